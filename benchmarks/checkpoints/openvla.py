@@ -15,7 +15,7 @@ from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.registry import require
-from vlagents_ray_models.openvla.prismatic import FILE, find_source, model_classes
+from vlagents_ray_models.openvla.prismatic import STATISTICS_FILE, find_source, model_classes
 
 ACTION_DIM, PROPRIO_DIM = 7, 8
 # Llama's 32000 and one for padding, in multiples of 64: action tokens count from its end.
@@ -60,7 +60,7 @@ def write(recipe: Recipe) -> WrittenCheckpoint:
     model.config.save_pretrained(folder)
     processor.save_pretrained(folder)
     make_tokenizer().save_pretrained(folder)
-    (folder / FILE).write_text(json.dumps(make_statistics([_DATASET])))
+    (folder / STATISTICS_FILE).write_text(json.dumps(make_statistics([_DATASET])))
     settings = {
         "checkpoint": str(folder),
         "source_dir": str(source),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray_models.openvla.prismatic import Statistics, middle, resized
+from vlagents_ray_models.openvla.prismatic import Statistics, crop_center, resize
 
 AT = ([0, 3, 57, 111, 160, 223], [0, 120, 31, 200, 77, 223])
 
@@ -68,15 +68,15 @@ def scene(height: int, width: int) -> np.ndarray:
 def test_pixels_are_tensorflows(
     size: tuple[int, int], small: list[list[int]], cropped: list[list[int]]
 ) -> None:
-    picture = resized(scene(*size))
+    picture = resize(scene(*size))
     assert picture.shape == (224, 224, 3)
     assert np.abs(picture[AT].astype(int) - small).max() <= 1
-    assert np.abs(middle(picture)[AT].astype(int) - cropped).max() <= 1
+    assert np.abs(crop_center(picture)[AT].astype(int) - cropped).max() <= 1
 
 
 def test_a_picture_of_the_right_size_is_not_compressed_again() -> None:
     picture = scene(224, 224)
-    assert np.array_equal(resized(picture), picture)
+    assert np.array_equal(resize(picture), picture)
 
 
 ACTION = {
@@ -126,9 +126,9 @@ def test_an_unknown_name_is_told_what_there_is() -> None:
 
 def test_fine_tunings_statistics_go_before_the_base_models(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"norm_stats": {"base": {}}}))
-    assert Statistics.of(tmp_path).key(None) == "base"
+    assert Statistics.from_folder(tmp_path).key(None) == "base"
     (tmp_path / "dataset_statistics.json").write_text(json.dumps(ONE))
-    assert Statistics.of(tmp_path).key(None) == "libero_goal_no_noops"
+    assert Statistics.from_folder(tmp_path).key(None) == "libero_goal_no_noops"
 
 
 @pytest.mark.parametrize(
@@ -137,4 +137,4 @@ def test_fine_tunings_statistics_go_before_the_base_models(tmp_path: Path) -> No
 def test_damaged_statistics_are_refused(tmp_path: Path, content: str, says: str) -> None:
     (tmp_path / "dataset_statistics.json").write_text(content)
     with pytest.raises(ConfigError, match=says):
-        Statistics.of(tmp_path)
+        Statistics.from_folder(tmp_path)

@@ -39,7 +39,7 @@ def test_the_log_probability_is_that_of_the_bins_alone(bins: ActionBins) -> None
         logits=scores[..., range(LAST - BINS + 1, LAST + 1)].double()
     )
     _, over = bins.read(scores)
-    *_, logprob, entropy, stated = bins.stated(tokens, over)
+    *_, logprob, entropy, stated = bins.describe(tokens, over)
     np.testing.assert_allclose(logprob, categorical.log_prob(tokens - (LAST - BINS + 1)), rtol=1e-9)
     np.testing.assert_allclose(entropy, categorical.entropy(), rtol=1e-9)
     np.testing.assert_allclose(bins.logprob(tokens, scores), logprob, rtol=1e-9)
@@ -57,7 +57,7 @@ def test_tokens_are_drawn_as_often_as_their_log_probability_says(bins: ActionBin
 def test_a_bin_that_is_impossible_adds_no_entropy(bins: ActionBins) -> None:
     scores = torch.full((1, VOCABULARY), -1e9)
     scores[0, [LAST, LAST - 1]] = 0.0
-    *_, entropy, _ = bins.stated(torch.tensor([LAST]), bins.read(scores)[1])
+    *_, entropy, _ = bins.describe(torch.tensor([LAST]), bins.read(scores)[1])
     assert entropy.item() == pytest.approx(np.log(2))
 
 
@@ -74,5 +74,5 @@ def test_the_likeliest_token_may_be_a_word_and_counts_as_the_nearest_bin(bins: A
     scores[0, 3] = 100.0  # a word, before all bins, of which the first token is the highest
     likeliest, over = bins.read(scores)
     assert bins.choose(likeliest, over, torch.tensor([torch.nan])).tolist() == [3]
-    highest = bins.stated(torch.tensor([LAST - BINS + 1]), over)
-    np.testing.assert_array_equal(bins.stated(likeliest, over)[:5], highest[:5])
+    highest = bins.describe(torch.tensor([LAST - BINS + 1]), over)
+    np.testing.assert_array_equal(bins.describe(likeliest, over)[:5], highest[:5])

@@ -1,5 +1,5 @@
-"""OpenVLA-OFT: computes a chunk of actions from images, proprioception and an instruction in one
-forward pass.
+"""OpenVLA-OFT, which computes a chunk of actions from images, proprioception and an instruction in
+one forward pass.
 """
 
 from __future__ import annotations
@@ -31,15 +31,18 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.openvla import prismatic
 
 _PRIMARY = "full_image"
-# In the order of training.
+# The cameras in the order of training.
 _CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")
-_USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # of LIBERO
-_STATE = ("xyz_axis_angle", "gripper_qpos")  # of LIBERO, 6 and 2 numbers
+# Defaults for LIBERO: the model's name of each camera -> ours, and the parts of the state, which
+# have 6 and 2 numbers.
+_DEFAULT_CAMERAS = {_PRIMARY: "front", "wrist_image": "wrist"}
+_DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
 
 
 class OpenVLAOFTConfig(prismatic.PrismaticConfig):
-    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, since its files do
-    not.
+    """Settings of OpenVLA-OFT.
+
+    They must describe how a checkpoint was trained, since its files do not.
     """
 
     attention: Literal["sdpa", "eager"] = Field(
@@ -85,10 +88,10 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
 
     def __init__(self, config: OpenVLAOFTConfig) -> None:
         super().__init__(config)
-        chosen = config.cameras or _USUAL
-        known = [name for name in _CAMERAS if name in chosen or name == _PRIMARY]
-        self._cameras = choose_cameras(config.cameras, _USUAL, known)
-        self._state = list(_STATE if config.state is None else config.state)
+        chosen = config.cameras or _DEFAULT_CAMERAS
+        used = [name for name in _CAMERAS if name in chosen or name == _PRIMARY]
+        self._cameras = choose_cameras(config.cameras, _DEFAULT_CAMERAS, used)
+        self._state = list(_DEFAULT_STATE if config.state is None else config.state)
 
     @property
     def contract(self) -> Contract:
@@ -102,62 +105,81 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
-        """Read the checkpoint and its components; raises `ConfigError` if one is missing or
-        unused.
+        """Read the checkpoint and its components.
+
+        Raises:
+            ConfigError: A component is missing, unused, or has other tensors than expected.
         """
         config = self.config
         base = prismatic.load_prismatic(config, config.bounds)
-        place = {"device": base.device, "dtype": base.dtype}
-        parts = {
-            "action_head": config.head != "tokens",
-            "proprio_projector": bool(self._state),
-            "noisy_action_projector": config.head == "diffusion",
-            "vision_backbone": config.film,
-        }
-        require_unused(base.path, [name for name, used in parts.items() if not used])
-        saved = {name: read_component(base.path, name) for name, used in parts.items() if used}
-        prefix = "noise_predictor.mlp_resnet" if config.head == "diffusion" else "model"
-        head = Mlp(saved["action_head"], prefix).to(**place) if "action_head" in saved else None
-        projectors = {
-            name: Projector(saved[name], name).to(**place) if name in saved else None
-            for name in ("proprio_projector", "noisy_action_projector")
-        }
+        saved = self._read_components(base.path)
+
+        target = {"device": base.device, "dtype": base.dtype}
+        head = proprio = noisy = film = None
+        if "action_head" in saved:
+            prefix = "noise_predictor.mlp_resnet" if config.head == "diffusion" else "model"
+            head = Mlp(saved["action_head"], prefix).to(**target)
+        if "proprio_projector" in saved:
+            proprio = Projector(saved["proprio_projector"], "proprio_projector").to(**target)
+        if "noisy_action_projector" in saved:
+            weights = saved["noisy_action_projector"]
+            noisy = Projector(weights, "noisy_action_projector").to(**target)
+        dim = _action_dim(base.statistics, config.unnorm_key, head)
+        if "vision_backbone" in saved:
+            film = Film(saved["vision_backbone"], base.network.vision_backbone).to(**target)
+
         parallel = Parallel(
             base,
             horizon=config.horizon,
-            dim=_action_dim(base.statistics, config.unnorm_key, head),
+            dim=dim,
             head=head,
-            proprio=projectors["proprio_projector"],
-            noisy=projectors["noisy_action_projector"],
-            film=Film(saved["vision_backbone"], base.network.vision_backbone).to(**place)
-            if config.film
-            else None,
+            proprio=proprio,
+            noisy=noisy,
+            film=film,
             steps=(config.diffusion_steps, config.inference_steps),
         )
         parallel.compile_with(self.compilation)
         return parallel
 
+    def _read_components(self, folder: Path) -> dict[str, Weights]:
+        """Read the files of the components that the settings use; raise `ConfigError` if one is
+        missing, or if there is one that they do not use.
+        """
+        uses = {
+            "action_head": self.config.head != "tokens",
+            "proprio_projector": bool(self._state),
+            "noisy_action_projector": self.config.head == "diffusion",
+            "vision_backbone": self.config.film,
+        }
+        require_unused(folder, [name for name, is_used in uses.items() if not is_used])
+        return {name: read_component(folder, name) for name, is_used in uses.items() if is_used}
+
     def perceive(self, obs: Obs) -> tuple[StagedRow, np.ndarray | None]:
         """Return the images, in the order of training, as inputs of the backbones, and the state
         vector (P,).
         """
-        seen = [prismatic.resized(image) for image in camera_images(obs, self._cameras).values()]
+        images = [prismatic.resize(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
-            seen = [prismatic.middle(image) for image in seen]
+            images = [prismatic.crop_center(image) for image in images]
+
         projector = self.model.proprio
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
-        return self.model.base.stage(seen), state
+        return self.model.base.stage(images), state
 
     def _model_input(self, row: Row, key: str) -> ModelInput:
-        seen, state = row.frames[-1]
+        images, state = row.frames[-1]
         base = self.model.base
-        if (dim := base.statistics.scale(key).dim) != self.model.dim:
+        dim = base.statistics.scale(key).dim
+        if dim != self.model.dim:
             raise InvalidObservation(
                 f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the "
                 "head's"
             )
-        proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
-        return ModelInput(seen, base.tokens(row.instruction), proprio)
+
+        proprio = None
+        if state is not None:
+            proprio = base.statistics.scale(key, "proprio").normalise(state)
+        return ModelInput(images, base.tokens(row.instruction), proprio)
 
     def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples
@@ -166,26 +188,24 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
+
         if self.config.head == "tokens":
-            draws = np.stack(
-                [
-                    entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan)
-                    for entry in prepared
-                ]
-            )
-            return self._decoded(
-                self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws)
-            )
+            draws = np.full((len(prepared), *shape), np.nan)
+            for row_draws, entry in zip(draws, prepared, strict=True):
+                if entry.row.sample:
+                    row_draws[:] = entry.row.rng.random(shape)
+            tokens, bin_logits = self.model.choose(inputs, owners, draws)
+            return self._decoded(self.model.base.bins, prepared, tokens, bin_logits)
+
         if self.config.head == "l1":
             chunks = self.model.regress(inputs)[owners]
         else:
-            chunks = self.model.denoise(
-                inputs, owners, np.stack([entry.row.noise(*shape) for entry in prepared])
-            )
-        return [
-            Prediction(entry.scale.restore(chunk))
-            for entry, chunk in zip(prepared, chunks, strict=True)
+            noise = np.stack([entry.row.noise(*shape) for entry in prepared])
+            chunks = self.model.denoise(inputs, owners, noise)
+        restored = [
+            entry.scale.restore(chunk) for entry, chunk in zip(prepared, chunks, strict=True)
         ]
+        return [Prediction(chunk) for chunk in restored]
 
 
 def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
@@ -210,19 +230,19 @@ _STOP = 2  # Llama's end of text, which follows the actions in training
 class ModelInput:
     """The inputs for one chunk."""
 
-    seen: StagedRow
+    images: StagedRow
     tokens: list[int]
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
 
 class Sequences(NamedTuple):
-    """The parts of sequences of embeddings that are known before the actions, and how they make
-    up a sequence.
+    """The embeddings from which sequences are assembled, apart from the actions, and their
+    order.
     """
 
-    seen: Any  # (B, P, D), of images and state
+    perceived: Any  # (B, P, D), of images and state
     words: Any  # (B, L, D)
-    places: Any  # (B, T), as for `Prismatic.assembled`; the actions are the last part
+    indices: Any  # (B, T), as for `Prismatic.assemble`; the actions are the last segment
     lengths: Any  # (B,), without padding
 
 
@@ -231,7 +251,7 @@ class Parallel:
     """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not
     use it.
 
-    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by
+    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces with
     their compiled forms.
     """
 
@@ -246,106 +266,124 @@ class Parallel:
 
     @property
     def trained(self) -> dict[str, Any]:
-        """The parts that upstream's training saves: modules, and tensors by their names in its
-        files.
+        """The components that upstream's training saves: modules, and tensors by their names in
+        its files.
         """
-        added = {
+        components = {
             "action_head": self.head,
             "proprio_projector": self.proprio,
             "noisy_action_projector": self.noisy,
             "film": self.film,
         }
-        return {
-            "vla": self.base.network,
-            **{name: part.weights for name, part in added.items() if part is not None},
-        }
+        trained: dict[str, Any] = {"vla": self.base.network}
+        for name, component in components.items():
+            if component is not None:
+                trained[name] = component.weights
+        return trained
 
     def compile_with(self, compilation: Compilation) -> None:
+        """Replace the passes with their compiled forms, if they are compiled."""
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.hidden_states = compilation.core("language model", self.hidden_states)  # type: ignore[method-assign]
 
     def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
+        """Compute chunks (B, H, D) in [-1, 1] in one pass, with the head of regression."""
         with require("torch").inference_mode():
-            return fetch(self._heads(self._hidden(self._sequences(inputs))).float())
+            hidden = self._hidden(self._sequences(inputs))
+            return fetch(self._apply_head(hidden).float())
 
     def denoise(
         self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray
     ) -> np.ndarray:
-        """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs
-        `owners` (B,).
+        """Denoise chunks.
+
+        Args:
+            inputs: The inputs, which several chunks may share.
+            owners: (B,), the input of each chunk.
+            noise: (B, H, D), standard normal.
+
+        Returns:
+            The chunks, (B, H, D) in [-1, 1].
         """
         with require("torch").inference_mode():
-            sequences = self._sequences(inputs)
-            index = self.base.moved(owners)
-            sequences = Sequences(*(part[index] for part in sequences))
-            start = self.base.moved(noise).to(self.base.dtype)
-            return fetch(
-                denoise(
-                    start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps
-                ).float()
-            )
+            index = self.base.upload(owners)
+            sequences = Sequences(*(values[index] for values in self._sequences(inputs)))
+
+            def predict(time: int, actions: Any) -> Any:
+                return self._predict_noise(sequences, time, actions)
+
+            start = self.base.upload(noise).to(self.base.dtype)
+            return fetch(denoise(start, predict, *self.steps).float())
 
     def choose(
         self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray
     ) -> tuple[Any, Any]:
-        """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in
-        `ActionBins.choose`.
+        """Choose the tokens of chunks.
 
-        Returns the tokens, and the logits of the bins (B, H, D, bins) there.
+        Args:
+            inputs: The inputs, which several chunks may share.
+            owners: (B,), the input of each chunk.
+            draws: (B, H, D), as in `ActionBins.choose`.
+
+        Returns:
+            The tokens (B, H, D), and the logits of the bins (B, H, D, bins) from which they were
+            chosen.
         """
         with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
-            index, bins = self.base.moved(owners), self.base.bins
-            likeliest, over = (
-                one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden))
-            )
-            return bins.choose(likeliest, over, self.base.moved(draws)), over
+            index, bins = self.base.upload(owners), self.base.bins
+            likeliest, bin_logits = bins.read(self.base.network.language_model.lm_head(hidden))
+            likeliest, bin_logits = likeliest[index], bin_logits[index]
+            return bins.choose(likeliest, bin_logits, self.base.upload(draws)), bin_logits
 
-    def _heads(self, hidden: Any) -> Any:
+    def _apply_head(self, hidden: Any) -> Any:
+        """Return the head's output (B, H, D) for hidden states (B, H * D, …)."""
         return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]
 
-    def _noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
-        seen = sequences.seen
-        now = (
-            time_embedding(time, seen.shape[-1], actions.device)
-            .to(actions.dtype)
-            .expand(len(seen), 1, -1)
-        )
+    def _predict_noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
+        """Return the noise in actions (B, H, D) at a time of training."""
+        perceived = sequences.perceived
+        embedding = time_embedding(time, perceived.shape[-1], actions.device).to(actions.dtype)
+        embedding = embedding.expand(len(perceived), 1, -1)
+        timed = sequences._replace(perceived=require("torch").cat([perceived, embedding], 1))
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
-        return self._heads(
-            self._hidden(sequences._replace(seen=require("torch").cat([seen, now], 1)), noisy)
-        )
+        return self._apply_head(self._hidden(timed, noisy))
 
     def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
-        """Return the sequences of inputs; for a diffusion head, with a place for the time after
+        """Return the sequences of inputs; for a diffusion head, with a position for the time after
         images and state.
         """
         torch, base = require("torch"), self.base
-        prompts, timed = (
-            [[*model_input.tokens, _STOP] for model_input in inputs],
-            self.noisy is not None,
-        )
-        words, counts = (
-            base.embed(base.padded(prompts)),
-            base.moved([len(tokens) for tokens in prompts]),
-        )
+        prompts = [[*model_input.tokens, _STOP] for model_input in inputs]
+        words = base.embed(base.pad(prompts))
+        counts = base.upload([len(tokens) for tokens in prompts])
+
+        # FiLM reads the mean of a prompt's words.
         padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
         language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
-        pixels = base.pixels([model_input.seen for model_input in inputs])
-        seen = self.encode_images(pixels, language.to(words.dtype))
+        pixels = base.pixels([model_input.images for model_input in inputs])
+        perceived = self.encode_images(pixels, language.to(words.dtype))
         if self.proprio is not None:
-            states = base.moved([model_input.proprio for model_input in inputs]).to(base.dtype)
-            seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
-        # `first`: place of a row's first token.
-        first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim
-        # Zeros without a diffusion head.
-        actions = [(first + words.shape[1] + i) * timed for i in range(count)]
-        lasts = [first + len(tokens) - 1 for tokens in prompts]
-        places = [
-            [first, *range(1, first), *range(first + 1, last), *actions, last] for last in lasts
-        ]
-        length = first - 1 + count + max(words.shape[1], base.padded_tokens)
-        return Sequences(seen, words, base.padded(places, length), counts + (first - 1 + count))
+            states = base.upload([model_input.proprio for model_input in inputs]).to(base.dtype)
+            perceived = torch.cat([perceived, self.proprio(states)[:, None]], 1)
+
+        # Indices into images and state, the time, the words and the actions, counted from 1.
+        has_time = self.noisy is not None
+        first = 1 + perceived.shape[1] + has_time  # the index of a row's first token
+        action_count = self.horizon * self.dim
+        if has_time:
+            first_action = first + words.shape[1]
+            actions = list(range(first_action, first_action + action_count))
+        else:
+            actions = [0] * action_count  # vectors of zeros
+        order = []
+        for tokens in prompts:
+            last = first + len(tokens) - 1
+            order.append([first, *range(1, first), *range(first + 1, last), *actions, last])
+
+        longest = max(words.shape[1], base.padded_tokens)
+        indices = base.pad(order, first - 1 + action_count + longest)
+        return Sequences(perceived, words, indices, counts + (first - 1 + action_count))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is
@@ -360,41 +398,48 @@ class Parallel:
         return self.base.network.projector(patches).unflatten(0, (len(pixels), views)).flatten(1, 2)
 
     def hidden_states(self, embeddings: Any, lengths: Any) -> Any:
-        """Return hidden states (B, L, D) of sequences (B, L, D); each token attends to the whole
-        length of its row.
+        """Run the language model on sequences, without a causal mask: each token attends to all
+        tokens of its row.
+
+        Args:
+            embeddings: The sequences, (B, L, D).
+            lengths: Their lengths without padding, (B,).
+
+        Returns:
+            The hidden states, (B, L, D).
         """
         import torch  # the compiler follows an import statement, but not `require`
 
         model, length = self.base.network.language_model.model, embeddings.shape[1]
-        places = lengths.new_ones(1, length).cumsum(1) - 1
-        hidden = (places >= lengths[:, None])[:, None, None].expand(-1, 1, length, -1)
-        mask = (
-            embeddings.new_zeros(1)
-            .expand(hidden.shape)
-            .masked_fill(hidden, torch.finfo(embeddings.dtype).min)
-        )
+        positions = lengths.new_ones(1, length).cumsum(1) - 1
+        hidden = (positions >= lengths[:, None])[:, None, None].expand(-1, 1, length, -1)
+        shown = embeddings.new_zeros(1).expand(hidden.shape)
+        mask = shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)
         for layer in model.layers:
-            [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
+            [embeddings] = layer(embeddings, attention_mask=mask, position_ids=positions)
         return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequences, *actions: Any) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens: `actions` for a diffusion
-        head, else zeros.
+        """Return the hidden states (B, H * D, …) that predict the numbers of actions.
+
+        Args:
+            sequences: The sequences.
+            actions: The embeddings of noisy actions, (B, H * D, …), for a diffusion head; other
+                heads have zeros in their place.
         """
-        lengths, count = sequences.lengths, self.horizon * self.dim
-        embeddings = self.base.assembled(
-            [sequences.seen, sequences.words, *actions], sequences.places
-        )
-        hidden = self.hidden_states(embeddings, lengths)
-        # the preceding token predicts an action, as in training
-        places = (
-            lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
-        )
-        return hidden.take_along_dim(places[..., None], 1)
+        segments = [sequences.perceived, sequences.words, *actions]
+        embeddings = self.base.assemble(segments, sequences.indices)
+        hidden = self.hidden_states(embeddings, sequences.lengths)
+
+        # The preceding token predicts an action, as in training.
+        count = self.horizon * self.dim
+        offsets = require("torch").arange(count, device=self.base.device)
+        positions = sequences.lengths[:, None] - count - 2 + offsets
+        return hidden.take_along_dim(positions[..., None], 1)
 
 
 def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
-    """Denoise actions by DDIM, without noise between steps.
+    """Denoise actions with DDIM, without noise between steps.
 
     Args:
         noise: (B, H, D), standard normal.
@@ -405,13 +450,16 @@ def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps:
     Returns:
         (B, H, D) in [-1, 1].
     """
-    kept, stride = _kept(trained), trained // steps
+    signal_shares = _signal_shares(trained)
+    stride = trained // steps
+    actions = noise
     for time in reversed(range(0, steps * stride, stride)):
-        guessed, before = predict(time, noise), time - stride
-        clean = (noise - (1 - kept[time]) ** 0.5 * guessed) / kept[time] ** 0.5
-        left = kept[before] if before >= 0 else 1.0
-        noise = left**0.5 * clean.clamp(-1, 1) + (1 - left) ** 0.5 * guessed
-    return noise
+        predicted = predict(time, actions)
+        share = signal_shares[time]
+        clean = (actions - (1 - share) ** 0.5 * predicted) / share**0.5
+        next_share = signal_shares[time - stride] if time >= stride else 1.0
+        actions = next_share**0.5 * clean.clamp(-1, 1) + (1 - next_share) ** 0.5 * predicted
+    return actions
 
 
 def time_embedding(time: int, dim: int, device: Any) -> Any:
@@ -422,23 +470,27 @@ def time_embedding(time: int, dim: int, device: Any) -> Any:
     return torch.cat([(time * rates).sin(), (time * rates).cos()])
 
 
-def _kept(trained: int) -> list[float]:
-    """Return the share of the signal that remains at each time of training."""
+def _signal_shares(trained: int) -> list[float]:
+    """Return the share of the signal in noisy actions at each time of training."""
 
     def alpha(x: float) -> float:
         return math.cos((x + 0.008) / 1.008 * math.pi / 2) ** 2
 
     betas = [min(1 - alpha((i + 1) / trained) / alpha(i / trained), 0.999) for i in range(trained)]
-    kept: list[float] = np.cumprod(1 - np.array(betas, np.float32)).tolist()
-    return kept
+    shares: list[float] = np.cumprod(1 - np.array(betas, np.float32)).tolist()
+    return shares
 
 
 Weights = dict[str, Any]  # tensors by name
 
+# The layers of a head.
 _MLP = (
     "layer_norm1",
     "fc1",
-    *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)),
+    "mlp_resnet_blocks.0.ffn.0",
+    "mlp_resnet_blocks.0.ffn.1",
+    "mlp_resnet_blocks.1.ffn.0",
+    "mlp_resnet_blocks.1.ffn.1",
     "layer_norm2",
     "fc2",
 )
@@ -447,8 +499,17 @@ _LORA_ALPHA = 16  # upstream's scale is min(rank, 16) / rank
 
 
 def read_component(folder: Path, name: str) -> dict[str, Any]:
-    """Return the tensors of the only file `name--*_checkpoint.pt`; raises `ConfigError` if there
-    is none or several.
+    """Read the file of a component, `NAME--STEP_checkpoint.pt`.
+
+    Args:
+        folder: The folder of the checkpoint.
+        name: The name of the component, such as "action_head".
+
+    Returns:
+        The tensors by name.
+
+    Raises:
+        ConfigError: There is no such file, or there are several.
     """
     files = sorted(path.name for path in folder.glob(f"{name}--*checkpoint.pt"))
     if len(files) != 1:
@@ -463,7 +524,11 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
 
 
 def require_unused(folder: Path, names: Iterable[str]) -> None:
-    """Raise `ConfigError` if there is a component that the settings omit."""
+    """Check that a checkpoint has no file of these components.
+
+    Raises:
+        ConfigError: There is a file of a component, which the settings do not use.
+    """
     for name in names:
         if any(folder.glob(f"{name}--*")):
             raise ConfigError(
@@ -472,47 +537,57 @@ def require_unused(folder: Path, names: Iterable[str]) -> None:
             )
 
 
-def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
-    want = {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
-    if set(found) != want:
+def _require_layers(weights: Weights, layers: Iterable[str], component: str) -> Weights:
+    """Return the weights of a component; raise `ConfigError` unless they are a weight and a bias of
+    each layer.
+    """
+    expected: set[str] = set()
+    for layer in layers:
+        expected |= {f"{layer}.weight", f"{layer}.bias"}
+
+    names = set(weights)
+    if names != expected:
         raise ConfigError(
-            f"{what}: misses {sorted(want - set(found))}, has {sorted(set(found) - want)} too; is "
-            "it of another kind?"
+            f"{component}: misses {sorted(expected - names)}, has {sorted(names - expected)} too; "
+            "is it of another kind?"
         )
-    return found
+    return weights
 
 
 class Component:
-    """A part that fine-tuning added to OpenVLA, by the names of its tensors."""
+    """A network that fine-tuning added to OpenVLA, as its tensors by name."""
 
     weights: Weights  # by upstream's names, which a learner pushes
     _prefix = ""  # of all names
 
-    def to(self, **place: Any) -> Self:
-        self.weights = {key: tensor.to(**place) for key, tensor in self.weights.items()}
+    def to(self, device: Any, dtype: Any) -> Self:
+        """Move the weights to a device and convert them to a type; return the component."""
+        self.weights = {name: tensor.to(device, dtype) for name, tensor in self.weights.items()}
         return self
 
     def _linear(self, layer: str, x: Any) -> Any:
         import torch  # the compiler follows an import statement, but not `require`
 
-        return torch.nn.functional.linear(x, *self._of(layer))
+        return torch.nn.functional.linear(x, *self._weight_and_bias(layer))
 
-    def _of(self, layer: str) -> tuple[Any, Any]:
-        return self.weights[f"{self._prefix}{layer}.weight"], self.weights[
-            f"{self._prefix}{layer}.bias"
-        ]
+    def _weight_and_bias(self, layer: str) -> tuple[Any, Any]:
+        name = f"{self._prefix}{layer}"
+        return self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
 
 
 class Mlp(Component):
     """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
 
     def __init__(self, saved: Weights, prefix: str) -> None:
-        self.weights = _exactly(saved, [f"{prefix}.{layer}" for layer in _MLP], "action_head")
+        layers = [f"{prefix}.{layer}" for layer in _MLP]
+        self.weights = _require_layers(saved, layers, "action_head")
         self._prefix = f"{prefix}."
 
     @property
     def dim(self) -> int:
-        return len(self._of("fc2")[1])
+        """The number of outputs."""
+        _, bias = self._weight_and_bias("fc2")
+        return len(bias)
 
     def __call__(self, x: Any) -> Any:
         relu = require("torch").relu
@@ -523,18 +598,19 @@ class Mlp(Component):
         return self._linear("fc2", self._norm("layer_norm2", x))
 
     def _norm(self, layer: str, x: Any) -> Any:
-        weight, bias = self._of(layer)
+        weight, bias = self._weight_and_bias(layer)
         return require("torch").nn.functional.layer_norm(x, bias.shape, weight, bias)
 
 
 class Projector(Component):
-    """Maps numbers to embeddings of the language model, by two layers with GELU between them."""
+    """Maps numbers to embeddings of the language model: two layers with GELU between them."""
 
-    def __init__(self, saved: Weights, what: str) -> None:
-        self.weights = _exactly(saved, ("fc1", "fc2"), what)
+    def __init__(self, saved: Weights, name: str) -> None:
+        self.weights = _require_layers(saved, ("fc1", "fc2"), name)
 
     @property
     def dim(self) -> int:
+        """The number of inputs."""
         return int(self.weights["fc1.weight"].shape[1])
 
     def __call__(self, x: Any) -> Any:
@@ -547,7 +623,11 @@ class Film(Component):
     """
 
     def __init__(self, saved: Weights, backbone: Any) -> None:
-        """Take FiLM's tensors from `saved`, and load the other tensors into the backbone."""
+        """Use FiLM's tensors in `saved`, and load the other tensors into the backbone.
+
+        Raises:
+            ConfigError: The tensors do not fit the backbone.
+        """
         plain, film = {}, {}
         for key, tensor in _merged(saved).items():
             name = key.removeprefix("vision_backbone.")
@@ -559,40 +639,43 @@ class Film(Component):
             backbone.load_state_dict(plain)
         except RuntimeError as error:
             raise ConfigError(f"vision_backbone: not the checkpoint's ({error})") from error
-        vits = {
-            n: getattr(backbone, n)
-            for n in ("featurizer", "fused_featurizer")
-            if hasattr(backbone, n)
-        }
-        layers = [
-            f"{n}.blocks.{i}.{way}"
-            for n, v in vits.items()
-            for i in range(len(v.blocks))
-            for way in ("scale", "shift")
-        ]
-        self.weights, self._vits = _exactly(film, layers, "vision_backbone"), vits
+
+        self._vits = {}
+        for name in ("featurizer", "fused_featurizer"):
+            if hasattr(backbone, name):
+                self._vits[name] = getattr(backbone, name)
+
+        layers = []
+        for name, vit in self._vits.items():
+            for i in range(len(vit.blocks)):
+                layers += [f"{name}.blocks.{i}.scale", f"{name}.blocks.{i}.shift"]
+        self.weights = _require_layers(film, layers, "vision_backbone")
 
     def __call__(self, pixels: Any, language: Any) -> Any:
-        """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean
-        of its embeddings.
+        """Return the patches of images for instructions.
+
+        Args:
+            pixels: The images, (B, C, S, S), with three channels for each backbone.
+            language: The mean of the embeddings of each instruction, (B, D).
+
+        Returns:
+            The patches, (B, P, V).
         """
         import torch  # the compiler follows an import statement, but not `require`
 
-        parts = pixels.split(3, dim=1)
-        return torch.cat(
-            [self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)],
-            dim=2,
-        )
+        patches = []
+        for name, channels in zip(self._vits, pixels.split(3, dim=1), strict=True):
+            patches.append(self._encode(name, channels, language))
+        return torch.cat(patches, dim=2)
 
-    def _see(self, name: str, pixels: Any, language: Any) -> Any:
+    def _encode(self, name: str, pixels: Any, language: Any) -> Any:
         """Return the output of the second to last block, which OpenVLA uses."""
         vit = self._vits[name]
         x = vit.norm_pre(vit.patch_drop(vit._pos_embed(vit.patch_embed(pixels))))
         for i, block in enumerate(vit.blocks[:-1]):
             layer = f"{name}.blocks.{i}"
-            scale, shift = (
-                self._linear(f"{layer}.{way}", language)[:, None] for way in ("scale", "shift")
-            )
+            scale = self._linear(f"{layer}.scale", language)[:, None]
+            shift = self._linear(f"{layer}.shift", language)[:, None]
             x = x + block.ls1(block.attn(block.norm1(x)))
             x = x * (1 + scale) + shift
             x = x + block.ls2(block.mlp(block.norm2(x)))
@@ -600,23 +683,24 @@ class Film(Component):
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """Add the low-rank adapters to their layers, including convolutions; OFT+ saves adapters
-    separately.
+    """Add the low-rank adapters to their layers, including convolutions.
+
+    OFT+ saves adapters separately.
     """
-    merged = {
-        key.replace(".base_layer.", "."): tensor
-        for key, tensor in saved.items()
-        if ".lora_" not in key
-    }
-    for key, down in saved.items():
-        if ".lora_A." in key:
-            up = saved[key.replace(".lora_A.", ".lora_B.")]
-            rank = len(down)
-            name = key.partition(".lora_A.")[0] + ".weight"
-            added = (
-                up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
-            )
-            merged[name] = (merged[name].float() + added.view_as(merged[name])).to(
-                merged[name].dtype
-            )
+    merged = {}
+    for name, tensor in saved.items():
+        if ".lora_" not in name:
+            merged[name.replace(".base_layer.", ".")] = tensor
+
+    for name, down in saved.items():
+        if ".lora_A." not in name:
+            continue
+        up = saved[name.replace(".lora_A.", ".lora_B.")]
+        rank = len(down)
+        scale = min(rank, _LORA_ALPHA) / rank
+        added = up.flatten(1).float() @ down.flatten(1).float() * scale
+
+        layer = name.partition(".lora_A.")[0] + ".weight"
+        weight = merged[layer]
+        merged[layer] = (weight.float() + added.view_as(weight)).to(weight.dtype)
     return merged

@@ -1,9 +1,9 @@
 """OpenVLA: decodes the next action from an image and an instruction, token by token.
 
-Upstream's `predict_action` takes one prompt and calls `generate`. Here prompts of different lengths
-are padded on the left, with masks and positions that give each the same result as alone, and share
-every forward pass. Keys and values are one tensor of a fixed length, with a masked place for each
-future token.
+Upstream's `predict_action` accepts one prompt and calls `generate`. Here prompts of different
+lengths are padded on the left, with masks and positions that give each the same result as alone,
+and share every forward pass. Keys and values are one tensor of a fixed length, which has a masked
+entry for each future token.
 """
 
 from __future__ import annotations
@@ -36,9 +36,8 @@ class OpenVLAConfig(prismatic.PrismaticConfig):
     center_crop: bool = Field(
         default=False,
         description="for checkpoints trained with random crops, such as LIBERO's: pictures go "
-        "through JPEG and Lanczos "
-        "to 224 px, and the middle nine tenths of them to the model; else the checkpoint's own "
-        "resizing is all",
+        "through JPEG and Lanczos to 224 px, and the middle nine tenths of them to the model; else "
+        "the checkpoint's own resizing is all",
     )
 
 
@@ -65,20 +64,26 @@ class OpenVLA(prismatic.PrismaticPolicy):
         return self.stated(self._cameras, (), 1, **facts)
 
     def load(self) -> TokenDecoder:
+        """Read the checkpoint.
+
+        Raises:
+            ConfigError: It is incomplete, or the settings do not fit it.
+        """
         base = prismatic.load_prismatic(self.config)
         if self.config.attention != "flash_attention_2":  # which reads the mask as it is
             model = base.network.language_model.model
             model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
-        decoder = TokenDecoder(
-            base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters
-        )
+
+        longest = max(base.statistics.action_dims(self.config.unnorm_key))
+        decoder = TokenDecoder(base, longest, self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
 
     def perceive(self, obs: Obs) -> StagedRow:
+        """Return the camera's image as the input of the vision backbones."""
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
-            image = prismatic.middle(prismatic.resized(image))
+            image = prismatic.crop_center(prismatic.resize(image))
         return self.model.base.stage([image])
 
     def _model_input(self, row: Row, key: str) -> tuple[StagedRow, list[int]]:
@@ -88,25 +93,26 @@ class OpenVLA(prismatic.PrismaticPolicy):
         """Decode all answers: sessions greedily unless outputs are requested, samples at
         temperature 1.
         """
-        firsts, owners = self.observations_of([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
-        for numbers, entry in zip(draws, prepared, strict=True):
+        for row_draws, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
-                numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
-        seen = [prepared[i] for i in firsts]
-        tokens, over = self.model.decode(
-            [entry.model_input for entry in seen],
+                row_draws[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
+
+        firsts, owners = self.observations_of([entry.row for entry in prepared])
+        tokens, bin_logits = self.model.decode(
+            [prepared[i].model_input for i in firsts],
             owners,
             draws,
-            [entry.row.adapter for entry in seen],
+            [prepared[i].row.adapter for i in firsts],
         )
-        return self._decoded(self.model.base.bins, prepared, tokens[:, None], over[:, None])
+        return self._decoded(self.model.base.bins, prepared, tokens[:, None], bin_logits[:, None])
 
 
 @dataclass
 class TokenDecoder:
-    """A checkpoint and its passes: functions of tensors, which `compile_with` replaces by their
-    compiled forms.
+    """A checkpoint and its passes.
+
+    The passes are functions of tensors, which `compile_with` replaces with their compiled forms.
     """
 
     base: prismatic.Prismatic
@@ -114,6 +120,7 @@ class TokenDecoder:
     adapters: LoraAdapters = field(default_factory=LoraAdapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
+        """Replace the passes with their compiled forms, if they are compiled."""
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.prefill = compilation.core("language model", self.prefill)  # type: ignore[method-assign]
         self.continue_from = compilation.core("next token", self.continue_from)  # type: ignore[method-assign]
@@ -130,42 +137,47 @@ class TokenDecoder:
         Args:
             prompts: The image and the tokens of each prompt.
             owners: (R,), the prompt of each answer; a prompt with several answers is read once.
-            draws: (R, S), for `ActionBins.choose`.
+            draws: (R, S) with a column for each token, for `ActionBins.choose`.
             fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has
                 one.
 
         Returns:
-            Tokens (R, S), and the logits of the bins (R, S, bins) there.
+            Tokens (R, S), and the logits of the bins (R, S, bins) from which they were chosen.
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
         with torch.inference_mode(), self.adapters.rows(fingerprints):
-            uniform = base.moved(draws)
+            quantiles = base.upload(draws)
             embeddings, mask = self._left_padded(prompts)
             hidden, cache = self.prefill(embeddings, mask)
-        with (
-            torch.inference_mode(),
-            self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()),
-        ):
+
+        answer_fingerprints = [fingerprints[i] for i in owners] if fingerprints else ()
+        with torch.inference_mode(), self.adapters.rows(answer_fingerprints):
             if list(owners) != list(range(len(prompts))):
-                index = base.moved(owners)
+                index = base.upload(owners)
                 hidden, mask, cache = hidden[index], mask[index], cache[index]
             length, position = mask.shape[1], mask.sum(1)
-            # one place for each token but the last, and one at the end for the current token
-            places = max(steps, self.longest)
-            cache = torch.nn.functional.pad(cache, (0, 0, 0, places - 1))
-            mask = torch.nn.functional.pad(mask, (0, places))
+
+            # One entry for each token but the last, and one at the end for the current token.
+            entries = max(steps, self.longest)
+            cache = torch.nn.functional.pad(cache, (0, 0, 0, entries - 1))
+            mask = torch.nn.functional.pad(mask, (0, entries))
             mask[:, -1] = 1
-            chosen: list[Any] = []
-            found: list[Any] = []
+
+            tokens: list[Any] = []
+            all_bin_logits: list[Any] = []
             for step in range(steps):
                 if step:
-                    hidden, own = self.continue_from(chosen[-1], position + step - 1, mask, cache)
-                    place = length + step - 1
-                    cache[..., place, :], mask[:, place] = own, 1
-                likeliest, over = base.bins.read(base.network.language_model.lm_head(hidden))
-                found.append(over)
-                chosen.append(base.bins.choose(likeliest, over, uniform[:, step]))
-            return torch.stack(chosen, 1), torch.stack(found, 1)
+                    hidden, keys_and_values = self.continue_from(
+                        tokens[-1], position + step - 1, mask, cache
+                    )
+                    entry = length + step - 1
+                    cache[..., entry, :] = keys_and_values
+                    mask[:, entry] = 1
+                logits = base.network.language_model.lm_head(hidden)
+                likeliest, bin_logits = base.bins.read(logits)
+                all_bin_logits.append(bin_logits)
+                tokens.append(base.bins.choose(likeliest, bin_logits, quantiles[:, step]))
+            return torch.stack(tokens, 1), torch.stack(all_bin_logits, 1)
 
     def encode_images(self, pixels: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, C, S, S)."""
@@ -173,10 +185,14 @@ class TokenDecoder:
         return network.projector(network.vision_backbone(pixels))
 
     def prefill(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
-        """Run the language model on prompts (P, L, D), whose tokens are where `mask` (P, L) is not
-        0.
+        """Run the language model on prompts.
 
-        Returns the last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
+        Args:
+            embeddings: The embeddings of the prompts, (P, L, D).
+            mask: (P, L), 0 where a prompt is padded.
+
+        Returns:
+            The last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
         """
         result = self.base.network.language_model.model(
             inputs_embeds=embeddings,
@@ -187,12 +203,17 @@ class TokenDecoder:
         return result.last_hidden_state[:, -1], stack_of(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
-        """Run the language model on one more token (R,) of each row, at `positions` (R,) of its
-        text.
+        """Run the language model on one more token of each row.
 
-        A token attends where `mask` (R, T + 1) is not 0: T places of keys and values (R, layers, 2,
-        heads, T, E), and itself. Returns the hidden state (R, D), and the token's own keys and
-        values (R, layers, 2, heads, E).
+        Args:
+            tokens: The tokens, (R,).
+            positions: Their positions in the texts of their rows, (R,).
+            mask: (R, T + 1), 0 for those of the T entries of the cache to which a token does not
+                attend; the last column is for the token itself.
+            cache: Keys and values, (R, layers, 2, heads, T, E).
+
+        Returns:
+            The hidden state (R, D), and the token's keys and values (R, layers, 2, heads, E).
         """
         result = self.base.network.language_model.model(
             input_ids=tokens[:, None],
@@ -201,41 +222,59 @@ class TokenDecoder:
             past_key_values=tuple((layer[:, 0], layer[:, 1]) for layer in cache.unbind(1)),
             use_cache=True,
         )
-        own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in result.past_key_values)
-        return result.last_hidden_state[:, -1], stack_of(own)[..., 0, :]
+        of_token = tuple(
+            (keys[:, :, -1:], values[:, :, -1:]) for keys, values in result.past_key_values
+        )
+        return result.last_hidden_state[:, -1], stack_of(of_token)[..., 0, :]
 
     def _left_padded(self, prompts: Sequence[tuple[StagedRow, list[int]]]) -> tuple[Any, Any]:
-        """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token,
-        as in training.
+        """Return the embeddings (P, L, D) of prompts, and their mask (P, L).
+
+        The patches of the image follow the first token, as in training.
         """
-        base, rows = self.base, [tokens for _, tokens in prompts]
-        patches = self.encode_images(base.pixels([seen for seen, _ in prompts]).flatten(0, 1))
-        first = 1 + patches.shape[1]  # place of a row's first token
-        places = [
+        base = self.base
+        rows = [tokens for _, tokens in prompts]
+        pixels = base.pixels([staged for staged, _ in prompts]).flatten(0, 1)
+        patches = self.encode_images(pixels)
+
+        # Indices into the patches and then the tokens, counted from 1.
+        first = 1 + patches.shape[1]  # the index of a row's first token
+        order = [
             [first, *range(1, first), *range(first + 1, first + len(tokens))] for tokens in rows
         ]
-        length = first - 1 + base.padded_tokens
-        index = base.padded(places, length, left=True)
-        return base.assembled([patches, base.embed(base.padded(rows))], index), (index > 0).long()
+        indices = base.pad(order, first - 1 + base.padded_tokens, left=True)
+        embeddings = base.assemble([patches, base.embed(base.pad(rows))], indices)
+        return embeddings, (indices > 0).long()
 
 
 def _causal_mask(
-    own: Callable[..., Any], mask: Any, embeddings: Any, positions: Any, *others: Any
+    update_causal_mask: Callable[..., Any],
+    mask: Any,
+    embeddings: Any,
+    positions: Any,
+    *arguments: Any,
 ) -> Any:
-    """Return Llama's mask (B, 1, Q, K) of tokens (B, Q, D) at positions (Q,) that attend where
-    `mask` (B, K) is not 0.
+    """Return the attention mask of Llama, without reading whether anything is masked.
 
-    Its `own` code reads whether anything is masked: each pass would wait for a GPU, and no graph
-    could be captured.
+    Llama's own code reads that: each pass would wait for a GPU, and no graph could be captured.
+
+    Args:
+        update_causal_mask: Llama's own code, for masks of another shape.
+        mask: (B, K), 0 where no token attends; None: all attend.
+        embeddings: The embeddings of the tokens, (B, Q, D).
+        positions: The positions of the tokens in the cache, (Q,).
+        arguments: Further arguments of Llama's code.
+
+    Returns:
+        (B, 1, Q, K): 0 where a token attends, else the smallest number of the embeddings' type.
     """
     import torch  # the compiler follows an import statement, but not `require`
 
     if mask is None or mask.ndim != 2:
-        return own(mask, embeddings, positions, *others)
-    hidden = (torch.arange(mask.shape[1], device=mask.device) > positions[:, None]) | (
-        mask[:, None] == 0
-    )
-    # Padding attends to all: fast kernels give NaN for no token at all.
+        return update_causal_mask(mask, embeddings, positions, *arguments)
+    is_later = torch.arange(mask.shape[1], device=mask.device) > positions[:, None]
+    hidden = is_later | (mask[:, None] == 0)
+    # Padding attends to all: fast kernels give NaN for a token that attends to nothing.
     hidden = hidden & ~hidden.all(-1, keepdim=True)
     shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
     return shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)[:, None]

@@ -41,11 +41,12 @@ from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import require
 
-# Of each dimension: 1st and 99th percentile, or minimum and maximum.
+# The range of each dimension: 1st and 99th percentile, or minimum and maximum.
 Bounds = Literal["q99", "min_max"]
+_STATISTICS = {"q99": ("q01", "q99"), "min_max": ("min", "max")}
+
 # Written by fine-tuning; it overrides the statistics in config.json.
-FILE = "dataset_statistics.json"
-_KEYS = {"q99": ("q01", "q99"), "min_max": ("min", "max")}
+STATISTICS_FILE = "dataset_statistics.json"
 _EPSILON = 1e-8  # upstream's value, for dimensions that never moved
 
 
@@ -59,6 +60,7 @@ class Scale:
 
     @property
     def dim(self) -> int:
+        """D, the number of dimensions."""
         return len(self.low)
 
     def restore(self, normalised: np.ndarray) -> np.ndarray:
@@ -68,9 +70,8 @@ class Scale:
 
     def restore_spread(self, normalised: np.ndarray) -> np.ndarray:
         """Convert standard deviations (…, D) to physical units, float32."""
-        return np.where(self.mask, 0.5 * normalised * (self.high - self.low), normalised).astype(
-            np.float32
-        )
+        values = 0.5 * normalised * (self.high - self.low)
+        return np.where(self.mask, values, normalised).astype(np.float32)
 
     def normalise(self, values: np.ndarray) -> np.ndarray:
         """Convert (…, D) in physical units to [-1, 1], float32, clipped at the ends of the
@@ -89,72 +90,98 @@ class Statistics:
         self._datasets, self.bounds = datasets, bounds
 
     @classmethod
-    def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
-        """Read the statistics in the folder; raises `ConfigError` if there are none."""
-        own = (checkpoint / FILE).is_file()
-        file = checkpoint / (FILE if own else "config.json")
+    def from_folder(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
+        """Read the statistics in a checkpoint's folder.
+
+        Args:
+            checkpoint: The folder.
+            bounds: The statistics with which values were normalised in training.
+
+        Raises:
+            ConfigError: The folder has no statistics.
+        """
+        has_own_file = (checkpoint / STATISTICS_FILE).is_file()
+        file = checkpoint / (STATISTICS_FILE if has_own_file else "config.json")
         try:
-            found = json.loads(file.read_text(encoding="utf-8"))
+            datasets = json.loads(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise ConfigError(f"{file}: is no JSON ({error}); copy it again") from error
-        if not own:
-            found = found.get("norm_stats")
-        if not found or not isinstance(found, dict):
+
+        if not has_own_file:
+            datasets = datasets.get("norm_stats")
+        if not datasets or not isinstance(datasets, dict):
             raise ConfigError(
-                f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or "
-                "norm_stats in config.json; copy it from where the training run saved it"
+                f"checkpoint {checkpoint}: got no normalisation statistics, want "
+                f"{STATISTICS_FILE}, or norm_stats in config.json; copy it from where the training "
+                "run saved it"
             )
-        return cls(found, bounds)
+        return cls(datasets, bounds)
 
     @property
     def names(self) -> list[str]:
+        """The names of all datasets."""
         return list(self._datasets)
 
-    def key(self, wanted: str | None) -> str:
-        """Return the key of the dataset `wanted`, with or without `_no_noops`; None selects the
-        only dataset.
+    def key(self, name: str | None) -> str:
+        """Return the key of a dataset in these statistics.
+
+        Args:
+            name: The name of the dataset, with or without `_no_noops`; None selects the only
+                dataset.
+
+        Raises:
+            InvalidObservation: There is no such dataset, or there are several for None.
         """
-        if wanted is None and len(self._datasets) == 1:
+        if name is None and len(self._datasets) == 1:
             return next(iter(self._datasets))
-        for name in (wanted, f"{wanted}_no_noops"):
-            if name in self._datasets:
-                return str(name)
+        for key in (name, f"{name}_no_noops"):
+            if key in self._datasets:
+                return str(key)
         raise InvalidObservation(
-            f"unnorm_key: got {wanted!r}, want one of the checkpoint's datasets "
+            f"unnorm_key: got {name!r}, want one of the checkpoint's datasets "
             f"{sorted(self._datasets)}; set it in the policy's config, in reset(..., "
             "unnorm_key=...) or in an observation's info"
         )
 
-    def scale(self, key: str, part: Literal["action", "proprio"] = "action") -> Scale:
-        """Return the ranges of a dataset's actions or proprioception; raises `ConfigError` if it
-        lacks them.
+    def scale(self, key: str, feature: Literal["action", "proprio"] = "action") -> Scale:
+        """Return the ranges of a dataset's actions or proprioception.
+
+        Raises:
+            ConfigError: The statistics lack them.
         """
-        found = self._datasets[key].get(part, {})
-        low, high = _KEYS[self.bounds]
-        if low not in found or high not in found:
+        statistics = self._datasets[key].get(feature, {})
+        low, high = _STATISTICS[self.bounds]
+        if low not in statistics or high not in statistics:
             raise ConfigError(
-                f"statistics of {key!r}: {part} has {sorted(found)}, want {low!r} and {high!r}; "
-                f"were they saved by another version, or with other normalisation bounds?"
+                f"statistics of {key!r}: {feature} has {sorted(statistics)}, want {low!r} and "
+                f"{high!r}; were they saved by another version, or with other normalisation bounds?"
             )
-        mask = found.get("mask", [True] * len(found[low]))
+
+        mask = statistics.get("mask", [True] * len(statistics[low]))
         return Scale(
-            np.array(found[low], float), np.array(found[high], float), np.array(mask, bool)
+            np.array(statistics[low], float),
+            np.array(statistics[high], float),
+            np.array(mask, bool),
         )
 
-    def action_dims(self, wanted: str | None = None) -> set[int]:
-        """Return the lengths of the actions of the dataset `wanted`, or of all datasets."""
-        return {
-            self.scale(key).dim
-            for key in (self._datasets if wanted is None else [self.key(wanted)])
-        }
+    def action_dims(self, name: str | None = None) -> set[int]:
+        """Return the lengths of the actions of a dataset; None: of all datasets."""
+        keys = self._datasets if name is None else [self.key(name)]
+        return {self.scale(key).dim for key in keys}
 
-    def require(self, wanted: str | None) -> None:
-        """Raise `ConfigError` unless the dataset `wanted` by a deployment exists."""
+    def require(self, name: str | None) -> None:
+        """Check the dataset that a deployment selects; None: it selects none.
+
+        Raises:
+            ConfigError: There is no such dataset, or it has no ranges of actions.
+        """
+        if name is None:
+            return
         try:
-            if wanted is not None:
-                self.scale(self.key(wanted))
+            key = self.key(name)
         except InvalidObservation as error:
             raise ConfigError(str(error)) from error
+        self.scale(key)
 
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
@@ -184,14 +211,14 @@ class Prismatic:
     device: Any
     dtype: Any
     staging: Staging
-    # The length to which shorter prompts are padded; 0: that of the longest prompt.
+    # The length to which shorter prompts are padded; 0: the length of the longest prompt.
     padded_tokens: int
-    # Of adapters that were trained on other datasets.
-    own: dict[str, Statistics] = field(default_factory=dict)
+    # Fingerprint of an adapter -> its statistics, if it was trained on other datasets.
+    adapter_statistics: dict[str, Statistics] = field(default_factory=dict)
 
     def stage(self, images: Sequence[np.ndarray]) -> StagedRow:
-        """Begin to copy V images, (H, W, 3) uint8, as inputs of the checkpoint's backbones, to
-        the model's device.
+        """Begin to copy V images, (H, W, 3) uint8, to the model's device, in the format of the
+        checkpoint's backbones.
         """
         convert = require("PIL.Image").fromarray
         pixels = [self.processor.apply_transform(convert(image)).numpy() for image in images]
@@ -204,60 +231,97 @@ class Prismatic:
         return self.staging.stack(rows)[_PIXELS].to(self.dtype)
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt's tokens, read-only; raises `InvalidObservation` if the instruction
-        is too long.
+        """Return the tokens of the prompt for an instruction, which callers must not change.
+
+        Raises:
+            InvalidObservation: The instruction is too long.
         """
-        ids = self._tokenized(instruction)
-        most = self.network.config.llm_max_length
-        if len(ids) > most:
+        tokens = self._tokenize(instruction)
+        max_tokens = self.network.config.llm_max_length
+        if len(tokens) > max_tokens:
             raise InvalidObservation(
-                f"instruction: got {len(ids)} tokens with the prompt, want {most} at most"
+                f"instruction: got {len(tokens)} tokens with the prompt, want {max_tokens} at most"
             )
-        return ids
+        return tokens
 
     @cached_property
-    def _tokenized(self) -> Callable[[str], list[int]]:
-        """Tokenizes an instruction, with a cache, since it is the same in each act of a session."""
+    def _tokenize(self) -> Callable[[str], list[int]]:
+        """A function that tokenizes the prompt for an instruction.
+
+        It has a cache, since the instruction is the same in each call of a session.
+        """
 
         @keeping_tokens
-        def tokenized(instruction: str) -> list[int]:
-            ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
-            return ids if ids[-1] == _SPACE else [*ids, _SPACE]
+        def tokenize(instruction: str) -> list[int]:
+            prompt = self.prompt.format(instruction.lower())
+            tokens: list[int] = self.tokenizer(prompt).input_ids
+            return tokens if tokens[-1] == _SPACE else [*tokens, _SPACE]
 
-        return tokenized
+        return tokenize
 
-    def moved(self, numbers: Any) -> Any:
-        """Copy numbers to the model's device, without waiting for what a GPU computes."""
+    def upload(self, numbers: Any) -> Any:
+        """Copy numbers to the model's device, without waiting for the GPU's computations."""
         return self.staging.upload(np.asarray(numbers))
 
-    def padded(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
-        """Return rows of int64 on the device with zeros after them, or before them, up to the
-        longest or `length`.
+    def pad(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
+        """Pad rows of integers with zeros, and copy them to the device.
+
+        Args:
+            rows: B rows.
+            length: The smallest length of the result.
+            left: Whether the zeros are before the rows instead of after them.
+
+        Returns:
+            (B, L) int64, where L is `length`, or the length of the longest row if that is larger.
         """
-        found = np.zeros((len(rows), max(length, *map(len, rows))), np.int64)
-        for row, numbers in zip(found, rows, strict=True):
-            row[slice(-len(numbers), None) if left else slice(len(numbers))] = numbers
-        return self.moved(found)
+        padded = np.zeros((len(rows), max(length, *map(len, rows))), np.int64)
+        for target, numbers in zip(padded, rows, strict=True):
+            if left:
+                target[-len(numbers) :] = numbers
+            else:
+                target[: len(numbers)] = numbers
+        return self.upload(padded)
 
     def embed(self, tokens: Any) -> Any:
         """Return the embeddings (…, D) of tokens (…)."""
         return self.network.get_input_embeddings()(tokens)
 
     @staticmethod
-    def assembled(parts: Sequence[Any], places: Any) -> Any:
-        """Return sequences (B, L, D) of the parts (B, N, D) at places (B, L), which count from
-        1; at 0 are zeros.
+    def assemble(segments: Sequence[Any], indices: Any) -> Any:
+        """Assemble sequences from the embeddings of concatenated segments.
+
+        Args:
+            segments: Embeddings (B, N, D) with an N for each segment.
+            indices: (B, L), for each position of a sequence an index into the concatenation of the
+                row's segments, counted from 1; 0 is a vector of zeros.
+
+        Returns:
+            The sequences, (B, L, D).
         """
-        zeros = parts[0].new_zeros(len(places), 1, parts[0].shape[-1])
-        return require("torch").cat([zeros, *parts], 1).take_along_dim(places[..., None], 1)
+        zeros = segments[0].new_zeros(len(indices), 1, segments[0].shape[-1])
+        return require("torch").cat([zeros, *segments], 1).take_along_dim(indices[..., None], 1)
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
+    """Load a checkpoint of OpenVLA, or the base of one of OpenVLA-OFT.
+
+    Args:
+        config: The settings of the policy.
+        bounds: The statistics with which values were normalised in training.
+
+    Returns:
+        The checkpoint, on its device and in evaluation mode.
+
+    Raises:
+        ConfigError: The checkpoint is incomplete, or the settings do not fit it.
+    """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, _NEEDS)
-    statistics = Statistics.of(path, bounds)
+    statistics = Statistics.from_folder(path, bounds)
     statistics.require(config.unnorm_key)
+
     device = torch_device(config.device)
     dtype = torch_dtype(config.dtype, device)
+
     ensure_torchvision()
     transformers = require("transformers")
     model_class, processor_class = model_classes(path, config.source_dir, config.trust_remote_code)
@@ -265,6 +329,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         path, torch_dtype=dtype, attn_implementation=config.attention, low_cpu_mem_usage=True
     )
     require_loaded(network, SavedTensors.open(path))
+
     return Prismatic(
         path=path,
         network=network.to(device).eval().requires_grad_(False),
@@ -292,20 +357,18 @@ class PrismaticConfig(ModelConfig):
     unnorm_key: str | None = Field(
         default=None,
         description="dataset whose statistics turn answers into physical units, with or without "
-        "`_no_noops`; unset: "
-        "the checkpoint's only one, or the one that `reset` or an observation names",
+        "`_no_noops`; unset: the checkpoint's only one, or the one that `reset` or an observation "
+        "names",
     )
     source_dir: str | None = Field(
         default=None,
         description="a clone of openvla or openvla-oft, for the model's classes; unset: "
-        "$OPENVLA_SRC, "
-        "$OPENVLA_OFT_SRC, or an installed `prismatic`",
+        "$OPENVLA_SRC, $OPENVLA_OFT_SRC, or an installed `prismatic`",
     )
     trust_remote_code: bool = Field(
         default=False,
         description="run the Python code in the checkpoint's folder instead: write access to it, "
-        "or to the hub's "
-        "repository, then gives all rights of this process",
+        "or to the hub's repository, then gives all rights of this process",
     )
     attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
         default="sdpa",
@@ -333,38 +396,52 @@ class ActionBins:
         edges = np.linspace(-1, 1, config.n_action_bins)
         middles = (edges[:-1] + edges[1:]) / 2
         self._first = config.text_config.vocab_size - config.pad_to_multiple_of - 1
-        # there is one token more than there are bins
+        # There is one token more than there are bins.
         self._middles = torch.tensor(np.append(middles, middles[-1]), device=device)
         self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
 
     def read(self, logits: Any) -> tuple[Any, Any]:
-        """Return the likeliest of all tokens (…), and the logits of bins (…, bins), float64, of
-        logits (…, V).
+        """Read the logits of a language model.
+
+        Args:
+            logits: (…, V), for all tokens of the vocabulary.
+
+        Returns:
+            The likeliest of all tokens (…), and the logits of the bins (…, bins), float64.
         """
         return logits.argmax(-1), logits[..., self._tokens].double()
 
-    def choose(self, likeliest: Any, over: Any, draws: Any) -> Any:
-        """Choose tokens (…) from the results of `read`: bins at given quantiles, or the likeliest
-        tokens.
+    def choose(self, likeliest: Any, bin_logits: Any, draws: Any) -> Any:
+        """Choose tokens: bins at given quantiles, or the likeliest tokens.
 
-        An element of `draws` (…), in [0, 1), is a quantile of the distribution over bins; NaN
-        selects the likeliest of all tokens, as upstream does.
+        Args:
+            likeliest: The likeliest of all tokens (…), from `read`.
+            bin_logits: The logits of the bins (…, bins), from `read`.
+            draws: (…) in [0, 1), quantiles of the distributions over bins; NaN selects the
+                likeliest of all tokens, as upstream does.
+
+        Returns:
+            The tokens (…).
         """
         torch = require("torch")
-        upto = over.softmax(-1).cumsum(-1)
-        drawn = (upto > (draws * upto[..., -1])[..., None]).int().argmax(-1)
+        cumulative = bin_logits.softmax(-1).cumsum(-1)
+        exceeds = cumulative > (draws * cumulative[..., -1])[..., None]
+        drawn = exceeds.int().argmax(-1)
         return torch.where(draws.isnan(), likeliest, self._tokens[drawn])
 
     def logprob(self, tokens: Any, logits: Any) -> Any:
         """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in
         logits (…, V).
         """
-        over = logits[..., self._tokens].double().log_softmax(-1)
-        return over.gather(-1, (self._first - tokens)[..., None])[..., 0]
+        log_shares = logits[..., self._tokens].double().log_softmax(-1)
+        return log_shares.gather(-1, (self._first - tokens)[..., None])[..., 0]
 
-    def stated(self, tokens: Any, over: Any) -> np.ndarray:
-        """Return what is known of tokens (…) by the logits of bins, (…, bins) float64, with one
-        copy from the device.
+    def describe(self, tokens: Any, bin_logits: Any) -> np.ndarray:
+        """Compute the values and the distributions of tokens, with one copy from the device.
+
+        Args:
+            tokens: The chosen tokens (…).
+            bin_logits: The logits of the bins (…, bins), float64.
 
         Returns:
             (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream;
@@ -372,11 +449,12 @@ class ActionBins:
             tokens.
         """
         torch = require("torch")
-        share, bins = over.softmax(-1), (self._first - tokens).clamp(0, len(self._middles) - 1)
-        mean = share @ self._middles
-        spread = (share * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
-        logprob = over.log_softmax(-1).gather(-1, bins[..., None])[..., 0]
-        entropy = torch.special.entr(share).sum(-1)
+        shares = bin_logits.softmax(-1)
+        bins = (self._first - tokens).clamp(0, len(self._middles) - 1)
+        mean = shares @ self._middles
+        spread = (shares * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
+        logprob = bin_logits.log_softmax(-1).gather(-1, bins[..., None])[..., 0]
+        entropy = torch.special.entr(shares).sum(-1)
         return fetch(
             torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()])
         )
@@ -414,40 +492,47 @@ def model_classes(
     return _from_source(find_source(source_dir))
 
 
-def _remote(checkpoint: Path, file: str, auto: str) -> Any:
-    named = (
-        json.loads((checkpoint / file).read_text(encoding="utf-8")).get("auto_map", {}).get(auto)
-    )
-    if named is None:
+def _remote(checkpoint: Path, file: str, auto_class: str) -> Any:
+    """Return the class that a JSON file of the checkpoint names for a class of transformers."""
+    content = json.loads((checkpoint / file).read_text(encoding="utf-8"))
+    class_reference = content.get("auto_map", {}).get(auto_class)
+    if class_reference is None:
         raise ConfigError(
-            f"trust_remote_code: {checkpoint / file} names no code (auto_map has no {auto!r}); "
+            f"trust_remote_code: {checkpoint / file} names no code (auto_map has no "
+            f"{auto_class!r}); "
             f"take the classes from a source tree instead: set source_dir"
         )
     return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(
-        named, str(checkpoint)
+        class_reference, str(checkpoint)
     )
 
 
 def find_source(source_dir: str | None) -> Path:
-    """Return the folder that holds the package `prismatic`."""
-    asked = (
-        [source_dir]
-        if source_dir
-        else [os.environ[name] for name in VARIABLES if os.environ.get(name)]
-    )
-    if not asked:
-        spec = importlib.util.find_spec("prismatic")  # finds without importing
-        asked = (
-            [str(Path(found).parent) for found in (spec.submodule_search_locations or ())]
-            if spec
-            else []
-        )
-    for folder in asked:
+    """Find the folder that contains the package `prismatic`.
+
+    Args:
+        source_dir: The folder, if the settings name one; None: $OPENVLA_SRC, $OPENVLA_OFT_SRC, or
+            the folder of an installed `prismatic`.
+
+    Raises:
+        ConfigError: No folder contains the model's classes.
+    """
+    if source_dir:
+        folders = [source_dir]
+    else:
+        folders = [os.environ[name] for name in VARIABLES if os.environ.get(name)]
+    if not folders:
+        spec = importlib.util.find_spec("prismatic")  # finds the package without importing it
+        if spec is not None:
+            packages = spec.submodule_search_locations or ()
+            folders = [str(Path(package).parent) for package in packages]
+
+    for folder in folders:
         root = Path(folder).expanduser().resolve()
         if (root / "prismatic/extern/hf/modeling_prismatic.py").is_file():
             return root
     raise ConfigError(
-        f"OpenVLA's model classes: got {asked or 'no source tree'}, want a folder with "
+        f"OpenVLA's model classes: got {folders or 'no source tree'}, want a folder with "
         f"prismatic/extern/hf in it; set source_dir or ${VARIABLES[0]} to a clone of openvla or "
         "openvla-oft, or, if you trust the Python code that lies beside the weights, "
         "trust_remote_code: true"
@@ -456,7 +541,8 @@ def find_source(source_dir: str | None) -> Path:
 
 @lru_cache(maxsize=4)
 def _from_source(root: Path) -> tuple[Any, Any]:
-    # OFT's code prints settings that do not apply here
+    """Import the classes of the model and of its image processor from a source tree."""
+    # OFT's code prints settings that do not apply here.
     with _bare_packages(root), contextlib.redirect_stdout(io.StringIO()):
         modeling = importlib.import_module("prismatic.extern.hf.modeling_prismatic")
         processing = importlib.import_module("prismatic.extern.hf.processing_prismatic")
@@ -465,10 +551,10 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which would import TensorFlow and
-    more.
+    """Import from `root` without running the `__init__` of its packages, which would import
+    TensorFlow and more.
     """
-    before = _take_out()
+    earlier_modules = _remove_modules()
     for name in _PACKAGES:
         package = types.ModuleType(name)
         package.__path__ = [str(root.joinpath(*name.split(".")))]
@@ -476,15 +562,16 @@ def _bare_packages(root: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # torch.compile imports the module of a function that it compiles, by the module's name
+        # torch.compile imports the module of a function that it compiles, by the module's name.
         alias = f"prismatic_{hashlib.sha256(str(root).encode()).hexdigest()[:16]}"
-        for name, module in _take_out().items():
+        for name, module in _remove_modules().items():
             module.__name__ = name.replace("prismatic", alias, 1)
             sys.modules[module.__name__] = module
-        sys.modules.update(before)
+        sys.modules.update(earlier_modules)
 
 
-def _take_out() -> dict[str, types.ModuleType]:
+def _remove_modules() -> dict[str, types.ModuleType]:
+    """Remove all modules of a package `prismatic` from `sys.modules`, and return them."""
     names = [name for name in sys.modules if name.partition(".")[0] == "prismatic"]
     return {name: sys.modules.pop(name) for name in names}
 
@@ -505,7 +592,10 @@ class PreparedRow:
 
 
 class PrismaticPolicy(ModelPolicy):
-    """Computes all valid rows of a batch together, each in the units of its own dataset."""
+    """The base of OpenVLA and OpenVLA-OFT.
+
+    It computes all valid rows of a batch together, each in the units of its own dataset.
+    """
 
     config: Any
     network = "model.base.network"
@@ -521,15 +611,19 @@ class PrismaticPolicy(ModelPolicy):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
         info = super().reset(obs, instruction, **kwargs)
-        self._begun().memory[UNNORM_KEY] = self._named(kwargs, self._begun().adapter)
+        episode = self._begun()
+        episode.memory[UNNORM_KEY] = self._requested_dataset(kwargs, episode.adapter)
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        """Compute the chunks of rows; the error of a row that is not valid takes the place of its
+        chunk.
+        """
+
         def prepare(row: Row) -> PreparedRow:
-            key = self._key(row)
-            return PreparedRow(
-                row, self._statistics(row.adapter).scale(key), self._model_input(row, key)
-            )
+            key = self._dataset(row)
+            scale = self._statistics(row.adapter).scale(key)
+            return PreparedRow(row, scale, self._model_input(row, key))
 
         return compute_valid([attempt(prepare, row) for row in rows], self._compute)
 
@@ -537,81 +631,109 @@ class PrismaticPolicy(ModelPolicy):
         """Return a row of any dataset; sessions may select theirs later."""
         row = super()._example(seed, instruction)
         datasets = self._statistics(row.adapter)
-        return replace(row, memory={UNNORM_KEY: self._default(row.adapter) or datasets.names[0]})
+        key = self._default_dataset(row.adapter) or datasets.names[0]
+        return replace(row, memory={UNNORM_KEY: key})
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the statistics of the adapter's datasets, if its folder has them."""
-        if not (folder / FILE).is_file():
+        """Keep the statistics of the adapter's datasets, if its folder has them.
+
+        Raises:
+            ConfigError: Its actions have other lengths than the base's.
+        """
+        if not (folder / STATISTICS_FILE).is_file():
             return
-        own, base = Statistics.of(folder, self._statistics().bounds), self._statistics()
-        dims = own.action_dims(), base.action_dims(self.config.unnorm_key)
-        if not dims[0] <= dims[1]:
+
+        base_statistics = self._statistics()
+        statistics = Statistics.from_folder(folder, base_statistics.bounds)
+        dims = statistics.action_dims()
+        base_dims = base_statistics.action_dims(self.config.unnorm_key)
+        if not dims <= base_dims:
             raise ConfigError(
-                f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want "
-                f"{sorted(dims[1])}, as the base's; merge the adapter into its base, and serve "
+                f"{folder / STATISTICS_FILE}: got actions of {sorted(dims)} numbers, want "
+                f"{sorted(base_dims)}, as the base's; merge the adapter into its base, and serve "
                 "that as a checkpoint of its own"
             )
-        self.model.base.own[adapter] = own
+        self.model.base.adapter_statistics[adapter] = statistics
 
     def _decoded(
-        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any
+        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, bin_logits: Any
     ) -> list[Prediction]:
-        """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins
-        (B, H, D, bins).
+        """Return the chunks of action tokens, with the outputs that their rows request.
+
+        Args:
+            bins: The bins of the checkpoint.
+            prepared: The B rows of the batch.
+            tokens: The chosen tokens, (B, H, D).
+            bin_logits: The logits of the bins from which they were chosen, (B, H, D, bins).
         """
-        chunks, parts = [], bins.stated(tokens, over)
+        described = bins.describe(tokens, bin_logits)
+        predictions = []
         for i, entry in enumerate(prepared):
             scale = entry.scale
-            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : scale.dim]
-            said = {
+            values, mean, spread, logprob, entropy, chosen = described[:, i, :, : scale.dim]
+            available = {
                 "logprob": self._used(logprob),
                 "entropy": float(self._used(entropy).sum()),
                 "replay": {"tokens": chosen.astype(np.int64)},
             }
-            found = scale.restore(values), scale.restore(mean), scale.restore_spread(spread)
-            chunks.append(Prediction(*found, {name: said[name] for name in entry.row.want}))
-        return chunks
+            prediction = Prediction(
+                scale.restore(values),
+                scale.restore(mean),
+                scale.restore_spread(spread),
+                {name: available[name] for name in entry.row.want},
+            )
+            predictions.append(prediction)
+        return predictions
 
     def _statistics(self, adapter: str = "") -> Statistics:
+        """Return the statistics of an adapter's datasets, or of the base's if it has none."""
         base: Prismatic = self.loaded().base
-        return base.own.get(adapter, base.statistics)
+        return base.adapter_statistics.get(adapter, base.statistics)
 
-    def _default(self, adapter: str) -> str | None:
-        """Return the dataset of the settings; None for an adapter with its own datasets."""
-        return (
-            None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
-        )
-
-    def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
-        if (key := options.get(UNNORM_KEY)) is None:
+    def _default_dataset(self, adapter: str) -> str | None:
+        """Return the dataset in the settings; None for an adapter with its own datasets."""
+        if self._statistics(adapter) is not self._statistics():
             return None
-        if not isinstance(key, str):
-            raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")
-        return self._statistics(adapter).key(key)
+        name: str | None = self.config.unnorm_key
+        return name
 
-    def _key(self, row: Row) -> str:
-        """Return the dataset of a row: that of the observation, the episode or the settings, or
-        the only one.
+    def _requested_dataset(self, options: Mapping[str, Any], adapter: str) -> str | None:
+        """Return the key of the dataset that a client names in a reset or an observation; None if
+        it names none.
         """
-        named = (
-            self._named(row.info, row.adapter)
+        name = options.get(UNNORM_KEY)
+        if name is None:
+            return None
+        if not isinstance(name, str):
+            raise InvalidObservation(
+                f"unnorm_key: got {type(name).__name__}, want a dataset's name"
+            )
+        return self._statistics(adapter).key(name)
+
+    def _dataset(self, row: Row) -> str:
+        """Return the key of a row's dataset.
+
+        It is named by the observation, the reset of the episode or the settings, in this order, or
+        is the only one.
+        """
+        name = (
+            self._requested_dataset(row.info, row.adapter)
             or row.memory.get(UNNORM_KEY)
-            or self._default(row.adapter)
+            or self._default_dataset(row.adapter)
         )
-        return self._statistics(row.adapter).key(named)
+        return self._statistics(row.adapter).key(name)
 
     def _action(self) -> ActionSpec:
         """Describe an action: its meaning depends on the dataset, except for the gripper of a
         single arm.
         """
-        dims = (
-            set() if self.model is None else self._statistics().action_dims(self.config.unnorm_key)
-        )
+        dims: set[int] = set()
+        if self.model is not None:
+            dims = self._statistics().action_dims(self.config.unnorm_key)
         dim = dims.pop() if len(dims) == 1 else None
-        single = dim == _SINGLE_ARM
-        return ActionSpec(
-            dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None
-        )
+        if dim == _SINGLE_ARM:
+            return ActionSpec(dim=dim, gripper_open=1.0, gripper_closed=0.0)
+        return ActionSpec(dim=dim)
 
 
 SIDE = 224  # px; the size of all images in OpenVLA's training data
@@ -619,9 +741,14 @@ CROP_AREA = 0.9  # share of the area that training's random crops kept
 _LOBES = 3  # of the Lanczos kernel
 
 
-def resized(image: np.ndarray) -> np.ndarray:
-    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos, unless
-    it has that size.
+def resize(image: np.ndarray) -> np.ndarray:
+    """Resize an image as the training data was resized: through JPEG of quality 95, with Lanczos.
+
+    Args:
+        image: (H, W, 3) uint8.
+
+    Returns:
+        (224, 224, 3) uint8; the image itself if it has that size.
     """
     height, width = image.shape[:2]
     if (height, width) == (SIDE, SIDE):
@@ -630,17 +757,23 @@ def resized(image: np.ndarray) -> np.ndarray:
     return _uint8(np.round(pixels), 255)
 
 
-def middle(image: np.ndarray) -> np.ndarray:
-    """Crop the central nine tenths of the area of an (H, W, 3) uint8 image, and scale them to
-    (224, 224, 3).
+def crop_center(image: np.ndarray) -> np.ndarray:
+    """Crop the central nine tenths of the area of an image, and scale them up.
+
+    Args:
+        image: (H, W, 3) uint8.
+
+    Returns:
+        (224, 224, 3) uint8.
     """
     height, width = image.shape[:2]
     pixels = _apply(_crop(height), _crop(width), image.astype(np.float32) / 255)
     return _uint8(pixels * 255.5, 255.5)  # as TensorFlow converts: add a half, then truncate
 
 
-def _uint8(pixels: np.ndarray, most: float) -> np.ndarray:
-    return np.asarray(np.clip(pixels, 0, most), np.uint8)
+def _uint8(pixels: np.ndarray, upper: float) -> np.ndarray:
+    """Clip pixels to [0, upper], and truncate them to integers."""
+    return np.asarray(np.clip(pixels, 0, upper), np.uint8)
 
 
 def _through_jpeg(image: np.ndarray) -> np.ndarray:
@@ -658,18 +791,19 @@ def _through_jpeg(image: np.ndarray) -> np.ndarray:
 
 
 def _apply(rows: np.ndarray, columns: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Resample (H, W, 3) by (224, H) and (224, W) weights."""
-    turned = np.tensordot(rows, image, (1, 0))  # (224, W, 3)
-    return np.asarray(np.tensordot(turned, columns, (1, 1)).transpose(0, 2, 1))
+    """Resample an image (H, W, 3) with weights (224, H) of its rows and (224, W) of its columns."""
+    resampled_rows = np.tensordot(rows, image, (1, 0))  # (224, W, 3)
+    return np.asarray(np.tensordot(resampled_rows, columns, (1, 1)).transpose(0, 2, 1))
 
 
 @lru_cache(maxsize=16)
 def _lanczos(size: int) -> np.ndarray:
-    """Return weights (224, size); kernels are wider where the image shrinks, so that it does not
-    alias.
+    """Return weights (224, size) that resize one axis of an image.
+
+    Kernels are wider where the image shrinks, so that it does not alias.
     """
     scale = size / SIDE
-    centres = (np.arange(SIDE) + 0.5) * scale
+    centres = (np.arange(SIDE) + 0.5) * scale  # in pixels of the original image
     x = ((np.arange(size) + 0.5) - centres[:, None]) / max(scale, 1.0)
     weights = np.where(np.abs(x) < _LOBES, np.sinc(x) * np.sinc(x / _LOBES), 0.0)
     return np.asarray(weights / weights.sum(1, keepdims=True), np.float32)
@@ -681,5 +815,7 @@ def _crop(size: int) -> np.ndarray:
     two nearest pixels.
     """
     side = CROP_AREA**0.5
-    at = (1 - side) / 2 * (size - 1) + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))
-    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(size) - at[:, None])), np.float32)
+    start = (1 - side) / 2 * (size - 1)
+    positions = start + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))  # in original pixels
+    distances = np.abs(np.arange(size) - positions[:, None])
+    return np.asarray(np.maximum(0.0, 1.0 - distances), np.float32)

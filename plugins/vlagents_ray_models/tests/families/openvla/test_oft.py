@@ -29,7 +29,7 @@ from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.openvla.oft import OpenVLAOFT
-from vlagents_ray_models.openvla.prismatic import middle, resized
+from vlagents_ray_models.openvla.prismatic import crop_center, resize
 
 pytestmark = [pytest.mark.source("OPENVLA_OFT_SRC"), *LIBRARIES]
 
@@ -127,7 +127,7 @@ class Upstream:
         """(8, 7)."""
         prompt = f"In: What action should the robot take to {words.lower()}?\nOut:"
         images = [
-            Image.fromarray(middle(resized(obs.cameras[name]))) for name in ("front", "wrist")
+            Image.fromarray(crop_center(resize(obs.cameras[name]))) for name in ("front", "wrist")
         ]
         both = [self.processor(prompt, image) for image in images]
         ranges = self.network.norm_stats[key]["proprio"]
@@ -286,7 +286,7 @@ def test_action_tokens_have_log_probabilities_and_other_heads_have_none(
     session = begun(policy, 0)
     inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
     _, over = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
-    *_, want, entropy, _ = bins.stated(tokens, over.expand(3, -1, -1, -1))
+    *_, want, entropy, _ = bins.describe(tokens, over.expand(3, -1, -1, -1))
     np.testing.assert_allclose(said["logprob"], want[0], atol=1e-4)
     np.testing.assert_allclose(act.info[DISTRIBUTION]["logprob"], want[1:], atol=1e-4)
     assert said["entropy"] == pytest.approx(entropy[0].sum(), rel=1e-4)

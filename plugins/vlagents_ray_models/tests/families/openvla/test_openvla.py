@@ -25,7 +25,7 @@ from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.testing import check_agent
 from vlagents_ray_models.openvla.policy import OpenVLA
-from vlagents_ray_models.openvla.prismatic import middle, resized
+from vlagents_ray_models.openvla.prismatic import crop_center, resize
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
 
@@ -214,7 +214,7 @@ def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
     scale = policy.model.base.statistics.scale("bridge_orig")
     chosen = torch.tensor(tokens)
     return scale.restore(
-        policy.model.base.bins.stated(chosen, torch.zeros(*chosen.shape, 256).double())[0]
+        policy.model.base.bins.describe(chosen, torch.zeros(*chosen.shape, 256).double())[0]
     )
 
 
@@ -241,7 +241,7 @@ def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
     [got], [plain] = cropping.perceive(obs).values(), loaded("openvla").perceive(obs).values()
-    [want] = cropping.model.base.stage([middle(resized(obs.cameras["front"]))]).values()
+    [want] = cropping.model.base.stage([crop_center(resize(obs.cameras["front"]))]).values()
     np.testing.assert_array_equal(got, want)
     assert not np.array_equal(got, plain)
 
