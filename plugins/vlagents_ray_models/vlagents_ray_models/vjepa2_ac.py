@@ -1,4 +1,4 @@
-"""V-JEPA 2-AC (arXiv 2506.09985): plans to a goal image in a learned world model, by the
+"""V-JEPA 2-AC (arXiv 2506.09985), which plans to a goal image in a learned world model with the
 cross-entropy method.
 """
 
@@ -99,7 +99,7 @@ class VJepa2AcConfig(ModelConfig):
         return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
     @model_validator(mode="after")
-    def _chosen_from_more(self) -> Self:
+    def _topk_within_samples(self) -> Self:
         if self.topk > self.samples:
             raise ValueError(
                 f"topk {self.topk} is over samples {self.samples}; want it to be a small part of "
@@ -108,32 +108,54 @@ class VJepa2AcConfig(ModelConfig):
         return self
 
 
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, for colours in [0, 1]
-_HEADS = {1024: 16, 1280: 16, 1408: 22}  # of ViT-L, ViT-H and ViT-g, by their width
+# Colours of ImageNet, in [0, 1].
+_MEAN = (0.485, 0.456, 0.406)
+_STD = (0.229, 0.224, 0.225)
+# Width of an encoder -> its attention heads, for ViT-L, ViT-H and ViT-g.
+_HEADS = {1024: 16, 1280: 16, 1408: 22}
 
+# Tensors of an encoder, by transformers' names.
 _PATCHES = "encoder.embeddings.patch_embeddings.proj.weight"
+_FIRST_MLP = "encoder.layer.0.mlp.fc1.weight"
 
 
 def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
-    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream does, to (3, side, side)
-    float32.
+    """Crop, resize and normalise an image as upstream does.
+
+    Args:
+        image: (H, W, 3) uint8.
+        side: The side of the result, px.
+
+    Returns:
+        (3, side, side) float32.
     """
     torch = require("torch")
     height, width = image.shape[:2]
     edge = min(height, width)
     top, left = (height - edge) // 2, (width - edge) // 2
-    square = torch.tensor(image[top : top + edge, left : left + edge], dtype=torch.float32).permute(
-        2, 0, 1
-    )[None]
-    resized = torch.nn.functional.interpolate(
-        square, size=(side, side), mode="bilinear", align_corners=False
-    )[0]
+    square = torch.tensor(image[top : top + edge, left : left + edge], dtype=torch.float32)
+    [resized] = torch.nn.functional.interpolate(
+        square.permute(2, 0, 1)[None], size=(side, side), mode="bilinear", align_corners=False
+    )
+
     mean, std = (torch.tensor(values)[:, None, None] * 255 for values in (_MEAN, _STD))
     return np.asarray(((resized - mean) / std).numpy())
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:
-    """Load the `VJEPA2Model` of `config.encoder`, or make one from upstream's weights `saved`."""
+    """Load the encoder.
+
+    Args:
+        config: The settings of the policy, whose `encoder` may name a saved `VJEPA2Model`.
+        saved: Upstream's weights, which are used if `config.encoder` is unset; None if the
+            checkpoint has none.
+
+    Returns:
+        A `VJEPA2Model` of transformers.
+
+    Raises:
+        ConfigError: There is no encoder, it lacks weights, or it is for images of another size.
+    """
     ensure_torchvision()
     transformers = require("transformers")
     if config.encoder is not None:
@@ -155,24 +177,33 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
 
 
 def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
-    """Make a `VJEPA2Model` with upstream's weights; raises `ConfigError` if some are missing."""
+    """Make a `VJEPA2Model` with upstream's weights.
+
+    Args:
+        saved: Upstream's tensors by name.
+        config: The settings of the policy.
+
+    Raises:
+        ConfigError: Weights are missing, or the number of attention heads is unknown.
+    """
     transformers = require("transformers")
     tensors = _renamed(saved)
     width, _, tubelet, patch, _ = tensors[_PATCHES].shape
-    if (heads := config.encoder_heads or _HEADS.get(width)) is None:
+    heads = config.encoder_heads or _HEADS.get(width)
+    if heads is None:
         raise ConfigError(
             f"encoder_heads: unset, and {width} is the width of none of {sorted(_HEADS)}; set it"
         )
+
+    layers = {name.split(".")[2] for name in tensors if name.startswith("encoder.layer.")}
     settings = transformers.VJEPA2Config(
         patch_size=patch,
         crop_size=config.image_size,
         tubelet_size=tubelet,
         hidden_size=width,
         num_attention_heads=heads,
-        num_hidden_layers=len(
-            {name.split(".")[2] for name in tensors if name.startswith("encoder.layer.")}
-        ),
-        mlp_ratio=tensors["encoder.layer.0.mlp.fc1.weight"].shape[0] / width,
+        num_hidden_layers=len(layers),
+        mlp_ratio=tensors[_FIRST_MLP].shape[0] / width,
         pred_num_hidden_layers=1,  # V-JEPA 2's own predictor of masked patches is not used
     )
     model = transformers.VJEPA2Model(settings)
@@ -187,23 +218,24 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
 
 
 def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename upstream's tensors to transformers' names; upstream stores query, key and value in
-    one matrix.
+    """Return upstream's tensors by transformers' names.
+
+    Upstream stores query, key and value in one matrix, transformers in three.
     """
     tensors: dict[str, Any] = {}
-    for name, tensor in saved.items():
-        new = (
-            f"encoder.{name}".replace(
-                "encoder.patch_embed.", "encoder.embeddings.patch_embeddings."
-            )
-            .replace("encoder.norm.", "encoder.layernorm.")
-            .replace("encoder.blocks.", "encoder.layer.")
-            .replace(".attn.", ".attention.")
-        )
-        kinds = ("query", "key", "value") if ".qkv." in new else ("qkv",)
-        for kind, share in zip(kinds, tensor.chunk(len(kinds)), strict=True):
-            tensors[new.replace("qkv", kind)] = share
-    if _PATCHES not in tensors or "encoder.layer.0.mlp.fc1.weight" not in tensors:
+    for upstream_name, tensor in saved.items():
+        name = f"encoder.{upstream_name}"
+        name = name.replace("encoder.patch_embed.", "encoder.embeddings.patch_embeddings.")
+        name = name.replace("encoder.norm.", "encoder.layernorm.")
+        name = name.replace("encoder.blocks.", "encoder.layer.")
+        name = name.replace(".attn.", ".attention.")
+        if ".qkv." not in name:
+            tensors[name] = tensor
+            continue
+        for projection, matrix in zip(("query", "key", "value"), tensor.chunk(3), strict=True):
+            tensors[name.replace("qkv", projection)] = matrix
+
+    if _PATCHES not in tensors or _FIRST_MLP not in tensors:
         raise ConfigError(
             f"the checkpoint's encoder: got {sorted(saved)[:4]}, want names as "
             "'patch_embed.proj.weight', upstream's"
@@ -211,13 +243,21 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
     return tensors
 
 
-# Added by distributed training and upstream's wrapper.
+# Prefixes of names, from distributed training and upstream's wrapper.
 _PREFIXES = re.compile(r"module\.|backbone\.")
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
-    """Read the tensors of the parts "encoder" and "predictor" of upstream's file; nothing is
-    unpickled.
+    """Read upstream's file, of which nothing is unpickled but tensors.
+
+    Args:
+        config: The settings of the policy, which name the checkpoint.
+
+    Returns:
+        The tensors by name of each network in the file: "predictor", and "encoder" if there is one.
+
+    Raises:
+        ConfigError: There is no file, or there are several, or it has no predictor.
     """
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
@@ -226,30 +266,47 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
         raise ConfigError(
             f"checkpoint {path}: got {[file.name for file in files]}, want one .pt file; name it"
         )
+
     [file] = files
     try:
-        parts = torch.load(file, map_location="cpu", weights_only=True)
+        content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
         raise ConfigError(
             f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's "
             ".pt"
         ) from error
-    if not isinstance(parts, Mapping) or not isinstance(parts.get("predictor"), Mapping):
-        got = sorted(map(str, parts))[:8] if isinstance(parts, Mapping) else type(parts).__name__
+    if not isinstance(content, Mapping) or not isinstance(content.get("predictor"), Mapping):
+        description: object = type(content).__name__
+        if isinstance(content, Mapping):
+            description = sorted(map(str, content))[:8]
         raise ConfigError(
-            f"checkpoint {file}: got {got}, want 'predictor' among them; is it V-JEPA 2-AC's, and "
-            "not V-JEPA 2's?"
+            f"checkpoint {file}: got {description}, want 'predictor' among them; is it V-JEPA "
+            "2-AC's, and not V-JEPA 2's?"
         )
-    return {
-        name: {_PREFIXES.sub("", str(key)): tensor for key, tensor in part.items()}
-        for name, part in parts.items()
-        if isinstance(part, Mapping)
-    }
+
+    networks: dict[str, dict[str, Any]] = {}
+    for network, tensors in content.items():
+        if isinstance(tensors, Mapping):
+            networks[network] = {
+                _PREFIXES.sub("", str(name)): tensor for name, tensor in tensors.items()
+            }
+    return networks
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
-    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or if the
-    encoder does not fit.
+    """Load the predictor.
+
+    Args:
+        config: The settings of the policy.
+        saved: The predictor's tensors by name.
+        width: The width of the encoder's features.
+
+    Returns:
+        The network, of upstream's own code.
+
+    Raises:
+        MissingDependency: The predictor's code is missing.
+        ConfigError: A weight is missing, or the encoder does not fit.
     """
     use_source("src", "VJEPA2_SRC", config.source_dir)
     try:
@@ -259,17 +316,18 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
             f"the predictor's code cannot be imported: no module {error.name!r}; is `src` "
             "vjepa2's, and timm installed?"
         ) from error
+
     embedding = saved.get("predictor_embed.weight")
     if embedding is None or embedding.shape[1] != width:
-        got = (
-            "no 'predictor_embed.weight'"
-            if embedding is None
-            else f"a predictor of features {embedding.shape[1]} wide"
-        )
+        description = "no 'predictor_embed.weight'"
+        if embedding is not None:
+            description = f"a predictor of features {embedding.shape[1]} wide"
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: got {got}, want {width}, the encoder's; they "
-            "belong together"
+            f"checkpoint {config.checkpoint!r}: got {description}, want {width}, the encoder's; "
+            "they belong together"
         )
+
+    blocks = {name.split(".")[1] for name in saved if name.startswith("predictor_blocks.")}
     model = module.vit_ac_predictor(
         img_size=(config.image_size, config.image_size),
         # Tubelets have two frames; this sets only the size of the mask.
@@ -277,7 +335,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
         tubelet_size=2,
         embed_dim=width,
         predictor_embed_dim=embedding.shape[0],
-        depth=len({name.split(".")[1] for name in saved if name.startswith("predictor_blocks.")}),
+        depth=len(blocks),
         num_heads=config.predictor_heads,
     )
     try:
@@ -291,9 +349,10 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
 
 
 @contextmanager
-def usual_attention() -> Iterator[None]:
-    """Make upstream's attention use torch's choice of a kernel; upstream's own switch cannot be
-    compiled.
+def default_attention() -> Iterator[None]:
+    """Make upstream's attention use the kernel that torch selects.
+
+    Upstream selects one itself, which cannot be compiled.
     """
     backend = require("torch").backends.cuda
     setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
@@ -310,8 +369,8 @@ poses (M, T, 7).
 """
 
 DRAWN = 4  # sampled components of an action: x, y, z and the gripper
-_GRIPPER_RANGE = 0.75  # largest change of the gripper in a step
-_GRIPPER_REST = 0.25  # smaller changes become zero
+_MAX_GRIPPER_CHANGE = 0.75  # in a step
+_MIN_GRIPPER_CHANGE = 0.25  # smaller changes become zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,15 +390,18 @@ def plan(
     noise: Tensor,
     config: VJepa2AcConfig,
 ) -> Plans:
-    """Search for plans by the cross-entropy method, with I iterations of S samples of H actions.
+    """Search for plans with the cross-entropy method, in I iterations of S samples of H actions.
 
     Args:
         world: The predictor.
-        features: (B, N, F), of the current images.
-        poses: (B, 7), the current poses.
-        goals: (B, N, F), features of the goal images.
+        features: The features of the current images, (B, N, F).
+        poses: The current poses, (B, 7).
+        goals: The features of the goal images, (B, N, F).
         noise: (B, I, H, S, 4), standard normal.
         config: The settings of the search.
+
+    Returns:
+        The plan of each of the B sessions.
     """
     torch = require("torch")
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
@@ -347,62 +409,82 @@ def plan(
     std[..., :3] = config.maxnorm
     keep_mean = mean.new_tensor([config.momentum_mean] * 3 + [config.momentum_mean_gripper])
     keep_std = mean.new_tensor([config.momentum_std] * 3 + [config.momentum_std_gripper])
+
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
-        tried = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
-        energy = _energies(
-            world, features, poses, goals, _actions(tried.transpose(1, 2)), config.plans_a_pass
-        )
+        samples = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
+        actions = _actions(samples.transpose(1, 2))
+        energy = _energies(world, features, poses, goals, actions, config.plans_a_pass)
         best = energy.topk(config.topk, largest=False).indices  # (B, K)
-        chosen = tried.gather(2, best[:, None, :, None].expand(-1, config.rollout, -1, DRAWN))
+        chosen = samples.gather(2, best[:, None, :, None].expand(-1, config.rollout, -1, DRAWN))
         mean = chosen.mean(2) * (1 - keep_mean) + mean * keep_mean
         std = chosen.std(2) * (1 - keep_std) + std * keep_std
+
     gripper = mean[..., 3:]
-    rested = torch.cat(
-        [mean[..., :3], torch.where(gripper.abs() < _GRIPPER_REST, 0.0, gripper)], -1
-    )
-    return Plans(_actions(rested), _actions(std), energy.min(1).values)
+    gripper = torch.where(gripper.abs() < _MIN_GRIPPER_CHANGE, 0.0, gripper)
+    planned = torch.cat([mean[..., :3], gripper], -1)
+    return Plans(_actions(planned), _actions(std), energy.min(1).values)
 
 
-def _bounded(tried: Tensor, config: VJepa2AcConfig) -> Tensor:
+def _bounded(samples: Tensor, config: VJepa2AcConfig) -> Tensor:
     """Limit sampled actions, (B, H, S, 4), to the largest change in one step."""
     torch = require("torch")
-    position = tried[..., :3].clip(-config.maxnorm, config.maxnorm)
-    gripper = tried[..., 3:].clip(-_GRIPPER_RANGE, _GRIPPER_RANGE)
+    position = samples[..., :3].clip(-config.maxnorm, config.maxnorm)
+    gripper = samples[..., 3:].clip(-_MAX_GRIPPER_CHANGE, _MAX_GRIPPER_CHANGE)
     if config.close_gripper is not None:
         gripper[:, config.close_gripper :] = 1.0
     return torch.cat([position, gripper], -1)
 
 
-def _actions(drawn: Tensor) -> Tensor:
+def _actions(samples: Tensor) -> Tensor:
     """Expand sampled actions (..., 4) to (..., 7), without rotation."""
     torch = require("torch")
-    return torch.cat([drawn[..., :3], torch.zeros_like(drawn[..., :3]), drawn[..., 3:]], -1)
+    position, gripper = samples[..., :3], samples[..., 3:]
+    return torch.cat([position, torch.zeros_like(position), gripper], -1)
 
 
 def _energies(
-    world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, most: int
+    world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, pass_size: int
 ) -> Tensor:
-    """Compute the mean absolute difference (B, S) between the goal and the prediction for
-    actions (B, S, H, 7).
+    """Compute how far plans end from their goals.
+
+    Args:
+        world: The predictor.
+        features: The features of the current images, (B, N, F).
+        poses: The current poses, (B, 7).
+        goals: The features of the goal images, (B, N, F).
+        actions: The actions of S plans of each session, (B, S, H, 7).
+        pass_size: The largest number of plans in a forward pass.
+
+    Returns:
+        The mean absolute difference between the goal and the predicted features, (B, S).
     """
     torch = require("torch")
     sessions, samples, horizon = actions.shape[:3]
-    flat = actions.flatten(0, 1)
-    owner = torch.arange(sessions, device=poses.device).repeat_interleave(samples)
-    found = []
-    for tried, whose in zip(flat.split(most), owner.split(most), strict=True):
-        frames, path = features[whose][:, None], poses[whose][:, None]
+    owners = torch.arange(sessions, device=poses.device).repeat_interleave(samples)
+    all_plans = actions.flatten(0, 1)
+
+    energies = []
+    for plans, owner in zip(all_plans.split(pass_size), owners.split(pass_size), strict=True):
+        frames, path = features[owner][:, None], poses[owner][:, None]
         for step in range(horizon):
-            following = world(frames, tried[:, : step + 1], path)
-            frames = torch.cat([frames, following[:, None]], 1)
-            path = torch.cat([path, moved(path[:, -1], tried[:, step])[:, None]], 1)
-        found.append((frames[:, -1] - goals[whose]).abs().flatten(1).mean(1))
-    return torch.cat(found).view(sessions, samples)
+            next_frame = world(frames, plans[:, : step + 1], path)
+            frames = torch.cat([frames, next_frame[:, None]], 1)
+            path = torch.cat([path, moved(path[:, -1], plans[:, step])[:, None]], 1)
+        energies.append((frames[:, -1] - goals[owner]).abs().flatten(1).mean(1))
+    return torch.cat(energies).view(sessions, samples)
 
 
 def moved(poses: Tensor, actions: Tensor) -> Tensor:
-    """Apply actions (M, 7) without rotation to poses (M, 7): x, y, z, Euler angles, closedness."""
+    """Return poses after actions.
+
+    Args:
+        poses: (M, 7): x, y, z, m; Euler angles, rad; closedness of the gripper in [0, 1].
+        actions: (M, 7), changes of these, without rotation.
+
+    Returns:
+        The poses, (M, 7).
+    """
     torch = require("torch")
     closedness = (poses[:, 6:] + actions[:, 6:]).clip(0, 1)
     return torch.cat([poses[:, :3] + actions[:, :3], poses[:, 3:6], closedness], -1)
@@ -418,21 +500,18 @@ class Goal:
 
     def __init__(self, pixels: np.ndarray, features: Any = None) -> None:
         self.pixels = pixels  # (3, side, side) float32
-        self.features = (
-            # (N, F) float32, a tensor on the model's device, or an array of a pickle; None: not
-            # yet.
-            features
-        )
+        # (N, F) float32: a tensor on the model's device, or an array from a pickle; None before
+        # they are computed.
+        self.features = features
 
     def __deepcopy__(self, memo: object) -> Goal:
-        return self  # of samples, which share the features
+        return self  # samples of a session copy its memory, and share the features
 
     def __reduce__(self) -> tuple[type[Goal], tuple[np.ndarray, np.ndarray | None]]:
         features = self.features
-        return Goal, (
-            self.pixels,
-            features if features is None or isinstance(features, np.ndarray) else fetch(features),
-        )
+        if features is not None and not isinstance(features, np.ndarray):
+            features = fetch(features)
+        return Goal, (self.pixels, features)
 
 
 @dataclass(frozen=True, slots=True)
@@ -444,8 +523,9 @@ class Frame:
 
 
 class WorldModel:
-    """The encoder and the predictor; weights and features are float32, but computations may use
-    another type.
+    """The encoder and the predictor.
+
+    Weights and features are float32, but computations may use another type.
     """
 
     def __init__(
@@ -458,19 +538,19 @@ class WorldModel:
     ) -> None:
         self._encoder, self._predictor = encoder, predictor
         self._encode = compilation.core("encode", self._features)
-        self._following = [  # by the number of known frames
-            compilation.core(f"predict frame {frames + 1}", self._predict, config.plans_a_pass)
-            for frames in range(1, config.rollout + 1)
-        ]
-        layer_norm = require("torch").nn.functional.layer_norm
-        self._normalized: Any = lambda found: (
-            layer_norm(found, found.shape[-1:]) if config.normalize else found
-        )
+        # Number of known frames - 1 -> the predictor of the next frame.
+        self._predictors = []
+        for frames in range(1, config.rollout + 1):
+            name = f"predict frame {frames + 1}"
+            self._predictors.append(compilation.core(name, self._predict, config.plans_a_pass))
+        self._layer_norm = require("torch").nn.functional.layer_norm
+        self._normalizes = config.normalize
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
-        """Return a context that computes in `dtype`, as in upstream's training; attention needs
-        weights of one type.
+        """Return a context that computes in `dtype`, as in upstream's training.
+
+        Attention needs weights of one type.
         """
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
@@ -482,19 +562,24 @@ class WorldModel:
 
     def _features(self, images: Tensor) -> Tensor:
         clip = images[:, None].repeat(1, 2, 1, 1, 1)  # the two frames of one step of the encoder
-        return self._normalized(
-            self._encoder(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float()
-        )
+        encoded = self._encoder(pixel_values_videos=clip, skip_predictor=True)
+        return self._normalized(encoded.last_hidden_state.float())
+
+    def _normalized(self, features: Tensor) -> Tensor:
+        """Return features (…, F), normalised if the model was trained that way."""
+        if not self._normalizes:
+            return features
+        return self._layer_norm(features, features.shape[-1:])
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """Predict the next frame's features (see `World`)."""
-        return self._following[features.shape[1] - 1](features, actions, poses)
+        predict = self._predictors[features.shape[1] - 1]
+        return predict(features, actions, poses)
 
     def _predict(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         tokens = features.shape[2]
-        return self._normalized(
-            self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float()
-        )
+        predicted = self._predictor(features.flatten(1, 2), actions, poses)
+        return self._normalized(predicted[:, -tokens:].float())
 
 
 class VJepa2Ac(ModelPolicy):
@@ -533,6 +618,12 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def load(self) -> WorldModel:
+        """Read the checkpoint, and the encoder if it is another one.
+
+        Raises:
+            ConfigError: A weight is missing, or the settings do not fit the checkpoint.
+            MissingDependency: The predictor's code is missing.
+        """
         saved = read_checkpoint(self.config)
         device = torch_device(self.config.device)
         # Upstream plans in float32.
@@ -548,10 +639,13 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def notice(self, obs: Obs) -> None:
-        """Set the goal to that of an observation, if it has one; the features of an unchanged
-        image are kept.
+        """Set the goal image, if an observation has one; an unchanged image keeps its features.
+
+        Raises:
+            InvalidObservation: It is no image.
         """
-        if (image := obs.info.get(GOAL_IMAGE)) is None:
+        image = obs.info.get(GOAL_IMAGE)
+        if image is None:
             return
         if (
             not isinstance(image, np.ndarray)
@@ -559,23 +653,28 @@ class VJepa2Ac(ModelPolicy):
             or image.shape[2] != 3
             or image.dtype != np.uint8
         ):
-            got = (
-                f"{image.shape} {image.dtype}"
-                if isinstance(image, np.ndarray)
-                else type(image).__name__
+            description = type(image).__name__
+            if isinstance(image, np.ndarray):
+                description = f"{image.shape} {image.dtype}"
+            raise InvalidObservation(
+                f"info[{GOAL_IMAGE!r}]: got {description}, want (H, W, 3) uint8 RGB"
             )
-            raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
+
         pixels, memory = to_pixels(image, self.config.image_size), self._begun().memory
         if _GOAL not in memory or not np.array_equal(pixels, memory[_GOAL].pixels):
             memory[_GOAL] = Goal(pixels)
 
     def perceive(self, obs: Obs) -> Frame:
+        """Return the camera's image in the encoder's format, and the pose with the gripper's
+        closedness.
+        """
         pose = state_vector(obs, [*self._state, GRIPPER], 7)
         pose[6] = 1 - pose[6]
         [image] = camera_images(obs, self._cameras).values()
         return Frame(to_pixels(image, self.config.image_size), pose)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        """Plan for all rows that have a goal; the others fail."""
         no_goal = InvalidObservation(
             f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) "
             "uint8"
@@ -586,34 +685,36 @@ class VJepa2Ac(ModelPolicy):
         torch = require("torch")
         config, world = self.config, self.model
         goals = [row.memory[_GOAL] for row in rows]
-        # Each once, for all its samples.
+        # Samples of a session share a goal, which is encoded once.
         new_goals = [goal for goal in dict.fromkeys(goals) if goal.features is None]
-        shape = (config.iterations, config.rollout, config.samples, DRAWN)
-        with torch.inference_mode(), world.autocast(), usual_attention():
+        noise_shape = (config.iterations, config.rollout, config.samples, DRAWN)
+
+        with torch.inference_mode(), world.autocast(), default_attention():
             features = world.encode([row.frames[-1].pixels for row in rows])
-            features_of_new = world.encode([goal.pixels for goal in new_goals]) if new_goals else []
-            for goal, goal_features in zip(new_goals, features_of_new, strict=True):
+            device = features.device
+            new_features = world.encode([goal.pixels for goal in new_goals]) if new_goals else []
+            for goal, goal_features in zip(new_goals, new_features, strict=True):
                 goal.features = goal_features.clone()
             for goal in goals:
-                goal.features = torch.as_tensor(goal.features).to(
-                    features.device, non_blocking=True
-                )
-            poses, noise = (
-                torch.as_tensor(np.stack(parts)).to(features.device, non_blocking=True)
-                for parts in (
-                    [row.frames[-1].pose for row in rows],
-                    [row.noise(*shape) for row in rows],
-                )
+                goal.features = torch.as_tensor(goal.features).to(device, non_blocking=True)
+
+            poses = torch.as_tensor(np.stack([row.frames[-1].pose for row in rows]))
+            noise = torch.as_tensor(np.stack([row.noise(*noise_shape) for row in rows]))
+            plans = plan(
+                world,
+                features,
+                poses.to(device, non_blocking=True),
+                torch.stack([goal.features for goal in goals]),
+                noise.to(device, non_blocking=True),
+                config,
             )
-            goal_features = torch.stack([goal.features for goal in goals])
-            plans = plan(world, features, poses, goal_features, noise, config)
-        actions, std, energy = (fetch(part) for part in (plans.actions, plans.std, plans.energy))
+
+        actions, std, energy = fetch(plans.actions), fetch(plans.std), fetch(plans.energy)
         predictions = []
         for i, row in enumerate(rows):
             steps = _openings(actions[i], row.frames[-1].pose[6])
-            predictions.append(
-                Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])})
-            )
+            info = {"energy": float(energy[i])}
+            predictions.append(Prediction(steps, mean=steps, std=std[i], info=info))
         return predictions
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
@@ -622,11 +723,14 @@ class VJepa2Ac(ModelPolicy):
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
-    """Replace the last column of plans (H, 7), the change of the gripper, by its opening after
-    each step.
+    """Return a plan with the opening of the gripper after each step, instead of its change.
+
+    Args:
+        actions: The plan, (H, 7); the last column is the change of the gripper's closedness.
+        closedness: The closedness at the start.
     """
-    opened = actions.copy()
-    for row in opened:
-        closedness = float(np.clip(closedness + row[6], 0, 1))
-        row[6] = 1 - closedness
-    return opened
+    converted = actions.copy()
+    for action in converted:
+        closedness = float(np.clip(closedness + action[6], 0, 1))
+        action[6] = 1 - closedness
+    return converted
