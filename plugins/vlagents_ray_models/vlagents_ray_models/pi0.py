@@ -40,8 +40,9 @@ logger = logging.getLogger(__name__)
 
 # openpi's names, in the order of the image tokens.
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
-USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
-USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
+# Defaults: openpi's name of each camera -> ours, and the parts of LIBERO's state.
+DEFAULT_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
+DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
 _ROUNDING = 1e-5  # of float32, for pixels of about 1
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
 _BILINEAR = 2  # Pillow's number of that filter
@@ -58,13 +59,13 @@ class Pi0Config(ModelConfig):
     cameras: dict[str, str] | None = Field(
         default=None,
         description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: "
-        f"{USUAL_CAMERAS}",
+        f"{DEFAULT_CAMERAS}",
     )
     images: InputStyle | None = Field(
         default=None,
         description="whose code prepared images and instructions in training: openpi for weights "
-        "converted from there; "
-        "unset: transformers, unless its image processor resizes bilinearly or does not pad",
+        "converted from there; unset: transformers, unless its image processor resizes bilinearly "
+        "or does not pad",
     )
     steps: int | None = Field(
         default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10"
@@ -87,7 +88,7 @@ class LoadedPi0:
     staging: Staging
     scale: tuple[Any, Any, Any]  # see `_scale`
 
-    def planned(self, row: Row) -> Row:
+    def normalised_plan(self, row: Row) -> Row:
         """Return the row with its leftover actions in the model's units."""
         if row.leftover is None:
             return row
@@ -102,6 +103,7 @@ class LoadedPi0:
         return np.asarray(flow[..., : len(mean)] * std + mean)
 
     def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean and the standard deviation of actions, each (D,) float32."""
         mean, std = self.processor.actions_mean, self.processor.actions_std
         return np.asarray(mean, np.float32), np.asarray(std, np.float32) + np.float32(_EPSILON)
 
@@ -118,13 +120,13 @@ class Pi0(ModelPolicy):
     def __init__(self, config: Pi0Config) -> None:
         super().__init__(config)
         self.cameras = _cameras(config.cameras)
-        self.state = tuple(config.state or USUAL_STATE)
+        self.state = tuple(config.state or DEFAULT_STATE)
 
     @property
     def contract(self) -> Contract:
-        loaded = self.model
-        horizon = None if loaded is None else loaded.network.config.chunk_size
-        action = ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean))
+        model = self.model
+        horizon = None if model is None else model.network.config.chunk_size
+        action = ActionSpec(dim=None if model is None else len(model.processor.actions_mean))
         behaviour = self.offered(OFFERED if self.config.noise_level else ())
         return self.stated(self.cameras, self.state, horizon, action=action, behaviour=behaviour)
 
@@ -137,6 +139,11 @@ class Pi0(ModelPolicy):
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedPi0:
+        """Read the checkpoint.
+
+        Raises:
+            ConfigError: It is incomplete, or its image processor does more than scale.
+        """
         path = find_checkpoint(
             self.config.checkpoint,
             self.config.checkpoint_step,
@@ -144,32 +151,41 @@ class Pi0(ModelPolicy):
         )
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
+
         ensure_torchvision()
-        network = from_pretrained(
-            require("transformers").PI0ForConditionalGeneration, path, dtype=dtype
-        )
+        model_class = require("transformers").PI0ForConditionalGeneration
+        network = from_pretrained(model_class, path, dtype=dtype)
         network = network.eval().requires_grad_(False).to(device)
         passes = Pi0HfPasses(network, self.compilation)
         passes.adapters = self.adapters
+
         processor, staging = _processor(path), Staging(device)
         style = self._style(processor)
         logger.info("images and instructions are prepared as in %s; `images` changes that", style)
         return LoadedPi0(network, processor, dtype, passes, staging, _scale(processor, staging))
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Refuse an adapter whose folder has statistics that differ from the base's."""
+        """Check that an adapter's folder has no statistics, or those of the base.
+
+        Raises:
+            ConfigError: Its statistics differ from the base's.
+        """
         file = folder / _PROCESSOR
+        if not file.is_file():
+            return
         try:
-            saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+            saved = dict(json.loads(file.read_text(encoding="utf-8")))
         except (TypeError, ValueError) as error:
             raise ConfigError(
                 f"{file}: is no processor's config ({error}); copy it again"
             ) from error
+
         base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
-        if other := [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]:
+        different = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
+        if different:
             raise ConfigError(
-                f"{file}: got other {other} than the base has, want the same; merge the adapter "
-                "into its base, and serve that as a checkpoint of its own"
+                f"{file}: got other {different} than the base has, want the same; merge the "
+                "adapter into its base, and serve that as a checkpoint of its own"
             )
 
     def perceive(self, obs: Obs) -> StagedRow:
@@ -178,40 +194,42 @@ class Pi0(ModelPolicy):
 
         Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
         """
-        processor, torch = self.loaded().processor, require("torch")
+        model, torch = self.loaded(), require("torch")
         cameras = camera_images(obs, self.cameras)
         images = self._resized([cameras[name] for name in self.cameras])
+
+        processor = model.processor
         state = np.zeros(processor.max_state_dim, np.float32)
         values = state_vector(obs, self.state, self.state_dim)
         state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
-        staged: StagedRow = self.loaded().staging.stage(
-            {**self._begun().prompt, **images, "state": state}
-        )
+
+        inputs = {**self._begun().prompt, **images, "state": state}
+        staged: StagedRow = model.staging.stage(inputs)
         return staged
 
     def _style(self, processor: Any) -> InputStyle:
         """Return whose preparation of images and instructions the checkpoint was trained with."""
+        if self.config.images is not None:
+            return self.config.images
         images = processor.image_processor
         resizes_as_openpi = images.resample is not None and int(images.resample) == _BILINEAR
-        usual: InputStyle = (
-            "transformers"
-            if images.do_resize and images.do_pad and not resizes_as_openpi
-            else "openpi"
-        )
-        return self.config.images or usual
+        if images.do_resize and images.do_pad and not resizes_as_openpi:
+            return "transformers"
+        return "openpi"
 
     def _resized(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Resize the images (H, W, 3) of all cameras, and pad them with zeros.
 
         Returns:
-            "images" (cameras, S, S, 3) uint8; as in transformers, also "sizes" (cameras, 2) int64,
-            in pixels: those of the resized images at the upper left, since transformers pads them
-            after it has scaled the colours.
+            "images" (cameras, S, S, 3) uint8. If images are prepared as in transformers, also
+            "sizes" (cameras, 2) int64: height and width, px, of the resized images, which are at
+            the upper left. transformers pads images after it has scaled the colours.
         """
         processor = self.loaded().processor.image_processor
         height, width = processor.pad_size["height"], processor.pad_size["width"]
         if self._style(self.loaded().processor) == "openpi":
             return {"images": np.stack([resize_with_pad(image, height, width) for image in images])}
+
         padded = np.zeros((len(images), height, width, 3), np.uint8)
         sizes = np.zeros((len(images), 2), np.int64)
         for i, image in enumerate(images):
@@ -223,31 +241,38 @@ class Pi0(ModelPolicy):
                 input_data_format="channels_last",
                 return_tensors="np",
             )["pixel_values"][0]
-            sizes[i] = resized.shape[1:]
-            padded[i, : sizes[i, 0], : sizes[i, 1]] = np.moveaxis(resized, 0, -1)
+            _, rows, columns = resized.shape
+            sizes[i] = rows, columns
+            padded[i, :rows, :columns] = np.moveaxis(resized, 0, -1)
         return {"images": padded, "sizes": sizes}
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        """Begin an episode and tokenize its instruction; one longer than in training is refused,
-        not truncated.
+        """Begin an episode and tokenize its instruction.
+
+        Raises:
+            InvalidObservation: The instruction is longer than in training, or contains the token of
+                an image; it is never truncated.
         """
         super()._begin(instruction, seed, adapter)
         if self.model is None:
             return
-        processor, most = self.model.processor, self.config.max_tokens
+
+        processor, max_tokens = self.model.processor, self.config.max_tokens
         patches = len(self.cameras) * processor.image_seq_length
         text = _openpi_text(instruction) if self._style(processor) == "openpi" else instruction
         tokens = processor.tokenizer(
             [f"{processor.image_token * patches}{processor.tokenizer.bos_token}{text}\n"],
             padding="max_length",
-            max_length=patches + most,
+            max_length=patches + max_tokens,
             padding_side="right",
             return_tensors="np",
         )
-        if (got := int(tokens["attention_mask"].sum()) - patches) > most:
+
+        text_tokens = int(tokens["attention_mask"].sum()) - patches
+        if text_tokens > max_tokens:
             raise InvalidObservation(
-                f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, "
-                "or set the policy's max_tokens"
+                f"instruction: got {text_tokens} tokens, want at most {max_tokens}, as in "
+                "training; shorten it, or set the policy's max_tokens"
             )
         if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
             raise InvalidObservation(
@@ -257,70 +282,75 @@ class Pi0(ModelPolicy):
         self._begun().prompt = {name: array[0] for name, array in tokens.items()}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        model, (firsts, owners) = self.loaded(), shared_frames(rows)
+        """Compute the chunks of rows, in one pass for each step of the flow."""
+        model = self.loaded()
         settings = model.network.config
+        noise_shape = (settings.chunk_size, settings.max_action_dim)
+        firsts, owners = shared_frames(rows)
         with require("torch").inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
-            cameras = inputs["pixel_attention_mask"].unbind(1)
-            others = (inputs[name] for name in ("input_ids", "attention_mask", "state"))
-            flows, stated = model.passes.chunks(
-                [model.planned(row) for row in rows],
-                [[inputs["pixel_values"]], cameras, *others],
+            flows, behaviours = model.passes.chunks(
+                [model.normalised_plan(row) for row in rows],
+                [
+                    [inputs["pixel_values"]],
+                    inputs["pixel_attention_mask"].unbind(1),
+                    inputs["input_ids"],
+                    inputs["attention_mask"],
+                    inputs["state"],
+                ],
                 owners,
-                noise=np.stack(
-                    [row.noise(settings.chunk_size, settings.max_action_dim) for row in rows]
-                ),
+                noise=np.stack([row.noise(*noise_shape) for row in rows]),
                 steps=self.config.steps or settings.num_inference_steps,
                 config=self.config,
                 dim=len(model.processor.actions_mean),
                 convert=model.staging.upload,
             )
-        return [
-            Prediction(model.actions(flow), behaviour=stated.get(i, {}))
-            for i, flow in enumerate(flows)
-        ]
+
+        predictions = []
+        for i, flow in enumerate(flows):
+            predictions.append(Prediction(model.actions(flow), behaviour=behaviours.get(i, {})))
+        return predictions
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Stack the last frames of rows, with their images scaled on the device as the image
-        processor does.
+        """Return the inputs of the network, by transformers' names, for the last observations of
+        rows.
+
+        Their images are scaled on the device, as the image processor does.
         """
         model, torch = self.loaded(), require("torch")
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images = inputs.pop("images").movedim(-1, 2)  # (P, cameras, 3, S, S)
+        device = images.device
         factor, summand, padding = model.scale
-        pixels = (
-            images.to(torch.float32, memory_format=torch.contiguous_format)
-            .mul_(factor)
-            .add_(summand)
-        )
-        if (sizes := inputs.pop("sizes", None)) is not None:
+        pixels = images.to(torch.float32, memory_format=torch.contiguous_format)
+        pixels = pixels.mul_(factor).add_(summand)
+
+        sizes = inputs.pop("sizes", None)
+        if sizes is not None:
             height, width = images.shape[-2:]
-            # (P, cameras, S)
-            rows_inside = torch.arange(height, device=images.device) < sizes[..., :1]
-            columns_inside = torch.arange(width, device=images.device) < sizes[..., 1:]
+            rows_inside = torch.arange(height, device=device) < sizes[..., :1]  # (P, cameras, S)
+            columns_inside = torch.arange(width, device=device) < sizes[..., 1:]
             inside = rows_inside[..., :, None] & columns_inside[..., None, :]
             pixels = torch.where(inside[:, :, None], pixels, padding)
-        return {
-            **inputs,
-            "pixel_values": pixels.to(model.dtype),
-            "pixel_attention_mask": torch.ones(
-                images.shape[:2], dtype=torch.bool, device=images.device
-            ),
-            "state": inputs["state"].to(model.dtype),
-        }
+
+        inputs["pixel_values"] = pixels.to(model.dtype)
+        inputs["pixel_attention_mask"] = torch.ones(
+            images.shape[:2], dtype=torch.bool, device=device
+        )
+        inputs["state"] = inputs["state"].to(model.dtype)
+        return inputs
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
-    """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of
-    them.
+    """Return the cameras in the order of the model's image tokens: openpi's name -> ours.
+
+    A checkpoint may be trained without some of them.
     """
-    asked = USUAL_CAMERAS if chosen is None else chosen
-    known = (
-        [name for name in CAMERAS if name in asked]
-        if asked and set(asked) <= set(CAMERAS)
-        else CAMERAS
-    )
-    return choose_cameras(chosen, USUAL_CAMERAS, known)
+    cameras = DEFAULT_CAMERAS if chosen is None else chosen
+    expected: Sequence[str] = CAMERAS
+    if cameras and set(cameras) <= set(CAMERAS):
+        expected = [name for name in CAMERAS if name in cameras]
+    return choose_cameras(chosen, DEFAULT_CAMERAS, expected)
 
 
 def _openpi_text(instruction: str) -> str:
@@ -329,8 +359,10 @@ def _openpi_text(instruction: str) -> str:
 
 
 def _processor(path: Path) -> Any:
+    """Load the processor of a checkpoint; raise `ConfigError` if it has no statistics."""
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
-    if absent := [name for name in _STATISTICS if getattr(processor, name) is None]:
+    absent = [name for name in _STATISTICS if getattr(processor, name) is None]
+    if absent:
         raise ConfigError(
             f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was "
             f"trained on: PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
@@ -339,38 +371,44 @@ def _processor(path: Path) -> Any:
 
 
 def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
-    """Return the factor and the summand by which a processor converts pixels, and the colour with
-    which it pads them.
+    """Return how a processor converts pixels.
 
-    They are (3, 1, 1) float32 on the device.
+    Args:
+        processor: The `PI0Processor`.
+        staging: Copies the result to the device.
+
+    Returns:
+        The factor and the summand of pixels, and the converted colour with which images are padded;
+        each (3, 1, 1) float32 on the device.
 
     Raises:
-        ConfigError: It does anything else with an image of its own size.
+        ConfigError: The processor does anything else with an image of the network's size.
     """
-    side = processor.image_processor.pad_size
+    image_processor = processor.image_processor
+    side = image_processor.pad_size
     levels = np.resize(np.arange(256, dtype=np.uint8), (side["height"], side["width"]))
     image = np.repeat(levels[..., None], 3, axis=2)
-    found = np.asarray(
-        processor.image_processor([image], return_tensors="np")["pixel_values"][0], np.float32
-    )
-    summand = found[:, :1, :1]  # of black, the first pixel
-    factor = (found[:, levels == 255][:, :1, None] - summand) / np.float32(255)
-    if found.shape != (3, *levels.shape) or not np.allclose(
-        levels * factor + summand, found, atol=_ROUNDING
+    [converted] = image_processor([image], return_tensors="np")["pixel_values"]
+    converted = np.asarray(converted, np.float32)
+
+    summand = converted[:, :1, :1]  # of black, the first pixel
+    white = converted[:, levels == 255][:, :1, None]
+    factor = (white - summand) / np.float32(255)
+    if converted.shape != (3, *levels.shape) or not np.allclose(
+        levels * factor + summand, converted, atol=_ROUNDING
     ):
         raise ConfigError(
             f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a "
             "factor and a summand for each channel, want do_rescale and do_normalize alone; images "
             "are resized before"
         )
-    wide = processor.image_processor([image[: len(image) // 2]], return_tensors="np")[
-        "pixel_values"
-    ][0]
-    padding = (
-        np.asarray(wide[:, -1:, -1:], np.float32)
-        if wide.shape == found.shape
-        else np.zeros_like(summand)
-    )
+
+    # An image that is twice as wide is padded at the bottom, if the processor pads.
+    wide_image = image[: len(image) // 2]
+    [wide] = image_processor([wide_image], return_tensors="np")["pixel_values"]
+    padding = np.zeros_like(summand)
+    if wide.shape == converted.shape:
+        padding = np.asarray(wide[:, -1:, -1:], np.float32)
     return staging.upload(factor), staging.upload(summand), staging.upload(padding)
 
 
@@ -384,20 +422,21 @@ class Pi0HfPasses(FlowPasses):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
-        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one (P,
-        cameras, 3, S, S).
+        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one tensor
+        (P, cameras, 3, S, S).
         """
-        cache = self.model.model.vlm(
+        result = self.model.model.vlm(
             inputs_embeds=self.model.model.embed_prefix(tokens, images[0], cameras),
             attention_mask=mask,
             position_ids=mask.cumsum(-1) - 1,
             token_type_ids=mask.new_zeros(mask.shape),
             use_cache=True,
-        ).past_key_values
-        return stack_of(layers_of(cache)), mask
+        )
+        return stack_of(layers_of(result.past_key_values)), mask
 
     def velocity(self, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
-        cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
+        # For this step only, which appends to it: later ones must not attend to its tokens.
+        cache = cache_of(encoded.unbind(1))
         noise = actions.to(state.dtype)
         output = self.model(
             state=state, noise=noise, timestep=times, attention_mask=present, past_key_values=cache
@@ -408,8 +447,9 @@ class Pi0HfPasses(FlowPasses):
 def flow_velocity(
     network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
 ) -> Callable[[Any, float], Any]:
-    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs
-    are encoded once.
+    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and flow time.
+
+    The inputs are encoded once.
 
     Args:
         network: The `PI0ForConditionalGeneration`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextvars import ContextVar, Token
 from functools import cached_property, partial
 from types import ModuleType
@@ -18,13 +18,14 @@ from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.policies.base import Row
 
 _SEEDS = 2**63
-# Of the pass of this thread.
+# The draws of the pass that this thread runs.
 _DRAWS: ContextVar[RowDraws | None] = ContextVar("draws", default=None)
 
 
 def generator_of(rng: np.random.Generator) -> Any:
-    """Make a torch generator seeded from `rng`, on the CPU so that draws are the same on every
-    device.
+    """Make a torch generator that is seeded from `rng`.
+
+    It is on the CPU, so that draws are the same on every device.
     """
     return torch.Generator().manual_seed(int(rng.integers(_SEEDS)))
 
@@ -34,7 +35,8 @@ def seeded(rng: np.random.Generator, device: Any) -> Iterator[None]:
     """Seed torch's global generators from `rng` within the context, and restore their state
     afterwards.
     """
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+    devices = [device] if device.type == "cuda" else []
+    with torch.random.fork_rng(devices=devices):
         torch.manual_seed(int(rng.integers(_SEEDS)))
         yield
 
@@ -42,35 +44,34 @@ def seeded(rng: np.random.Generator, device: Any) -> Iterator[None]:
 class RowDraws:
     """A context in which a model's code draws each row of a batch from that row's generator.
 
-    Only the modules that define the model's own class draw so, by `torch.randn` and
-    `torch.multinomial`; they may not draw otherwise. Layers and other threads run as always:
-    torch's function modes, which reach all code, make each call of torch slower by half. The batch
+    Only the modules that define the model's own class draw this way, with `torch.randn` and
+    `torch.multinomial`; they may not draw otherwise. Layers and other threads are not affected,
+    unlike with torch's function modes, which also make each call of torch slower by half. The batch
     must be the first dimension of every draw, or the outer part of that dimension.
     """
 
     def __init__(self, rngs: Sequence[np.random.Generator], *models: Any) -> None:
-        """Prepare to draw from the generator of each row in the code of these objects, or
-        modules, from now on.
+        """Replace `torch` in the modules of models, so that they can draw for rows.
+
+        Args:
+            rngs: The generator of each row.
+            models: Objects, whose classes' modules are meant, or modules.
         """
-        self._rngs, self._drawn = rngs, False
+        self._rngs = rngs
+        self._has_drawn = False
         for model in models:
-            names = [kind.__module__ for kind in type(model).__mro__]
-            modules: Iterable[Any] = (
-                [model] if isinstance(model, ModuleType) else map(sys.modules.get, names)
-            )
-            for module in modules:
-                if getattr(module, "torch", None) is torch and not module.__name__.startswith(
-                    "torch."
-                ):
+            for module in _modules_of(model):
+                uses_torch = getattr(module, "torch", None) is torch
+                if uses_torch and not module.__name__.startswith("torch."):
                     module.torch = _TORCH
 
     def __enter__(self) -> Self:
         self._token: Token[RowDraws | None] = _DRAWS.set(self)
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
+    def __exit__(self, error: object, *_: object) -> None:
         _DRAWS.reset(self._token)
-        if kind is None and not self._drawn:
+        if error is None and not self._has_drawn:
             raise PolicyFailed(
                 "the model drew no numbers for its rows; is its code of the version that is "
                 "required?"
@@ -81,69 +82,94 @@ class RowDraws:
         return [generator_of(rng) for rng in self._rngs]
 
     def draw(self, name: str, *args: Any, **options: Any) -> Any:
-        """Draw as the function `name` of torch does."""
-        self._drawn = True
+        """Draw as the function `name` of torch does.
+
+        Args:
+            name: The name of a function that draws.
+            args: Its arguments.
+            options: Its arguments by name.
+
+        Raises:
+            PolicyFailed: The function cannot draw for each row.
+        """
+        self._has_drawn = True
         if name == "multinomial":
             return self._multinomial(*args, **options)
         if name != "randn":
             raise PolicyFailed(
                 f"the model drew from {name}: its actions would depend on its neighbours'"
             )
-        sizes = options["size"] if "size" in options else args[0] if len(args) == 1 else args
-        return self._randn(
-            tuple(sizes), {place: options.get(place) for place in ("device", "dtype")}
-        )
+        if "size" in options:
+            shape = options["size"]
+        elif len(args) == 1:
+            [shape] = args
+        else:
+            shape = args
+        return self._randn(tuple(shape), options.get("device"), options.get("dtype"))
 
-    def _randn(self, shape: tuple[int, ...], place: dict[str, Any]) -> Any:
-        each = shape[0] // len(self._generators)
-        rows = [
-            torch.randn(each, *shape[1:], generator=generator) for generator in self._generators
+    def _randn(self, shape: tuple[int, ...], device: Any, dtype: Any) -> Any:
+        """Draw standard normal numbers, with the same number of entries for each row."""
+        entries = shape[0] // len(self._generators)
+        drawn = [
+            torch.randn(entries, *shape[1:], generator=generator) for generator in self._generators
         ]
-        return torch.cat(rows).to(**place, non_blocking=True)
+        return torch.cat(drawn).to(device=device, dtype=dtype, non_blocking=True)
 
     def _multinomial(self, weights: Any, num_samples: int) -> Any:
+        """Draw indices with these weights, of which each row has the same number of entries."""
         blocks = weights.float().cpu().chunk(len(self._generators))
-        each = zip(blocks, self._generators, strict=True)
-        drawn = [
-            torch.multinomial(block, num_samples, generator=generator) for block, generator in each
-        ]
+        drawn = []
+        for block, generator in zip(blocks, self._generators, strict=True):
+            drawn.append(torch.multinomial(block, num_samples, generator=generator))
         return torch.cat(drawn).to(weights.device, non_blocking=True)
 
 
+def _modules_of(model: Any) -> list[Any]:
+    """Return the modules that define the class of an object and its bases, or a module itself."""
+    if isinstance(model, ModuleType):
+        return [model]
+    return [sys.modules.get(base.__module__) for base in type(model).__mro__]
+
+
 class RowNoise(RowDraws):
-    """`RowDraws` of the numbers of `Row.noise`, with a row of each batch for each of `rows`."""
+    """`RowDraws` with the numbers of `Row.noise`; every batch has one entry for each row."""
 
     def __init__(self, rows: Sequence[Row], ahead: int, *models: Any) -> None:
-        """Prepare to draw for rows; the first `ahead` draws have one shape, and are made and
-        copied together.
+        """Replace `torch` in the modules of models, so that they can draw for rows.
+
+        Args:
+            rows: The rows.
+            ahead: How many of the first draws have one shape; they are made and copied together.
+            models: As for `RowDraws`.
         """
         super().__init__([row.rng for row in rows], *models)
-        self._rows, self._ahead, self._left = rows, ahead, list[Any]()
+        self._rows = rows
+        self._ahead = ahead
+        self._prepared: list[Any] = []  # the results of the next draws
 
-    def _randn(self, shape: tuple[int, ...], place: dict[str, Any]) -> Any:
+    def _randn(self, shape: tuple[int, ...], device: Any, dtype: Any) -> Any:
         if len(shape) < 2 or shape[0] != len(self._rows):
             raise PolicyFailed(
                 f"the model asked for noise {shape}, want one row for each of {len(self._rows)}"
             )
-        if not self._left:
-            drawn = torch.from_numpy(
-                np.stack([row.noise(self._ahead, *shape[1:]) for row in self._rows], 1)
-            )
-            self._left, self._ahead = list(drawn.to(**place, non_blocking=True)), 1
-        return self._left.pop(0)
+        if not self._prepared:
+            noise = np.stack([row.noise(self._ahead, *shape[1:]) for row in self._rows], 1)
+            drawn = torch.from_numpy(noise).to(device=device, dtype=dtype, non_blocking=True)
+            self._prepared = list(drawn)
+            self._ahead = 1
+        return self._prepared.pop(0)
 
 
 def _draw(name: str, *args: Any, **options: Any) -> Any:
+    """Call the function `name` of torch, or draw for the rows of this thread's pass."""
     draws = _DRAWS.get()
-    return (
-        getattr(torch, name)(*args, **options)
-        if draws is None
-        else draws.draw(name, *args, **options)
-    )
+    if draws is None:
+        return getattr(torch, name)(*args, **options)
+    return draws.draw(name, *args, **options)
 
 
-# Stands for `torch` in modules that draw. Other attributes are torch's own, found without a call of
-# Python.
+# Replaces `torch` in modules that draw. All other attributes are torch's own; they are copied, so
+# that reading them calls no Python function.
 _TORCH = ModuleType("torch")
 vars(_TORCH).update(vars(torch), __getattr__=partial(getattr, torch))
 for _name in ("randn", "multinomial", "rand", "randint", "randn_like", "rand_like", "normal"):

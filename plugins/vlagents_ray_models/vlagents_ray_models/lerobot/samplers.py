@@ -238,7 +238,7 @@ class FlowSampler(Sampler):
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
             self.flow_steps = int(config.num_steps)
         else:
-            self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
+            self.passes = Pi0Passes(model, compilation, takes_state=policy.name == "pi0")
             self.flow_steps = int(config.num_inference_steps)
 
         memories = [name for name in _MEMORIES if getattr(config, name, False)]
