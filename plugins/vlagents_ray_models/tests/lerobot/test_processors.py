@@ -1,4 +1,4 @@
-"""Tokens of instructions that are kept."""
+"""The cache of the tokens of instructions."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ from vlagents_ray_models.lerobot.processors import cached_tokenizer
 
 
 @pytest.mark.torch
-def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_not_reach_the_cache() -> (
-    None
-):
+def test_cached_tokens_are_the_tokenizers_and_changes_of_a_batch_do_not_reach_them() -> None:
     torch = pytest.importorskip("torch")
-    asked: list[list[str]] = []
+    tokenized: list[list[str]] = []
 
     def tokenizer(
         texts: list[str], *, padding: str, return_tensors: str, max_length: int
     ) -> dict[str, Any]:
         assert (padding, return_tensors) == ("max_length", "pt")
-        asked.append(texts)
+        tokenized.append(texts)
         ids = torch.tensor([[*map(ord, text), *[0] * (max_length - len(text))] for text in texts])
         return {"input_ids": ids, "attention_mask": (ids > 0).long()}
 
@@ -29,8 +27,8 @@ def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_no
 
     cached = cached_tokenizer(tokenizer, "cpu", max_length=8)
     for texts in (["lift"], ["push", "lift"], ["lift"], ["lift", "push", "lift"]):
-        got, want = cached(texts), plain(texts)
-        assert got.keys() == want.keys()
-        assert all(torch.equal(got[name], want[name]) for name in want)
-        got["input_ids"].zero_()
-    assert sum(texts == ["push"] for texts in asked) == 1
+        batch, expected = cached(texts), plain(texts)
+        assert batch.keys() == expected.keys()
+        assert all(torch.equal(batch[name], expected[name]) for name in expected)
+        batch["input_ids"].zero_()
+    assert sum(texts == ["push"] for texts in tokenized) == 1

@@ -1,5 +1,5 @@
-"""The parts that fine-tuning added to OpenVLA-OFT, as a learner pushes them, on a stand-in for
-the network.
+"""The components that fine-tuning added to OpenVLA-OFT, as a learner pushes them, with a stand-in
+for the network.
 """
 
 from __future__ import annotations
@@ -19,18 +19,14 @@ pytestmark = pytest.mark.torch
 WIDTH, DIM = 6, 2  # of hidden states, of actions
 
 
-def named(prefix: str, shapes: dict[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Return the weights and biases of layers, as a file of upstream's has them."""
+def random_layers(prefix: str, shapes: dict[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Return random weights and biases of layers, by their names in upstream's files."""
     generator = torch.Generator().manual_seed(0)
-    layers = {f"{prefix}{layer}": shape for layer, shape in shapes.items()}
-    weights = {
-        f"{layer}.weight": torch.randn(shape, generator=generator)
-        for layer, shape in layers.items()
-    }
-    return weights | {
-        f"{layer}.bias": torch.randn(shape[:1], generator=generator)
-        for layer, shape in layers.items()
-    }
+    tensors = {}
+    for layer, shape in shapes.items():
+        tensors[f"{prefix}{layer}.weight"] = torch.randn(shape, generator=generator)
+        tensors[f"{prefix}{layer}.bias"] = torch.randn(shape[:1], generator=generator)
+    return tensors
 
 
 @pytest.fixture(params=["model", "noise_predictor.mlp_resnet"])
@@ -45,13 +41,15 @@ def policy(request: pytest.FixtureRequest) -> OpenVLAOFT:
         "fc2": (DIM, 4),
     }
     base: Any = SimpleNamespace(network=torch.nn.Linear(WIDTH, WIDTH))
-    head = Mlp(named(f"{request.param}.", norms | linear), request.param)
-    proprio = Projector(named("", {"fc1": (WIDTH, 3), "fc2": (WIDTH, WIDTH)}), "proprio_projector")
-    made = OpenVLAOFT(OpenVLAOFTConfig(checkpoint="none"))
-    made.model = Parallel(
+    head = Mlp(random_layers(f"{request.param}.", norms | linear), request.param)
+    proprio = Projector(
+        random_layers("", {"fc1": (WIDTH, 3), "fc2": (WIDTH, WIDTH)}), "proprio_projector"
+    )
+    policy = OpenVLAOFT(OpenVLAOFTConfig(checkpoint="none"))
+    policy.model = Parallel(
         base, horizon=1, dim=DIM, head=head, proprio=proprio, noisy=None, film=None, steps=(1, 1)
     )
-    return made
+    return policy
 
 
 def test_it_acts_with_pushed_parts_by_the_names_of_upstreams_files(policy: OpenVLAOFT) -> None:

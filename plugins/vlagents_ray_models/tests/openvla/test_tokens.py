@@ -1,6 +1,4 @@
-"""The distribution over action tokens: what is drawn from it, and its log-probability and
-entropy.
-"""
+"""The distribution over action tokens: draws, log-probability and entropy."""
 
 from __future__ import annotations
 
@@ -38,12 +36,13 @@ def test_the_log_probability_is_that_of_the_bins_alone(bins: ActionBins) -> None
     categorical = torch.distributions.Categorical(
         logits=scores[..., range(LAST - BINS + 1, LAST + 1)].double()
     )
-    _, over = bins.read(scores)
-    *_, logprob, entropy, stated = bins.describe(tokens, over)
+    _, bin_logits = bins.read(scores)
+    *_, logprob, entropy, described_tokens = bins.describe(tokens, bin_logits)
+
     np.testing.assert_allclose(logprob, categorical.log_prob(tokens - (LAST - BINS + 1)), rtol=1e-9)
     np.testing.assert_allclose(entropy, categorical.entropy(), rtol=1e-9)
     np.testing.assert_allclose(bins.logprob(tokens, scores), logprob, rtol=1e-9)
-    np.testing.assert_array_equal(stated, tokens)
+    np.testing.assert_array_equal(described_tokens, tokens)
 
 
 def test_tokens_are_drawn_as_often_as_their_log_probability_says(bins: ActionBins) -> None:
@@ -57,7 +56,8 @@ def test_tokens_are_drawn_as_often_as_their_log_probability_says(bins: ActionBin
 def test_a_bin_that_is_impossible_adds_no_entropy(bins: ActionBins) -> None:
     scores = torch.full((1, VOCABULARY), -1e9)
     scores[0, [LAST, LAST - 1]] = 0.0
-    *_, entropy, _ = bins.describe(torch.tensor([LAST]), bins.read(scores)[1])
+    _, bin_logits = bins.read(scores)
+    *_, entropy, _ = bins.describe(torch.tensor([LAST]), bin_logits)
     assert entropy.item() == pytest.approx(np.log(2))
 
 
@@ -72,7 +72,7 @@ def test_a_learner_follows_the_gradient_of_the_log_probability(bins: ActionBins)
 def test_the_likeliest_token_may_be_a_word_and_counts_as_the_nearest_bin(bins: ActionBins) -> None:
     scores = logits(1)
     scores[0, 3] = 100.0  # a word, before all bins, of which the first token is the highest
-    likeliest, over = bins.read(scores)
-    assert bins.choose(likeliest, over, torch.tensor([torch.nan])).tolist() == [3]
-    highest = bins.describe(torch.tensor([LAST - BINS + 1]), over)
-    np.testing.assert_array_equal(bins.describe(likeliest, over)[:5], highest[:5])
+    likeliest, bin_logits = bins.read(scores)
+    assert bins.choose(likeliest, bin_logits, torch.tensor([torch.nan])).tolist() == [3]
+    highest = bins.describe(torch.tensor([LAST - BINS + 1]), bin_logits)
+    np.testing.assert_array_equal(bins.describe(likeliest, bin_logits)[:5], highest[:5])

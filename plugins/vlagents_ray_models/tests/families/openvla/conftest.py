@@ -42,14 +42,13 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
 
 @pytest.fixture(scope="session")
 def loaded(checkpoint: Callable[[str], Path]) -> Callable[..., ModelPolicy]:
-    """A policy that loaded a kind's checkpoint, for `bridge_orig` unless told otherwise."""
+    """Loads a policy with a kind's checkpoint, for the dataset `bridge_orig` by default."""
 
     @lru_cache
     def load(kind: str, **config: Any) -> ModelPolicy:
         settings = {"checkpoint": str(checkpoint(kind)), "unnorm_key": "bridge_orig"} | config
-        policy: ModelPolicy = policy_class(
-            "openvla_oft" if "oft" in kind else "openvla"
-        ).from_config(settings)
+        cls = policy_class("openvla_oft" if "oft" in kind else "openvla")
+        policy: ModelPolicy = cls.from_config(settings)
         policy.initialize()
         return policy
 
@@ -57,7 +56,7 @@ def loaded(checkpoint: Callable[[str], Path]) -> Callable[..., ModelPolicy]:
 
 
 def seen(seed: int, **info: Any) -> Obs:
-    """What session `seed` sees: LIBERO's cameras and states."""
+    """Return an observation of session `seed`, with LIBERO's cameras and states."""
     rng = np.random.default_rng(seed)
     return Obs(
         cameras={
@@ -72,7 +71,7 @@ def seen(seed: int, **info: Any) -> Obs:
 
 
 def begun(policy: Any, seed: int, **options: Any) -> Any:
-    """Session `seed` of a loaded policy."""
+    """Return session `seed` of a loaded policy, in an episode."""
     session = type(policy)(policy.config)
     session.model = policy.model
     session.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)

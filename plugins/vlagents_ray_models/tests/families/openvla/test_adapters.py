@@ -35,15 +35,15 @@ CHOSEN = ("first", None, "second", "first")
 def saved(
     checkpoint: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Path]:
-    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "second" has a dataset
-    of its own.
+    """Folders of adapters by name, and of whole checkpoints by "merged/NAME"; the adapter "second"
+    was trained on another dataset.
     """
     root, folders = tmp_path_factory.mktemp("adapters"), {}
     cls = module("OPENVLA_SRC", "extern.hf.modeling_prismatic").OpenVLAForActionPrediction
     for seed, (name, rank) in enumerate((("first", 4), ("second", 8))):
         torch.manual_seed(seed)
         network = cls.from_pretrained(checkpoint("openvla"))
-        # as OpenVLA's vla-scripts/finetune.py, but not at zero
+        # As in OpenVLA's vla-scripts/finetune.py, but the initial weights are not zero.
         config = LoraConfig(
             r=rank,
             lora_alpha=min(rank, 16),
@@ -53,7 +53,7 @@ def saved(
         )
         trained = get_peft_model(network, config)
         folders[name] = root / name
-        # That it saves the base's last layer as well, since that has an adapter.
+        # PEFT warns that it also saves the base's last layer, since that has an adapter.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Setting `save_embedding_layers`", UserWarning)
             trained.save_pretrained(folders[name])
@@ -64,8 +64,8 @@ def saved(
         if name == "second":
             datasets = json.loads((whole / "dataset_statistics.json").read_text())
             for folder in (folders[name], whole):
-                own = {"own_dataset": datasets["libero_spatial_no_noops"]}
-                (folder / "dataset_statistics.json").write_text(json.dumps(own))
+                statistics = {"own_dataset": datasets["libero_spatial_no_noops"]}
+                (folder / "dataset_statistics.json").write_text(json.dumps(statistics))
     return folders
 
 
@@ -75,11 +75,11 @@ def load(folder: Path, **config: Any) -> OpenVLA:
     return policy
 
 
-def session(policy: OpenVLA, seed: int, **options: Any) -> OpenVLA:
-    one = AgentCopies(policy).make()
-    one.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)
-    assert isinstance(one, OpenVLA)
-    return one
+def begun(policy: OpenVLA, seed: int, **options: Any) -> OpenVLA:
+    session = AgentCopies(policy).make()
+    session.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)
+    assert isinstance(session, OpenVLA)
+    return session
 
 
 def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
@@ -92,58 +92,59 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
         "first": load(saved["merged/first"]),
         "second": load(saved["merged/second"], unnorm_key=None),
     }
-    sessions = [session(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)]
+    sessions = [begun(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)]
     acts = policy.act_batch(
         [seen(seed, **{SAMPLES: 2 * seed}) for seed in range(len(CHOSEN))], sessions
     )
     fingerprints: dict[str | None, str] = {}
     for seed, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
-        wanted = session(alone[name], seed).act(seen(seed, **{SAMPLES: 2 * seed}))
+        expected = begun(alone[name], seed).act(seen(seed, **{SAMPLES: 2 * seed}))
         assert isinstance(act, Act)
-        assert np.array_equal(act.action, wanted.action)  # the same tokens
+        assert np.array_equal(act.action, expected.action)  # the same tokens
         if seed:
-            stated, other = act.info[DISTRIBUTION], wanted.info[DISTRIBUTION]
-            np.testing.assert_allclose(stated["mean"], other["mean"], atol=ATOL)
-            np.testing.assert_allclose(stated["std"], other["std"], atol=ATOL)
-            assert np.array_equal(stated["samples"], other["samples"])
+            distribution = act.info[DISTRIBUTION]
+            expected_distribution = expected.info[DISTRIBUTION]
+            for moment in ("mean", "std"):
+                np.testing.assert_allclose(
+                    distribution[moment], expected_distribution[moment], atol=ATOL
+                )
+            assert np.array_equal(distribution["samples"], expected_distribution["samples"])
+
         fingerprint = policy.adapters.named(name).fingerprint or policy.adapters.base
         assert act.info[POLICY] == {"version": 0, "fingerprint": fingerprint}
         assert fingerprint
         fingerprints[name] = fingerprint
         if name is not None:
-            assert not np.array_equal(
-                wanted.action, session(alone[None], seed).act(seen(seed)).action
-            )
+            of_base = begun(alone[None], seed).act(seen(seed))
+            assert not np.array_equal(expected.action, of_base.action)
     assert len(set(fingerprints.values())) == len(alone), "the base and each adapter differ"
 
 
 def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
     checkpoint: Callable[[str], Path], saved: dict[str, Path]
 ) -> None:
-    policy, cls = load(checkpoint("openvla")), module("OPENVLA_SRC", "extern.hf.modeling_prismatic")
-    trained = PeftModel.from_pretrained(
-        cls.OpenVLAForActionPrediction.from_pretrained(checkpoint("openvla")), saved["first"]
-    )
+    policy = load(checkpoint("openvla"))
+    modeling = module("OPENVLA_SRC", "extern.hf.modeling_prismatic")
+    network = modeling.OpenVLAForActionPrediction.from_pretrained(checkpoint("openvla"))
+    trained = PeftModel.from_pretrained(network, saved["first"])
     trained.merge_adapter()
-    merged = {
-        name: value
-        for name, value in trained.state_dict().items()
-        if name.endswith(".base_layer.weight")
-    }
-    pushed = {
-        name.removeprefix("base_model.model.").replace(".base_layer", ""): merged[name]
-        for name in merged
-    }
+    pushed = {}
+    for peft_name, tensor in trained.state_dict().items():
+        if peft_name.endswith(".base_layer.weight"):
+            name = peft_name.removeprefix("base_model.model.").replace(".base_layer", "")
+            pushed[name] = tensor
+
     weights, options = ModelWeights(policy, threading.Lock()), PushOptions(partial=True)
     weights.stage(1, pushed, options)
     weights.commit(1, options, list)
     weights.use(weights.newest)
-    acts = [
-        session(one, 1).act(seen(1, **{SAMPLES: 2}))
-        for one in (policy, load(saved["merged/first"]))
-    ]
-    assert np.array_equal(*(act.action for act in acts))
-    np.testing.assert_allclose(*(act.info[DISTRIBUTION]["mean"] for act in acts), atol=ATOL)
+
+    act = begun(policy, 1).act(seen(1, **{SAMPLES: 2}))
+    expected = begun(load(saved["merged/first"]), 1).act(seen(1, **{SAMPLES: 2}))
+    assert np.array_equal(act.action, expected.action)
+    np.testing.assert_allclose(
+        act.info[DISTRIBUTION]["mean"], expected.info[DISTRIBUTION]["mean"], atol=ATOL
+    )
     assert len(pushed) < len(policy.parameters())
 
 

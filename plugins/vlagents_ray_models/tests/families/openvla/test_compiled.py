@@ -32,9 +32,9 @@ def compiler() -> Iterator[CountingCompiler]:
 
 def acts(policy: Any, seeds: list[int], **info: Any) -> list[Act]:
     views: list[Obs] = [seen(seed, **info) for seed in seeds]
-    found = policy.act_batch(views, [begun(policy, seed) for seed in seeds])
-    assert all(isinstance(act, Act) for act in found)
-    return found  # type: ignore[no-any-return]
+    outcomes = policy.act_batch(views, [begun(policy, seed) for seed in seeds])
+    assert all(isinstance(outcome, Act) for outcome in outcomes)
+    return outcomes  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -52,24 +52,25 @@ def test_acts_are_those_without_compilation_also_of_long_prompts(
     base = getattr(plain.model, "base", plain.model)
     lengths = [len(base.tokens(words)) for words in WORDS]
     assert lengths[2] > max(lengths[:2]) + 1
+
     compiled = type(plain).from_config(
         plain.config.model_dump(exclude_unset=True)
         | {"compile": "require", "batch_sizes": [SIZE], "compiled_tokens": max(lengths[:2]) + 1}
     )
     compiled.initialize()
     assert compiler.rows == [SIZE] * cores
+
     for seeds in ([0], [1, 0], [0, 1, 0], [2], [0, 2]):
         calls = compiler.calls
-        for one, other in zip(acts(plain, seeds), acts(compiled, seeds), strict=True):
-            np.testing.assert_allclose(one.action, other.action, atol=ATOL[kind])
+        for expected, act in zip(acts(plain, seeds), acts(compiled, seeds), strict=True):
+            np.testing.assert_allclose(expected.action, act.action, atol=ATOL[kind])
         assert compiler.calls > calls  # images, at least
+
     if plain.contract.behaviour:
-        wanted = {SAMPLES: 2, WANT: ["logprob"]}
-        for one, other in zip(
-            acts(plain, [0, 1], **wanted), acts(compiled, [0, 1], **wanted), strict=True
-        ):
-            samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+        info = {SAMPLES: 2, WANT: ["logprob"]}
+        for pair in zip(acts(plain, [0, 1], **info), acts(compiled, [0, 1], **info), strict=True):
+            samples = [act.info[DISTRIBUTION]["samples"] for act in pair]
             np.testing.assert_allclose(*samples, atol=ATOL[kind])
-            said = [act.info[BEHAVIOUR]["logprob"] for act in (one, other)]
-            np.testing.assert_allclose(*said, atol=1e-4)
+            logprobs = [act.info[BEHAVIOUR]["logprob"] for act in pair]
+            np.testing.assert_allclose(*logprobs, atol=1e-4)
     assert compiler.rows == [SIZE] * cores

@@ -1,4 +1,4 @@
-"""What of a checkpoint or its settings does not fit is said before anything is served."""
+"""A checkpoint or settings that do not fit are errors before anything is served."""
 
 from __future__ import annotations
 
@@ -122,14 +122,15 @@ def test_statistics_are_in_the_checkpoint_or_nothing_is_served(
     copied: Callable[[str], Path],
 ) -> None:
     folder = copied("openvla")
-    found = (folder / "dataset_statistics.json").read_text()
+    statistics = json.loads((folder / "dataset_statistics.json").read_text())
     (folder / "dataset_statistics.json").unlink()
     with pytest.raises(
         ConfigError, match=r"got no normalisation statistics, want dataset_statistics.json"
     ):
         load("openvla", folder)
+
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(config | {"norm_stats": json.loads(found)}))
+    (folder / "config.json").write_text(json.dumps(config | {"norm_stats": statistics}))
     load("openvla", folder, unnorm_key="bridge_orig")
 
 

@@ -62,85 +62,90 @@ def policy(loaded: Callable[..., Any], kind: str) -> OpenVLAOFT:
 
 @pytest.fixture
 def fork(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attention as in the transformers that OFT brings: each token sees all that the last one
-    sees.
+    """Use attention as in OFT's fork of transformers: each token attends to all tokens that the
+    last one attends to.
     """
     attend = torch.nn.functional.scaled_dot_product_attention
 
-    def both_ways(*args: Any, attn_mask: Any = None, is_causal: bool = False, **kwargs: Any) -> Any:
-        return attend(
-            *args, attn_mask=None if attn_mask is None else attn_mask[:, :, -1:], **kwargs
-        )
+    def attend_both_ways(
+        *args: Any, attn_mask: Any = None, is_causal: bool = False, **kwargs: Any
+    ) -> Any:
+        mask = None if attn_mask is None else attn_mask[:, :, -1:]
+        return attend(*args, attn_mask=mask, **kwargs)
 
-    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", both_ways)
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", attend_both_ways)
 
 
 class Upstream:
-    """A checkpoint as OFT's own code loads it, and asks it (experiments/robot/openvla_utils.py)."""
+    """A checkpoint that OFT's own code loads and runs (experiments/robot/openvla_utils.py)."""
 
     def __init__(
         self, folder: Path, kind: str, inference_steps: int = tiny.DIFFUSION_STEPS
     ) -> None:
-        def of(name: str, part: torch.nn.Module) -> torch.nn.Module:
-            saved = torch.load(folder / f"{name}--100_checkpoint.pt", weights_only=True)
-            part.load_state_dict(
-                {key.removeprefix("module."): tensor for key, tensor in saved.items()}
-            )
-            return part.eval()
-
         self.kind = kind
-        network = self._module(
-            "extern.hf.modeling_prismatic"
-        ).OpenVLAForActionPrediction.from_pretrained(folder)
+        self.folder = folder
+        modeling = self._module("extern.hf.modeling_prismatic")
+        network = modeling.OpenVLAForActionPrediction.from_pretrained(folder)
         if kind == "oft-film":
-            network.vision_backbone = of("vision_backbone", tiny.filmed(network, trained=False))
+            backbone = tiny.filmed(network, trained=False)
+            network.vision_backbone = self._filled("vision_backbone", backbone)
         network.vision_backbone.set_num_images_in_input(2)
         network.norm_stats = json.loads((folder / "dataset_statistics.json").read_text())
         self.network = network.eval()
+
         processing = self._module("extern.hf.processing_prismatic")
         self.processor = processing.PrismaticProcessor(
             processing.PrismaticImageProcessor.from_pretrained(folder),
             AutoTokenizer.from_pretrained(folder),
         )
+
         heads, projectors = self._module("models.action_heads"), self._module("models.projectors")
         sizes = tiny.LLM_DIM, tiny.LLM_DIM, tiny.ACTION_DIM
-        self.parts = {
-            "proprio_projector": of(
-                "proprio_projector", projectors.ProprioProjector(tiny.LLM_DIM, tiny.PROPRIO_DIM)
-            )
+        components = {
+            "proprio_projector": projectors.ProprioProjector(tiny.LLM_DIM, tiny.PROPRIO_DIM)
         }
         if kind == "oft-diffusion":
             head = heads.DiffusionActionHead(*sizes, tiny.DIFFUSION_STEPS)
             head.noise_scheduler.set_timesteps(inference_steps)
-            self.parts["noisy_action_projector"] = of(
-                "noisy_action_projector", projectors.NoisyActionProjector(tiny.LLM_DIM)
-            )
-            self.parts["action_head"] = of("action_head", head)
+            components["noisy_action_projector"] = projectors.NoisyActionProjector(tiny.LLM_DIM)
+            components["action_head"] = head
         elif kind != "oft-tokens":
-            self.parts["action_head"] = of("action_head", heads.L1RegressionActionHead(*sizes))
+            components["action_head"] = heads.L1RegressionActionHead(*sizes)
+        self.components = {
+            name: self._filled(name, component) for name, component in components.items()
+        }
+
+    def _filled(self, name: str, component: torch.nn.Module) -> torch.nn.Module:
+        """Return a component with its saved weights."""
+        saved = torch.load(self.folder / f"{name}--100_checkpoint.pt", weights_only=True)
+        component.load_state_dict(
+            {key.removeprefix("module."): tensor for key, tensor in saved.items()}
+        )
+        return component.eval()
 
     @staticmethod
     def _module(name: str) -> Any:
         return module("OPENVLA_OFT_SRC", name)
 
     def act(self, obs: Obs, words: str, key: str = "bridge_orig") -> np.ndarray:
-        """(8, 7)."""
+        """Return the actions (8, 7) of upstream's code."""
         prompt = f"In: What action should the robot take to {words.lower()}?\nOut:"
-        images = [
-            Image.fromarray(crop_center(resize(obs.cameras[name]))) for name in ("front", "wrist")
-        ]
-        both = [self.processor(prompt, image) for image in images]
+        front, wrist = (
+            self.processor(prompt, Image.fromarray(crop_center(resize(obs.cameras[name]))))
+            for name in ("front", "wrist")
+        )
+        pixels = torch.cat([front["pixel_values"], wrist["pixel_values"]], 1)
+
         ranges = self.network.norm_stats[key]["proprio"]
         low, high = np.array(ranges["q01"]), np.array(ranges["q99"])
         state = np.concatenate([obs.state["xyz_axis_angle"], obs.state["gripper_qpos"]])
-        inputs = {**both[0], "pixel_values": torch.cat([one["pixel_values"] for one in both], 1)}
         with torch.inference_mode():
             actions, _ = self.network.predict_action(
-                **inputs,
+                **{**front, "pixel_values": pixels},
                 unnorm_key=key,
                 proprio=np.clip(2 * (state - low) / (high - low + 1e-8) - 1, -1, 1),
                 use_film=self.kind == "oft-film",
-                **self.parts,
+                **self.components,
             )
         return actions
 
@@ -200,30 +205,31 @@ def test_a_session_gets_the_same_in_any_company(policy: OpenVLAOFT, kind: str) -
         acts = policy.act_batch(
             [seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)]
         )
-        for one, act in zip(alone, acts, strict=False):
+        for action, act in zip(alone, acts, strict=False):
             assert isinstance(act, Act)
-            assert np.abs(one - act.action).max() <= SAME[kind]
-    # They differ by what they see and are told.
-    assert len({one.round(3).tobytes() for one in alone}) == 8
+            assert np.abs(action - act.action).max() <= SAME[kind]
+    # Their observations and instructions differ, and so do their actions.
+    assert len({action.round(3).tobytes() for action in alone}) == 8
 
 
 @pytest.mark.parametrize(
-    ("part", "kinds"), [("front", "oft"), ("wrist", "oft"), ("state", "oft"), ("words", "oft-film")]
+    ("changed", "kind"),
+    [("front", "oft"), ("wrist", "oft"), ("state", "oft"), ("words", "oft-film")],
 )
-def test_everything_that_is_seen_counts(loaded: Callable[..., Any], part: str, kinds: str) -> None:
-    policy = loaded(kinds, **SETTINGS[kinds])
-    before, obs = begun(policy, 0), seen(0)
-    if part == "words":
-        before.reset(obs, "something else", seed=0)
-    elif part == "state":
+def test_actions_depend_on_each_input(loaded: Callable[..., Any], changed: str, kind: str) -> None:
+    policy = loaded(kind, **SETTINGS[kind])
+    session, obs = begun(policy, 0), seen(0)
+    if changed == "words":
+        session.reset(obs, "something else", seed=0)
+    elif changed == "state":
         obs.state["gripper_qpos"] = obs.state["gripper_qpos"] + 1
     else:
-        obs.cameras[part] = 255 - obs.cameras[part]
-    assert np.abs(before.act(obs).action - begun(policy, 0).act(seen(0)).action).max() > 0.01
+        obs.cameras[changed] = 255 - obs.cameras[changed]
+    assert np.abs(session.act(obs).action - begun(policy, 0).act(seen(0)).action).max() > 0.01
 
 
 @pytest.mark.parametrize(
-    ("kind", "parts"),
+    ("kind", "components"),
     [
         ("oft", {"action_head", "proprio_projector"}),
         ("oft-diffusion", {"action_head", "proprio_projector", "noisy_action_projector"}),
@@ -232,10 +238,10 @@ def test_everything_that_is_seen_counts(loaded: Callable[..., Any], part: str, k
     ],
 )
 def test_it_acts_with_pushed_weights(
-    loaded: Callable[..., Any], kind: str, parts: set[str]
+    loaded: Callable[..., Any], kind: str, components: set[str]
 ) -> None:
     policy = loaded(kind, seed=1, **SETTINGS[kind])  # of this test alone
-    assert {name.partition("/")[0] for name in policy.parameters()} == {"vla", *parts}
+    assert {name.partition("/")[0] for name in policy.parameters()} == {"vla", *components}
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
@@ -258,16 +264,18 @@ def test_samples_share_the_images_of_their_session(
     monkeypatch.setattr(
         backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels)
     )
+
     views = [seen(0, **{SAMPLES: 3}), seen(1)]
     shared = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
     monkeypatch.setattr(
         base_policy, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows))))
     )
-    each = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
-    assert read == [4, 10]  # of two cameras
-    for one, other in zip(shared, each, strict=True):
-        assert np.abs(one.action - other.action).max() <= SAME[kind]
-    samples = [acts[0].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
+    separate = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
+
+    assert read == [4, 10]  # images of two cameras
+    for shared_act, separate_act in zip(shared, separate, strict=True):
+        assert np.abs(shared_act.action - separate_act.action).max() <= SAME[kind]
+    samples = [acts[0].info[DISTRIBUTION]["samples"] for acts in (shared, separate)]
     assert np.abs(samples[0] - samples[1]).max() <= SAME[kind]
 
 
@@ -277,24 +285,26 @@ def test_action_tokens_have_log_probabilities_and_other_heads_have_none(
     assert loaded("oft").contract.behaviour is None
     policy = loaded("oft-tokens", **SETTINGS["oft-tokens"])
     assert policy.contract.behaviour == ("logprob", "entropy", "replay")
+
     act = begun(policy, 0).act(seen(0, **{SAMPLES: 2, WANT: ["logprob", "entropy", "replay"]}))
-    said = act.info[BEHAVIOUR]
-    bins = policy.model.base.bins
-    tokens = torch.tensor(
-        np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]])
+    behaviour, distribution = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    tokens = np.concatenate([behaviour["replay"]["tokens"][None], distribution["replay"]["tokens"]])
+
+    row = Row((begun(policy, 0).perceive(seen(0)),), WORDS[0], None)
+    inputs = [policy._model_input(row, "bridge_orig")]
+    draws = np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan)
+    _, bin_logits = policy.model.choose(inputs, [0], draws)
+    *_, logprob, entropy, _ = policy.model.base.bins.describe(
+        torch.tensor(tokens), bin_logits.expand(3, -1, -1, -1)
     )
-    session = begun(policy, 0)
-    inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
-    _, over = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
-    *_, want, entropy, _ = bins.describe(tokens, over.expand(3, -1, -1, -1))
-    np.testing.assert_allclose(said["logprob"], want[0], atol=1e-4)
-    np.testing.assert_allclose(act.info[DISTRIBUTION]["logprob"], want[1:], atol=1e-4)
-    assert said["entropy"] == pytest.approx(entropy[0].sum(), rel=1e-4)
+    np.testing.assert_allclose(behaviour["logprob"], logprob[0], atol=1e-4)
+    np.testing.assert_allclose(distribution["logprob"], logprob[1:], atol=1e-4)
+    assert behaviour["entropy"] == pytest.approx(entropy[0].sum(), rel=1e-4)
 
 
 def test_regression_is_sure_of_its_only_answer(loaded: Callable[..., Any]) -> None:
-    found = begun(loaded("oft"), 0).act(seen(0, **{SAMPLES: 3})).info[DISTRIBUTION]
-    assert found["std"].max() <= SAME["oft"]
+    act = begun(loaded("oft"), 0).act(seen(0, **{SAMPLES: 3}))
+    assert act.info[DISTRIBUTION]["std"].max() <= SAME["oft"]
 
 
 @pytest.mark.verifies("isolation")

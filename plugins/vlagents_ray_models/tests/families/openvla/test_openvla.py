@@ -36,15 +36,12 @@ def policy(loaded: Callable[..., Any]) -> OpenVLA:
 
 
 def upstream(folder: Path, image: np.ndarray, words: str, unnorm_key: str) -> np.ndarray:
-    """What OpenVLA's own `predict_action` answers, (7,)."""
-    hf = "extern.hf."
-    network = (
-        module("OPENVLA_SRC", hf + "modeling_prismatic")
-        .OpenVLAForActionPrediction.from_pretrained(folder)
-        .eval()
-    )
+    """Return the action (7,) of OpenVLA's own `predict_action`."""
+    modeling = module("OPENVLA_SRC", "extern.hf.modeling_prismatic")
+    network = modeling.OpenVLAForActionPrediction.from_pretrained(folder).eval()
     network.norm_stats = json.loads((folder / "dataset_statistics.json").read_text())
-    processing = module("OPENVLA_SRC", hf + "processing_prismatic")
+
+    processing = module("OPENVLA_SRC", "extern.hf.processing_prismatic")
     processor = processing.PrismaticProcessor(
         processing.PrismaticImageProcessor.from_pretrained(folder),
         AutoTokenizer.from_pretrained(folder),
@@ -79,21 +76,23 @@ def test_a_session_gets_the_same_in_any_company(policy: OpenVLA, size: int) -> N
     together = policy.act_batch(
         [seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)]
     )
-    for one, act in zip(alone, together, strict=True):
+    for action, act in zip(alone, together, strict=True):
         assert isinstance(act, Act)
-        assert np.array_equal(one, act.action)
-    # They differ by what they see and are told.
-    assert len({one.tobytes() for one in alone}) == size
+        assert np.array_equal(action, act.action)
+    # Their observations and instructions differ, and so do their actions.
+    assert len({action.tobytes() for action in alone}) == size
 
 
 def test_a_session_may_have_another_datasets_units(
     policy: OpenVLA, checkpoint: Callable[[str], Path]
 ) -> None:
-    here, told = begun(policy, 0), begun(policy, 0, unnorm_key="libero_spatial")
-    asked = seen(0, unnorm_key="libero_spatial_no_noops")
-    plain, reset, observed = policy.act_batch(
-        [seen(0), seen(0), asked], [here, told, begun(policy, 0)]
-    )
+    sessions = [
+        begun(policy, 0),
+        begun(policy, 0, unnorm_key="libero_spatial"),
+        begun(policy, 0),
+    ]
+    views = [seen(0), seen(0), seen(0, unnorm_key="libero_spatial_no_noops")]
+    plain, reset, observed = policy.act_batch(views, sessions)
     want = upstream(
         checkpoint("openvla"), seen(0).cameras["front"], WORDS[0], "libero_spatial_no_noops"
     )
@@ -150,15 +149,14 @@ def test_quantized_it_acts_from_weights_of_8_bits(loaded: Callable[..., Any]) ->
 def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy: OpenVLA) -> None:
     act = begun(policy, 0).act(seen(0, **{SAMPLES: 1000}))
     assert np.array_equal(act.action, begun(policy, 0).act(seen(0)).action)
-    found = act.info[DISTRIBUTION]
-    assert found["samples"].shape == (1000, 1, 7)
-    # the first number does not depend on those before it, so that its draws have just the stated
-    # moments
-    first = found["samples"][:, 0, 0]
-    assert first.mean() == pytest.approx(
-        found["mean"][0, 0], abs=4 * found["std"][0, 0] / 1000**0.5
-    )
-    assert first.std() == pytest.approx(found["std"][0, 0], rel=0.1)
+    distribution = act.info[DISTRIBUTION]
+    assert distribution["samples"].shape == (1000, 1, 7)
+
+    # No number precedes the first one, so that its draws have exactly these moments.
+    first = distribution["samples"][:, 0, 0]
+    mean, std = distribution["mean"][0, 0], distribution["std"][0, 0]
+    assert first.mean() == pytest.approx(mean, abs=4 * std / 1000**0.5)
+    assert first.std() == pytest.approx(std, rel=0.1)
 
 
 def test_samples_share_their_sessions_prompt(
@@ -178,13 +176,12 @@ ALL = ["logprob", "entropy", "replay"]
 
 
 def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distributions.Categorical:
-    """The distributions over bins of each token after those before it, all in one pass of the
-    whole sequence.
+    """Return the distribution over bins of each token, given the tokens before it, from one pass
+    over the whole sequence.
     """
     model = policy.model.base
-    patches = model.network.projector(
-        model.network.vision_backbone(model.pixels([policy.perceive(seen(seed))])[0])
-    )[0]
+    pixels = model.pixels([policy.perceive(seen(seed))])[0]
+    [patches] = model.network.projector(model.network.vision_backbone(pixels))
     words = model.embed(torch.tensor(model.tokens(WORDS[seed])))
     sequence = torch.cat([words[:1], patches, words[1:], model.embed(torch.tensor(tokens[:-1]))])
     logits = model.network.language_model(inputs_embeds=sequence[None]).logits[0, -len(tokens) :]
@@ -198,24 +195,23 @@ def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(
     acts = policy.act_batch(
         [seen(i, **{WANT: ALL}) for i in range(2)], [begun(policy, i) for i in range(2)]
     )
-    said = acts[seed].info[BEHAVIOUR]
-    [tokens] = said["replay"]["tokens"]
+    behaviour = acts[seed].info[BEHAVIOUR]
+    [tokens] = behaviour["replay"]["tokens"]
     with torch.no_grad():
         categorical = scored(policy, seed, tokens)
     np.testing.assert_allclose(
-        said["logprob"][0], categorical.log_prob(torch.tensor(tokens) - 31744), atol=1e-4
+        behaviour["logprob"][0], categorical.log_prob(torch.tensor(tokens) - 31744), atol=1e-4
     )
-    assert said["entropy"] == pytest.approx(categorical.entropy().sum().item(), abs=1e-4)
+    assert behaviour["entropy"] == pytest.approx(categorical.entropy().sum().item(), abs=1e-4)
     assert np.array_equal(acts[seed].action[0], unit(policy, tokens))
 
 
 def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
-    """The action of tokens."""
-    scale = policy.model.base.statistics.scale("bridge_orig")
-    chosen = torch.tensor(tokens)
-    return scale.restore(
-        policy.model.base.bins.describe(chosen, torch.zeros(*chosen.shape, 256).double())[0]
-    )
+    """Return the action of tokens."""
+    base = policy.model.base
+    bin_logits = torch.zeros(*tokens.shape, 256).double()
+    values, *_ = base.bins.describe(torch.tensor(tokens), bin_logits)
+    return base.statistics.scale("bridge_orig").restore(values)
 
 
 def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(
@@ -229,21 +225,25 @@ def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likelie
 
 
 def test_each_sample_has_its_log_probability(policy: OpenVLA) -> None:
-    found = begun(policy, 0).act(seen(0, **{SAMPLES: 3, WANT: ALL})).info[DISTRIBUTION]
-    assert found["logprob"].shape == found["samples"].shape == (3, 1, 7)
+    act = begun(policy, 0).act(seen(0, **{SAMPLES: 3, WANT: ALL}))
+    distribution = act.info[DISTRIBUTION]
+    assert distribution["logprob"].shape == distribution["samples"].shape == (3, 1, 7)
     with torch.no_grad():
-        for (tokens,), (logprob,) in zip(found["replay"]["tokens"], found["logprob"], strict=True):
-            want = scored(policy, 0, tokens).log_prob(torch.tensor(tokens) - 31744)
-            np.testing.assert_allclose(logprob, want, atol=1e-4)
+        for (tokens,), (logprob,) in zip(
+            distribution["replay"]["tokens"], distribution["logprob"], strict=True
+        ):
+            expected = scored(policy, 0, tokens).log_prob(torch.tensor(tokens) - 31744)
+            np.testing.assert_allclose(logprob, expected, atol=1e-4)
 
 
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
-    [got], [plain] = cropping.perceive(obs).values(), loaded("openvla").perceive(obs).values()
-    [want] = cropping.model.base.stage([crop_center(resize(obs.cameras["front"]))]).values()
-    np.testing.assert_array_equal(got, want)
-    assert not np.array_equal(got, plain)
+    [cropped] = cropping.perceive(obs).values()
+    [plain] = loaded("openvla").perceive(obs).values()
+    [expected] = cropping.model.base.stage([crop_center(resize(obs.cameras["front"]))]).values()
+    np.testing.assert_array_equal(cropped, expected)
+    assert not np.array_equal(cropped, plain)
 
 
 # Transformers 4.40 imports such code with it.

@@ -23,25 +23,30 @@ def test_it_loads_and_acts_with_every_dimension_inside_its_range(tmp_path: Path)
     written = write_checkpoint("openvla", tmp_path / "made", "small", "float32")
     policy = OpenVLA.from_config(written.config)
     policy.initialize()
-    assert written.parameters == sum(one.numel() for one in policy.model.base.network.parameters())
-    found = []
+    parameters = policy.model.base.network.parameters()
+    assert written.parameters == sum(parameter.numel() for parameter in parameters)
+
+    actions = []
     for seed in range(4):
         obs = random_observation(policy.contract, seed, image_size=224)
         policy.reset(obs, "pick up the cube", seed=0)
-        found.append(np.asarray(policy.act(obs).action))
+        actions.append(np.asarray(policy.act(obs).action))
+    values = np.array(actions)
+    assert values.shape == (4, 1, recipe.ACTION_DIM)
+
     scale = policy.model.base.statistics.scale("bridge_orig")
-    assert np.shape(found) == (4, 1, recipe.ACTION_DIM)
-    inside = (np.array(found) > scale.low + 1e-6) & (np.array(found) < scale.high - 1e-6)
-    # Tokens of other words than actions would all be at an end.
+    inside = (values > scale.low + 1e-6) & (values < scale.high - 1e-6)
+    # The values of other tokens than actions would all be at an end of the range.
     assert inside[..., scale.mask].mean() > 0.5
-    assert len(np.unique(np.array(found), axis=0)) > 1
+    assert len(np.unique(values, axis=0)) > 1
 
 
 @pytest.mark.verifies("size")
 def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     model, _ = recipe.make_model(Recipe("openvla", tmp_path, "full", "bfloat16"), find_source(None))
     # Its files have 15.1 GB.
-    assert sum(one.numel() for one in model.parameters()) == pytest.approx(7.54e9, rel=0.01)
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    assert parameters == pytest.approx(7.54e9, rel=0.01)
 
 
 def test_the_models_code_must_be_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

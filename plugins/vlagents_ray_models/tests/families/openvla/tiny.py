@@ -29,7 +29,7 @@ LORA_RANK = 4  # as scale min(rank, 16) / rank = 1
 
 
 def make(folder: Path, kind: str = "openvla", datasets: tuple[str, ...] = DATASETS) -> Path:
-    """A checkpoint of that kind in `folder`."""
+    """Write a checkpoint of that kind into `folder`."""
     torch.manual_seed(0)
     variable = "OPENVLA_OFT_SRC" if kind.startswith("oft") else "OPENVLA_SRC"
     network = _network(variable, small=kind != "openvla")
@@ -46,7 +46,7 @@ def make(folder: Path, kind: str = "openvla", datasets: tuple[str, ...] = DATASE
 
 
 def _network(variable: str, *, small: bool) -> Any:
-    """The model, whose two backbones give 16 patches each.
+    """Return the model, whose two backbones return 16 patches each.
 
     The first one of the larger has layer scales, whose name transformers would change if OpenVLA
     did not.
@@ -63,7 +63,7 @@ def _network(variable: str, *, small: bool) -> Any:
         ("vit_tiny_patch16_224" if small else "deit3_small_patch16_224", "vit_tiny_patch16_224"),
         side=64,
     )
-    # far from nothing, so that different inputs have different answers
+    # Far from zero, so that different inputs have different actions.
     config = recipe.make_config(modeling.OpenVLAConfig, size, initializer_range=0.1)
     network = modeling.OpenVLAForActionPrediction(config).eval()
     for name, parameter in network.named_parameters():
@@ -74,39 +74,40 @@ def _network(variable: str, *, small: bool) -> Any:
 
 
 def _add_code(folder: Path) -> None:
-    """The model's code beside its weights, and where it is found."""
+    """Add the model's code to a checkpoint, and name its classes in the configs."""
     hf = Path(module("OPENVLA_SRC", "extern.hf.modeling_prismatic").__file__ or "").parent
     for name in ("configuration", "modeling", "processing"):
         shutil.copy(hf / f"{name}_prismatic.py", folder)
-    named = {
+    auto_maps = {
         "config.json": {"AutoModelForVision2Seq": "modeling_prismatic.OpenVLAForActionPrediction"},
         "preprocessor_config.json": {
             "AutoImageProcessor": "processing_prismatic.PrismaticImageProcessor"
         },
     }
-    for name, auto_map in named.items():
+    for name, auto_map in auto_maps.items():
         config = json.loads((folder / name).read_text())
         (folder / name).write_text(json.dumps(config | {"auto_map": auto_map}))
 
 
 def _add_components(folder: Path, kind: str, network: Any) -> None:
-    """OFT's heads, as its fine-tuning saves them."""
+    """Add the components that OFT's fine-tuning saves."""
     heads = module("OPENVLA_OFT_SRC", "models.action_heads")
     projectors = module("OPENVLA_OFT_SRC", "models.projectors")
-    parts: dict[str, torch.nn.Module] = {
+    components: dict[str, torch.nn.Module] = {
         "proprio_projector": projectors.ProprioProjector(LLM_DIM, PROPRIO_DIM)
     }
     if kind == "oft-diffusion":
-        parts["action_head"] = heads.DiffusionActionHead(
+        components["action_head"] = heads.DiffusionActionHead(
             LLM_DIM, LLM_DIM, ACTION_DIM, DIFFUSION_STEPS
         )
-        parts["noisy_action_projector"] = projectors.NoisyActionProjector(LLM_DIM)
+        components["noisy_action_projector"] = projectors.NoisyActionProjector(LLM_DIM)
     elif kind != "oft-tokens":
-        parts["action_head"] = heads.L1RegressionActionHead(LLM_DIM, LLM_DIM, ACTION_DIM)
+        components["action_head"] = heads.L1RegressionActionHead(LLM_DIM, LLM_DIM, ACTION_DIM)
     if kind == "oft-film":
-        parts["vision_backbone"] = filmed(network)
-    for name, part in parts.items():
-        state = part.state_dict()
+        components["vision_backbone"] = filmed(network)
+
+    for name, component in components.items():
+        state = component.state_dict()
         if name in ("action_head", "proprio_projector"):  # trained in parallel
             state = {f"module.{key}": tensor for key, tensor in state.items()}
         torch.save(state, folder / f"{name}--100_checkpoint.pt")

@@ -24,15 +24,15 @@ _PACKAGES = ("", ".extern", ".extern.hf", ".models", ".training", ".vla")
 
 
 def source(variable: str) -> Path | None:
-    """The source tree that a variable names, if there is one."""
+    """Return the source tree that a variable names; None if there is none."""
     root = Path(os.environ.get(variable) or "-")
     return root if (root / "prismatic").is_dir() else None
 
 
 @lru_cache
 def module(variable: str, name: str) -> types.ModuleType:
-    """A module of that tree's package `prismatic`, by its name there; those of one tree share
-    what they import.
+    """Return a module of the package `prismatic` in that tree; modules of one tree share their
+    imports.
     """
     with _packages(variable):
         return importlib.import_module(f"prismatic.{name}")
@@ -44,15 +44,16 @@ _imported: dict[str, dict[str, types.ModuleType]] = {name: {} for name in VARIAB
 @contextlib.contextmanager
 def _packages(variable: str) -> Iterator[None]:
     ensure_torchvision()
-    known = _imported[variable]
+    imported = _imported[variable]
     for suffix in _PACKAGES:
-        if f"prismatic{suffix}" not in known:
-            package = known[f"prismatic{suffix}"] = types.ModuleType(f"prismatic{suffix}")
-            package.__path__ = [str(Path(os.environ[variable], *f"prismatic{suffix}".split(".")))]
-    sys.modules.update(known)
+        name = f"prismatic{suffix}"
+        if name not in imported:
+            package = imported[name] = types.ModuleType(name)
+            package.__path__ = [str(Path(os.environ[variable], *name.split(".")))]
+    sys.modules.update(imported)
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             yield
     finally:
         for name in [name for name in sys.modules if name.partition(".")[0] == "prismatic"]:
-            known[name] = sys.modules.pop(name)
+            imported[name] = sys.modules.pop(name)
