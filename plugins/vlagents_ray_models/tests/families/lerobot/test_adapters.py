@@ -45,28 +45,26 @@ SEEING = r"model\.vlm_with_expert\.vlm\.model\.(text_model|vision_model)\..*\.(q
 
 
 def layers(network: Any, pattern: str) -> list[str]:
-    found = [
-        name
-        for name, one in network.named_modules()
-        if type(one) is torch.nn.Linear and re.fullmatch(pattern, name)
-    ]
-    assert len(found) > 3
-    return found
+    """Return the names of the linear layers that a pattern matches."""
+    names = []
+    for name, module in network.named_modules():
+        if type(module) is torch.nn.Linear and re.fullmatch(pattern, name):
+            names.append(name)
+    assert len(names) > 3
+    return names
 
 
 @pytest.fixture(scope="module")
 def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "units" has statistics
-    of its own.
+    """Folders of adapters by name, and of whole checkpoints by "merged/NAME"; the adapter "units"
+    was trained with other statistics.
     """
     root, folders = tmp_path_factory.mktemp("adapters"), {}
     network = loaded("smolvla").model.sampler.policy
-    kinds = [("expert", TARGETS, 4), ("all", f"{TARGETS}|{SEEING}", 2), ("units", TARGETS, 8)]
-    for seed, (name, pattern, rank) in enumerate(kinds):
-        values = {
-            key: 0.3 * value
-            for key, value in pairs(network, layers(network, pattern), rank, seed).items()
-        }
+    adapters = [("expert", TARGETS, 4), ("all", f"{TARGETS}|{SEEING}", 2), ("units", TARGETS, 8)]
+    for seed, (name, pattern, rank) in enumerate(adapters):
+        random_values = pairs(network, layers(network, pattern), rank, seed)
+        values = {key: 0.3 * value for key, value in random_values.items()}
         folders[name] = save(root / name, values)
         whole = shutil.copytree(made("smolvla"), root / f"merged-{name}")
         merged = LeRobot.from_config({"checkpoint": str(whole)})
@@ -80,14 +78,15 @@ def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) ->
     return folders
 
 
-def write_processors(settings: Any, beside: dict[str, Any], *folders: Path) -> None:
-    """Write the processors of a training on another dataset than the base's, with statistics
-    `beside` its own.
+def write_processors(settings: Any, further: dict[str, Any], *folders: Path) -> None:
+    """Write the processors of a training on another dataset than the base's.
+
+    Its statistics are those of its features, and `further` ones.
     """
-    dataset = {
-        key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()
-    }
-    for pipeline in make_pre_post_processors(settings, dataset_stats=dataset | beside):
+    dataset = {}
+    for key, statistics in tiny.statistics().items():
+        dataset[key] = {name: 2 * value + 0.5 for name, value in statistics.items()}
+    for pipeline in make_pre_post_processors(settings, dataset_stats=dataset | further):
         for folder in folders:
             pipeline.save_pretrained(folder)
 
@@ -100,11 +99,11 @@ def adapted(made: Made, saved: dict[str, Path]) -> LeRobot:
     return policy
 
 
-def session(policy: LeRobot, number: int, adapter: str | None = None) -> LeRobot:
-    one = AgentCopies(policy).make()
-    one.reset(view(number), TASKS[number % len(TASKS)], seed=number, adapter=adapter)
-    assert isinstance(one, LeRobot)
-    return one
+def begun_with(policy: LeRobot, number: int, adapter: str | None = None) -> LeRobot:
+    session = AgentCopies(policy).make()
+    session.reset(view(number), TASKS[number % len(TASKS)], seed=number, adapter=adapter)
+    assert isinstance(session, LeRobot)
+    return session
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +124,7 @@ CHOSEN = ("all", None, "expert", "units", "all", "units")
 
 
 def infos(number: int) -> dict[str, Any]:
-    """Some sessions also want samples, or continue a plan."""
+    """Return the info of a session's observation; some request samples, or continue a plan."""
     if number == 3:
         return {LEFTOVER: np.full((6, tiny.ACTION), 0.3, np.float32), DELAY: 2}
     return {SAMPLES: 3 * (number % 2)}
@@ -134,29 +133,30 @@ def infos(number: int) -> dict[str, Any]:
 def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
     adapted: LeRobot, alone: Callable[[str | None], LeRobot]
 ) -> None:
-    sessions = [session(adapted, number, name) for number, name in enumerate(CHOSEN)]
+    sessions = [begun_with(adapted, number, name) for number, name in enumerate(CHOSEN)]
     acts = adapted.act_batch(
         [view(number, **infos(number)) for number in range(len(CHOSEN))], sessions
     )
     for number, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
-        wanted = begun(alone(name), number).act(view(number, **infos(number)))
+        expected = begun(alone(name), number).act(view(number, **infos(number)))
         assert isinstance(act, Act)
-        np.testing.assert_allclose(act.action, wanted.action, atol=ATOL)
-        if DISTRIBUTION in wanted.info:
-            for part in ("mean", "samples"):
+        np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
+        if DISTRIBUTION in expected.info:
+            for key in ("mean", "samples"):
                 np.testing.assert_allclose(
-                    act.info[DISTRIBUTION][part], wanted.info[DISTRIBUTION][part], atol=ATOL
+                    act.info[DISTRIBUTION][key], expected.info[DISTRIBUTION][key], atol=ATOL
                 )
         if name is not None:
-            base = begun(alone(None), number).act(view(number, **infos(number)))
-            assert np.abs(base.action - wanted.action).max() > 100 * ATOL
+            of_base = begun(alone(None), number).act(view(number, **infos(number)))
+            assert np.abs(of_base.action - expected.action).max() > 100 * ATOL
 
 
-def test_a_learner_pushes_one_of_them(adapted: LeRobot) -> None:
-    others = [session(adapted, 0, name).act(view(0)).action for name in (None, "units")]
-    check_pushed_weights(adapted, lambda: session(adapted, 0, "all").act(view(0)).action, "all/")
-    for name, action in zip((None, "units"), others, strict=True):
-        assert np.array_equal(session(adapted, 0, name).act(view(0)).action, action)
+def test_a_learner_pushes_one_of_several_adapters(adapted: LeRobot) -> None:
+    unchanged = (None, "units")
+    before = [begun_with(adapted, 0, name).act(view(0)).action for name in unchanged]
+    check_pushed_weights(adapted, lambda: begun_with(adapted, 0, "all").act(view(0)).action, "all/")
+    for name, action in zip(unchanged, before, strict=True):
+        assert np.array_equal(begun_with(adapted, 0, name).act(view(0)).action, action)
 
 
 def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:
@@ -179,8 +179,9 @@ def test_processors_of_another_kind_are_refused(
         ConfigError, match=r"adapter 'expert': .* misses .*'policy_postprocessor.json'.*, want both"
     ):
         LeRobot.from_config(config).initialize()
-    for other in made("smolvla").glob("policy_*"):
-        shutil.copy(other, folder)
+
+    for file_of_base in made("smolvla").glob("policy_*"):
+        shutil.copy(file_of_base, folder)
     pipeline = json.loads(Path(file).read_text())
     pipeline["steps"] = [
         step for step in pipeline["steps"] if step["registry_name"] != "to_batch_processor"
@@ -193,12 +194,11 @@ def test_processors_of_another_kind_are_refused(
 
 
 def arm(control_hz: float) -> DatasetContract:
-    """The contract of a dataset whose first joint is near a half turn."""
-    action = ActionSpec(dim=tiny.ACTION, space="joints", delta=False)
+    """Return the contract of a dataset whose first joint is near a half turn."""
     contract = Contract(
         state={"joints": StateSpec(tiny.STATE - 1)},
         gripper=True,
-        action=action,
+        action=ActionSpec(dim=tiny.ACTION, space="joints", delta=False),
         control_hz=control_hz,
     )
     return DatasetContract(
@@ -207,19 +207,19 @@ def arm(control_hz: float) -> DatasetContract:
 
 
 @pytest.fixture(scope="module")
-def stated(
+def with_contracts(
     saved: dict[str, Path], loaded: Load, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Path]:
-    """Folders of the adapter "units" with the contracts of two datasets, and "whole", the first
-    one merged.
+    """Folders of the adapter "units" with the contract of a dataset, and of "whole", the adapter
+    merged into its base.
+
+    "ten", "again" and "whole" have the contract of one dataset, "twenty" of another.
     """
-    root, settings = (
-        tmp_path_factory.mktemp("stated"),
-        loaded("smolvla").model.sampler.policy.config,
-    )
-    folders = {
-        name: shutil.copytree(saved["units"], root / name) for name in ("ten", "twenty", "again")
-    }
+    root = tmp_path_factory.mktemp("contracts")
+    settings = loaded("smolvla").model.sampler.policy.config
+    folders = {}
+    for name in ("ten", "twenty", "again"):
+        folders[name] = shutil.copytree(saved["units"], root / name)
     folders["whole"] = shutil.copytree(saved["merged/units"], root / "whole")
     write_processors(
         settings, arm(10.0).to_statistics(9), folders["ten"], folders["again"], folders["whole"]
@@ -229,36 +229,43 @@ def stated(
 
 
 def served(base: Path, adapters: dict[str, Path], **config: Any) -> LeRobot:
-    named = {name: str(folder) for name, folder in adapters.items()}
-    policy = LeRobot.from_config({"checkpoint": str(base), "adapters": named, **config})
+    folders = {name: str(folder) for name, folder in adapters.items()}
+    policy = LeRobot.from_config({"checkpoint": str(base), "adapters": folders, **config})
     policy.initialize()
     return policy
 
 
-def test_a_base_that_states_no_dataset_gets_the_contract_of_its_adapters(
-    made: Made, saved: dict[str, Path], stated: dict[str, Path]
+def test_a_base_without_a_dataset_gets_the_contract_of_its_adapters(
+    made: Made, saved: dict[str, Path], with_contracts: dict[str, Path]
 ) -> None:
-    adapters = {"expert": saved["expert"], "ten": stated["ten"], "again": stated["again"]}
-    policy, alone = served(made("smolvla"), adapters), served(stated["whole"], {})
+    adapters = {
+        "expert": saved["expert"],
+        "ten": with_contracts["ten"],
+        "again": with_contracts["again"],
+    }
+    policy, alone = served(made("smolvla"), adapters), served(with_contracts["whole"], {})
     assert alone.contract is not None
     assert alone.contract.gripper
     assert policy.contract == alone.contract
-    # The first one is wrapped to 3.18.
+
+    # The first joint is wrapped to 3.18.
     joints = np.linspace(-3.1, 3.1, tiny.STATE - 1).astype(np.float32)
-    seen = Obs({"front": view(0).cameras["top"]}, 0.5, {"joints": joints})
-    acts = []
-    for one, name in ((policy, "ten"), (alone, None)):
-        session = AgentCopies(one).make()
-        session.reset(seen, TASKS[0], seed=1, adapter=name)
-        acts.append(session.act(seen).action)
-    np.testing.assert_allclose(acts[0], acts[1], atol=ATOL)
+    obs = Obs({"front": view(0).cameras["top"]}, 0.5, {"joints": joints})
+    actions = []
+    for agent, name in ((policy, "ten"), (alone, None)):
+        session = AgentCopies(agent).make()
+        session.reset(obs, TASKS[0], seed=1, adapter=name)
+        actions.append(session.act(obs).action)
+    np.testing.assert_allclose(*actions, atol=ATOL)
 
 
-def test_adapters_of_different_contracts_are_refused(made: Made, stated: dict[str, Path]) -> None:
+def test_adapters_of_different_contracts_are_refused(
+    made: Made, with_contracts: dict[str, Path]
+) -> None:
     with pytest.raises(ConfigError, match=r"adapter 'twenty': .*its dataset has another contract"):
-        served(made("smolvla"), {"ten": stated["ten"], "twenty": stated["twenty"]})
+        served(made("smolvla"), {"ten": with_contracts["ten"], "twenty": with_contracts["twenty"]})
     with pytest.raises(ConfigError, match=r"adapter 'twenty': .*its dataset has another contract"):
-        served(stated["whole"], {"twenty": stated["twenty"]})
+        served(with_contracts["whole"], {"twenty": with_contracts["twenty"]})
 
 
 @pytest.mark.parametrize(
@@ -282,7 +289,8 @@ def test_adapters_of_different_contracts_are_refused(made: Made, stated: dict[st
 def test_an_adapter_that_was_trained_with_another_network_is_refused(
     made: Made, saved: dict[str, Path], tmp_path: Path, change: dict[str, Any], says: str
 ) -> None:
-    folder, base = shutil.copytree(saved["units"], tmp_path / "units"), made("smolvla")
+    base = made("smolvla")
+    folder = shutil.copytree(saved["units"], tmp_path / "units")
     config = json.loads((base / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config))
     served(base, {"units": folder})
@@ -297,12 +305,8 @@ def test_an_adapter_whose_instructions_were_other_tokens_is_refused(
     folder = shutil.copytree(saved["units"], tmp_path / "units")
     file = folder / "policy_preprocessor.json"
     pipeline = json.loads(file.read_text())
-    [tokens] = [
-        step["config"]
-        for step in pipeline["steps"]
-        if step["registry_name"] == "tokenizer_processor"
-    ]
-    tokens["max_length"] += 1
+    steps = {step["registry_name"]: step for step in pipeline["steps"]}
+    steps["tokenizer_processor"]["config"]["max_length"] += 1
     file.write_text(json.dumps(pipeline))
     with pytest.raises(
         ConfigError, match=r"adapter 'units': .*other settings of \['tokenizer_processor'\]"

@@ -52,15 +52,15 @@ def both(
         }
     )
     compiled.initialize()
-    # What is seen, and a step from noise.
+    # The program of the observations, and of a step from noise.
     assert programs[before:] == [SIZE] * (1 if request.param == "act" else 2)
     return loaded(request.param, **settings), compiled
 
 
 def acts(policy: LeRobot, views: list[Obs]) -> list[Act]:
-    found = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
-    assert all(isinstance(act, Act) for act in found)
-    return found  # type: ignore[return-value]
+    outcomes = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
+    assert all(isinstance(outcome, Act) for outcome in outcomes)
+    return outcomes  # type: ignore[return-value]
 
 
 def test_batches_of_any_size_are_those_without_compilation(
@@ -69,8 +69,8 @@ def test_batches_of_any_size_are_those_without_compilation(
     before = len(programs)
     for size in (1, 2, SIZE, SIZE + 1):
         plain, compiled = (acts(policy, [view(i) for i in range(size)]) for policy in both)
-        for one, other in zip(plain, compiled, strict=True):
-            np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+        for expected, act in zip(plain, compiled, strict=True):
+            np.testing.assert_allclose(expected.action, act.action, atol=ATOL)
     assert len(programs) == before
 
 
@@ -79,26 +79,24 @@ def test_plans_samples_and_random_steps_are_those_without_compilation(
 ) -> None:
     before = len(programs)
     plan = np.ones((6, tiny.ACTION), np.float32)
-    flow = both[0].contract.behaviour is not None
+    has_random_steps = both[0].contract.behaviour is not None
     views = [
         view(0, **{LEFTOVER: plan, DELAY: 2}),
-        view(1, **({SAMPLES: 2, WANT: ["logprob"]} if flow else {})),
+        view(1, **({SAMPLES: 2, WANT: ["logprob"]} if has_random_steps else {})),
     ]
-    for one, other in zip(*(acts(policy, views) for policy in both), strict=True):
-        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
-        if DISTRIBUTION in one.info:
-            np.testing.assert_allclose(
-                *(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL
-            )
-            np.testing.assert_allclose(
-                *(act.info[BEHAVIOUR]["logprob"] for act in (one, other)), atol=2e-3
-            )
+    for pair in zip(*(acts(policy, views) for policy in both), strict=True):
+        np.testing.assert_allclose(*(act.action for act in pair), atol=ATOL)
+        if DISTRIBUTION in pair[0].info:
+            samples = [act.info[DISTRIBUTION]["samples"] for act in pair]
+            np.testing.assert_allclose(*samples, atol=ATOL)
+            logprobs = [act.info[BEHAVIOUR]["logprob"] for act in pair]
+            np.testing.assert_allclose(*logprobs, atol=2e-3)
     assert len(programs) == before
 
 
 def test_it_acts_with_pushed_weights(both: tuple[LeRobot, LeRobot], programs: list[int]) -> None:
     before = len(programs)
-    compiled = both[1]
+    _, compiled = both
     check_pushed_weights(compiled, lambda: begun(compiled, 0).act(view(0)).action)
     assert len(programs) == before
 

@@ -1,4 +1,4 @@
-"""What SmolVLA states of its acts for learners, and that its samples share what they see."""
+"""The outputs of SmolVLA for learners, and the shared observation of its samples."""
 
 from __future__ import annotations
 
@@ -37,22 +37,25 @@ def learnt(loaded: Load) -> LeRobot:
 
 
 def velocity(policy: LeRobot, number: int, noisy: Any, time: float) -> Any:
-    """The flow's velocity (1, H, D) by LeRobot's own training pass, which has no cache."""
-    session, seen, network = begun(policy, number), [], policy.model.sampler.policy
+    """Return the flow's velocity (1, H, D) from LeRobot's own training pass, which has no
+    cache.
+    """
+    session, network = begun(policy, number), policy.model.sampler.policy
     row = Row((session.perceive(view(number)),), session.episode.instruction, session.episode.rng)
     batch = network._prepare_batch(policy.model.processors.observe([row], 1))
     images, masks = network.prepare_images(batch)
     words = [batch[f"observation.language.{name}"] for name in ("tokens", "attention_mask")]
+    outputs: list[Any] = []
     hook = network.model.action_out_proj.register_forward_hook(
-        lambda _module, _inputs, output: seen.append(output)
+        lambda _module, _inputs, output: outputs.append(output)
     )
     try:
-        with torch.no_grad():  # noise and actions are the same, and so is what is between them
+        with torch.no_grad():  # between the same noise and actions, noisy actions are the same
             state, times = network.prepare_state(batch), torch.tensor([time])
             network.model.forward(images, masks, *words, state, noisy, noise=noisy, time=times)
     finally:
         hook.remove()
-    return seen[0]
+    return outputs[0]
 
 
 def test_it_offers_what_random_steps_have(loaded: Load, learnt: LeRobot) -> None:
@@ -67,9 +70,10 @@ def test_a_policy_without_a_flow_has_no_noise_level(made: Made) -> None:
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: LeRobot) -> None:
     act = begun(learnt, 1).act(view(1, **{WANT: ALL, SAMPLES: 2}))
-    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
-    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
-    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+    behaviour, samples = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [behaviour["replay"]["chain"], *samples["replay"]["chain"]]
+    logprobs = [behaviour["logprob"], *samples["logprob"]]
+    for chain, logprob in zip(chains, logprobs, strict=True):
         total = logprob_of_steps(lambda noisy, time: velocity(learnt, 1, noisy, time), chain, LEVEL)
         np.testing.assert_allclose(logprob, total[: len(act.action), : tiny.ACTION], atol=SUMMED)
 
@@ -101,11 +105,11 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
     model = learnt.model.sampler.policy.model
     embed = model.embed_prefix
 
-    def counted(images: Any, *rest: Any, **more: Any) -> Any:
+    def count_and_embed(images: Any, *args: Any, **kwargs: Any) -> Any:
         read.append(len(images[0]))
-        return embed(images, *rest, **more)
+        return embed(images, *args, **kwargs)
 
-    monkeypatch.setattr(model, "embed_prefix", counted)
+    monkeypatch.setattr(model, "embed_prefix", count_and_embed)
     views = [view(0, **{SAMPLES: 8, WANT: ALL}), view(1), view(2, **{SAMPLES: 3})]
     check_shared_readings(learnt, views, begun, samplers, ATOL)
     assert read == [3, 14]

@@ -137,7 +137,7 @@ def test_flow_matching_and_its_guidance_are_theirs(
         theirs.policy.init_rtc_processor()
         left = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
         given |= {"prev_chunk_left_over": torch.from_numpy(left)[None], "inference_delay": delay}
-    chunk = theirs.policy.predict_action_chunk(theirs.see(view()), **given)
+    chunk = theirs.policy.predict_action_chunk(theirs.preprocess(view()), **given)
     ours = begun(policy).act(view(**info)).action
     np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
 
@@ -165,7 +165,7 @@ def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
     plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
     theirs.policy.config.rtc_config = RTCConfig(enabled=True)
     theirs.policy.init_rtc_processor()
-    seen = theirs.see(view())
+    seen = theirs.preprocess(view())
     steps = {type(step).__name__: step for step in theirs.before.steps}
     left = reanchor_relative_rtc_prefix(
         torch.from_numpy(plan),

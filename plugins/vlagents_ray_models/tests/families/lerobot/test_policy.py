@@ -1,6 +1,4 @@
-"""What every type of LeRobot policy keeps: the contract, and sessions that do not notice one
-another.
-"""
+"""Tests of every type of LeRobot policy: its contract, and the independence of sessions."""
 
 from __future__ import annotations
 
@@ -46,12 +44,12 @@ def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None
     first, second = alone.act(view(1)).action, alone.act(view(11)).action
     for size in (2, 3, 8):
         company = [begun(policy, number) for number in range(1, size + 1)]
-        for tick, wanted in enumerate((first, second)):
+        for tick, expected in enumerate((first, second)):
             acts = policy.act_batch(
                 [view(10 * tick + number) for number in range(1, size + 1)], company
             )
             assert isinstance(acts[0], Act)
-            np.testing.assert_allclose(acts[0].action, wanted, atol=ATOL)
+            np.testing.assert_allclose(acts[0].action, expected, atol=ATOL)
 
 
 @pytest.mark.parametrize("kind", INSTRUCTED)
@@ -68,16 +66,17 @@ def test_the_instruction_decides(kind: str, loaded: Load) -> None:
 def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
     loaded: Load, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, read = loaded("xvla"), list[int]()
+    policy = loaded("xvla")
     vlm = policy.model.sampler.policy.model.vlm
     name = "get_image_features" if tiny.NEW else "_encode_image"
-    look = getattr(vlm, name)
+    encode = getattr(vlm, name)
+    read: list[int] = []
 
-    def counted(images: Any) -> Any:
+    def count_and_encode(images: Any) -> Any:
         read.append(len(images))  # one camera
-        return look(images)
+        return encode(images)
 
-    monkeypatch.setattr(vlm, name, counted)
+    monkeypatch.setattr(vlm, name, count_and_encode)
     views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
     check_shared_readings(policy, views, begun, samplers, ATOL)
     assert read == [3, 14]
@@ -102,12 +101,12 @@ def test_the_contract_is_what_the_checkpoint_was_trained_with(loaded: Load) -> N
 
 
 def test_the_ranges_of_the_training_are_stated(loaded: Load) -> None:
-    stated, made = loaded("act").statistics, tiny.statistics()
-    assert stated is not None
-    assert stated["parts"] == ["joints"]
+    ranges, expected = loaded("act").statistics, tiny.statistics()
+    assert ranges is not None
+    assert ranges["parts"] == ["joints"]
     for key in ("observation.state", "action"):
-        assert set(stated[key]) == {"min", "max"}
-        np.testing.assert_allclose(stated[key]["min"], made[key]["min"], rtol=1e-6)
+        assert set(ranges[key]) == {"min", "max"}
+        np.testing.assert_allclose(ranges[key]["min"], expected[key]["min"], rtol=1e-6)
 
 
 def test_the_names_of_the_joints_are_those_of_the_training(
@@ -117,8 +116,8 @@ def test_the_names_of_the_joints_are_those_of_the_training(
     model = policy.model
     # As LeRobot 0.6 saves it.
     monkeypatch.setattr(model.sampler.config, "action_feature_names", names, raising=False)
-    found = policy._describe(model.sampler, model.processors, model.trained, {})
-    assert found.contract.action.names == tuple(names)
+    described = policy._describe(model.sampler, model.processors, model.trained, {})
+    assert described.contract.action.names == tuple(names)
     assert policy.contract.action.names is None
 
 
@@ -126,29 +125,27 @@ def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Loa
     policy = loaded("smolvla")
     sides = [64, 96, 64]
     views = [view(number, side) for number, side in enumerate(sides)]
-    alone = [begun(policy, number).act(one).action for number, one in enumerate(views)]
+    alone = [begun(policy, number).act(obs).action for number, obs in enumerate(views)]
     acts = policy.act_batch(views, [begun(policy, number) for number in range(3)])
-    for act, wanted in zip(acts, alone, strict=True):
+    for act, expected in zip(acts, alone, strict=True):
         assert isinstance(act, Act)
-        np.testing.assert_allclose(act.action, wanted, atol=ATOL)
+        np.testing.assert_allclose(act.action, expected, atol=ATOL)
 
 
 def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Load) -> None:
     policy = loaded("ensemble")
-    assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == (
-        "ensemble",
-        0.1,
-        1,
-    )
+    assert policy.config.actions == "ensemble"
+    assert policy.config.ensemble_m == 0.1
+    assert policy.contract.chunk == 1
     assert loaded("ensemble", actions="chunk").contract.chunk == tiny.CHUNK
     assert loaded("act", actions="ensemble").config.execute is None
 
 
 @pytest.mark.parametrize("kind", ["diffusion", "tdmpc", "smolvla"])
 def test_samples_change_no_action_of_the_session(kind: str, loaded: Load) -> None:
-    plain, asked = begun(loaded(kind, actions="chunk")), begun(loaded(kind, actions="chunk"))
+    plain, sampling = begun(loaded(kind, actions="chunk")), begun(loaded(kind, actions="chunk"))
     for tick in range(2):
-        act = asked.act(view(tick, **{SAMPLES: 3}))
+        act = sampling.act(view(tick, **{SAMPLES: 3}))
         assert act.info[DISTRIBUTION]["samples"].shape == (3, *act.action.shape)
         assert act.info[DISTRIBUTION]["std"].max() > 1e-3
         np.testing.assert_allclose(act.action, plain.act(view(tick)).action, atol=ATOL)
@@ -177,6 +174,6 @@ def test_other_names_for_cameras_and_state(loaded: Load, made: Made) -> None:
 def test_acts_with_pushed_weights(kind: str, made: Made) -> None:
     policy = LeRobot.from_config({"checkpoint": str(made(kind))})
     policy.initialize()
-    # Those of LeRobot's trainer.
+    # LeRobot's training uses the same names.
     assert policy.parameters().keys() == policy.model.sampler.policy.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy, 1).act(view(1)).action)

@@ -53,7 +53,7 @@ def test_given_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None
         "inference_delay": delay,
     }
     wanted = (
-        theirs.after(theirs.policy.predict_action_chunk(theirs.see(view()), **given))[0]
+        theirs.after(theirs.policy.predict_action_chunk(theirs.preprocess(view()), **given))[0]
         .detach()
         .numpy()
     )

@@ -34,7 +34,7 @@ OF_THIS_VERSION = tiny.KINDS[4:] if tiny.NEW else ("sac",)
 
 
 class Theirs:
-    """A checkpoint in LeRobot's own loop."""
+    """A checkpoint that LeRobot's own loop runs."""
 
     def __init__(self, folder: Path, **processors: dict[str, Any]) -> None:
         config = PreTrainedConfig.from_pretrained(folder)
@@ -46,19 +46,24 @@ class Theirs:
             config, pretrained_path=str(folder), preprocessor_overrides=processors
         )
 
-    def see(self, obs: Obs, task: str = TASKS[0]) -> dict[str, Any]:
-        images = {f"observation.images.{name}": image.copy() for name, image in obs.cameras.items()}
-        seen = {**images, "observation.state": obs.state["joints"].copy()}
-        batch = self.before(prepare_observation_for_inference(seen, torch.device("cpu"), task))
+    def preprocess(self, obs: Obs, task: str = TASKS[0]) -> dict[str, Any]:
+        """Return the policy's inputs for an observation."""
+        observation = {"observation.state": obs.state["joints"].copy()}
+        for name, image in obs.cameras.items():
+            observation[f"observation.images.{name}"] = image.copy()
+        prepared = prepare_observation_for_inference(observation, torch.device("cpu"), task)
+        batch = self.before(prepared)
         return {key: value for key, value in batch.items() if value is not None}
 
-    def select(self, obs: Obs, **given: Any) -> np.ndarray:
+    def select(self, obs: Obs, **options: Any) -> np.ndarray:
+        """Return the action (D,) of the policy's own `select_action`."""
         with torch.inference_mode():
-            return self.after(self.policy.select_action(self.see(obs), **given))[0].numpy()
+            action = self.policy.select_action(self.preprocess(obs), **options)
+            return self.after(action)[0].numpy()
 
 
 def draws_of(policy: LeRobot) -> np.random.Generator:
-    """What the first session of these tests draws from, as a copy."""
+    """Return a copy of the generator of the first session in these tests."""
     return np.random.default_rng([policy.config.seed, 0])
 
 
@@ -118,7 +123,7 @@ def test_what_draws_by_itself_is_theirs_from_the_same_seed(
 def test_diffusion_is_theirs_over_several_chunks(
     loaded: Load, upstream: Callable[[str], Theirs], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The scheduler adds noise at each step: it gets ours."""
+    """The scheduler, which adds noise at each step, draws from our generator."""
     theirs, policy = upstream("diffusion"), loaded("diffusion")
     draws, config = draws_of(policy), theirs.policy.config
     step = theirs.policy.diffusion.noise_scheduler.step
@@ -135,8 +140,8 @@ def test_diffusion_is_theirs_over_several_chunks(
                 draws.standard_normal((1, config.horizon, tiny.ACTION), dtype=np.float32)
             )
             torch_draws = torch.Generator().manual_seed(int(draws.integers(2**63)))
-        wanted = theirs.select(view(tick), noise=noise)
-        np.testing.assert_allclose(session.act(view(tick)).action, wanted, atol=ATOL)
+        expected = theirs.select(view(tick), noise=noise)
+        np.testing.assert_allclose(session.act(view(tick)).action, expected, atol=ATOL)
 
 
 @pytest.mark.verifies("parity")
@@ -148,32 +153,40 @@ def test_tdmpc_plans_as_theirs_from_its_last_plan(
     for tick in range(3):
         torch.manual_seed(int(draws.integers(2**63)))
         with torch.inference_mode():
-            latent = theirs.policy.model.encode(theirs.see(view(tick)))
+            latent = theirs.policy.model.encode(theirs.preprocess(view(tick)))
             action = theirs.after(theirs.policy.plan(latent).clamp(-1, 1)[0])[0].numpy()
         np.testing.assert_allclose(session.act(view(tick)).action[0], action, atol=ATOL)
 
 
 @pytest.mark.verifies("parity")
 def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -> None:
-    """LeRobot reads those weights from the hub first; here they come from the checkpoint alone,
-    in the same types.
+    """LeRobot first reads these weights from the hub; here they come from the checkpoint only, in
+    the same types.
     """
     folder = tiny.make(tmp_path / "smolvla", "smolvla", load_vlm_weights=True)
     theirs, policy = Theirs(folder), LeRobot.from_config({"checkpoint": str(folder)})
     for file in (folder / "vlm").glob("*.safetensors"):
         file.unlink()
     policy.initialize()
-    ours = {name: one.dtype for name, one in policy.model.sampler.policy.named_parameters()}
-    assert ours == {name: one.dtype for name, one in theirs.policy.named_parameters()}
-    assert torch.bfloat16 in ours.values()
+
+    dtypes = dtypes_of(policy.model.sampler.policy)
+    assert dtypes == dtypes_of(theirs.policy)
+    assert torch.bfloat16 in dtypes.values()
+
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
     noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
     np.testing.assert_allclose(
         begun(policy).act(view()).action[0], theirs.select(view(), noise=noise), atol=ATOL
     )
+
     exact = LeRobot.from_config({"checkpoint": str(folder), "dtype": "float32"})
     exact.initialize()
-    assert {one.dtype for one in exact.model.sampler.policy.parameters()} == {torch.float32}
+    assert set(dtypes_of(exact.model.sampler.policy).values()) == {torch.float32}
+
+
+def dtypes_of(network: torch.nn.Module) -> dict[str, torch.dtype]:
+    """Return the type of each parameter by its name."""
+    return {name: parameter.dtype for name, parameter in network.named_parameters()}
 
 
 @pytest.mark.verifies("parity")
@@ -192,7 +205,7 @@ def test_real_time_chunking_is_theirs(
     action = tiny.statistics()["action"]
     normalised = (plan - action["mean"]) / action["std"]
     chunk = theirs.policy.predict_action_chunk(
-        theirs.see(view(1)),
+        theirs.preprocess(view(1)),
         noise=torch.from_numpy(noise),
         prev_chunk_left_over=torch.from_numpy(normalised)[None],
         inference_delay=delay,
