@@ -57,7 +57,7 @@ TASKS = ("pick up the cube", "open the drawer, then close it again", "push")
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """The checkpoint of a kind, written once."""
+    """Returns the checkpoint of a kind, which is written once."""
 
     @functools.cache
     def make(kind: str) -> Path:
@@ -68,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture(scope="session")
 def loaded(made: Made) -> Load:
-    """A policy on the checkpoint of a kind, loaded once for each setting."""
+    """Returns a policy with the checkpoint of a kind, which is loaded once for each setting."""
 
     @functools.cache
     def load(kind: str, **config: Any) -> LeRobot:
@@ -80,7 +80,7 @@ def loaded(made: Made) -> Load:
 
 
 def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:
-    """What one robot sees."""
+    """Return the observation of a robot."""
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
     return Obs(
@@ -91,7 +91,7 @@ def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:
 
 
 def begun(policy: LeRobot, number: int = 0) -> LeRobot:
-    """The session of one robot, as a server makes it."""
+    """Return the session of a robot as a server makes it, in an episode."""
     session = AgentCopies(policy).make()
     session.reset(view(number), TASKS[number % len(TASKS)], seed=number)
     assert isinstance(session, LeRobot)

@@ -1,7 +1,8 @@
-"""π0, π0.5 and π0-FAST, where transformers has openpi's changes; conftest.py leaves this file out
-where it has not.
+"""π0, π0.5 and π0-FAST, for a transformers with openpi's changes; conftest.py leaves this file
+out for others.
 
-LeRobot makes these models in two sizes only, so their sizes are changed under its hands.
+LeRobot makes these models in two sizes only, so that the tests replace the functions that choose
+them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from vlagents_ray.testing import check_agent
 from vlagents_ray_models.lerobot import LeRobot
 
 KINDS, FAST = ("pi0", "pi05"), "pi0_fast"
-# Code of an action tokenizer, as those on the hub have it, but without a vocabulary.
+# The code of an action tokenizer, as on the hub, but without a vocabulary.
 ACTION_TOKENIZER = """
 class Characters:
     scale, min_token = 16, -32
@@ -53,7 +54,7 @@ VOCABULARY = len(fast_tokenizer())  # π0-FAST turns each of its tokens into a w
 
 @pytest.fixture(scope="module")
 def shrunk() -> Iterator[pytest.MonkeyPatch]:
-    """LeRobot makes small models."""
+    """Make LeRobot's models small."""
     with pytest.MonkeyPatch.context() as patch:
         for kind in (*KINDS, FAST):
             modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
@@ -61,16 +62,19 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
                 width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16
             )
             patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
-            new = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
-            names = new if tiny.NEW else ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
-            for name, change in zip(names, (_small_vision, _few_words), strict=True):
+
+            if tiny.NEW:
+                names = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
+            else:
+                names = ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
+            for name, shrink in zip(names, (_small_vision, _few_words), strict=True):
                 if not hasattr(modeling, name):  # π0-FAST has no second network
                     continue
-                made = getattr(modeling, name)
+                cls = getattr(modeling, name)
                 patch.setattr(
                     modeling,
                     name,
-                    lambda config, made=made, change=change: made(config=change(config)),
+                    lambda config, cls=cls, shrink=shrink: cls(config=shrink(config)),
                 )
         yield patch
 
@@ -79,7 +83,7 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
 def made(
     shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[[str], Path]:
-    """The checkpoint of a kind, with a tokenizer beside it."""
+    """Returns the checkpoint of a kind; a tokenizer is in the folder above."""
     folder = tmp_path_factory.mktemp("pi")
     fast_tokenizer().save_pretrained(folder / "tokenizer")
     for kind in KINDS:
@@ -126,18 +130,18 @@ def test_flow_matching_and_its_guidance_are_theirs(
 ) -> None:
     policy, theirs = _loaded(made(kind), execute=tiny.CHUNK), Theirs(made(kind))
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
-    given: dict[str, Any] = {
-        "noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
-    }
+    noise = draws_of(policy).standard_normal(shape, dtype=np.float32)
+    options: dict[str, Any] = {"noise": torch.from_numpy(noise)}
     info: dict[str, Any] = {}
     if delay is not None:
         plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
         info = {LEFTOVER: plan, DELAY: delay}
         theirs.policy.config.rtc_config = RTCConfig(enabled=True)
         theirs.policy.init_rtc_processor()
-        left = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
-        given |= {"prev_chunk_left_over": torch.from_numpy(left)[None], "inference_delay": delay}
-    chunk = theirs.policy.predict_action_chunk(theirs.preprocess(view()), **given)
+        leftover = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
+        options["prev_chunk_left_over"] = torch.from_numpy(leftover)[None]
+        options["inference_delay"] = delay
+    chunk = theirs.policy.predict_action_chunk(theirs.preprocess(view()), **options)
     ours = begun(policy).act(view(**info)).action
     np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
 
@@ -155,19 +159,18 @@ def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
         tiny.write(tmp_path, tiny.config_of("pi0", use_relative_actions=True, **sizes, **chunk))
     policy, theirs = _loaded(tmp_path, execute=tiny.CHUNK), Theirs(tmp_path)
     views = [view(1, **{SAMPLES: 2}), view(2)]
-    both = policy.act_batch(views, [begun(policy, 1), begun(policy, 2)])
-    for number, act in zip((1, 2), both, strict=True):
+    acts = policy.act_batch(views, [begun(policy, 1), begun(policy, 2)])
+    for number, act in zip((1, 2), acts, strict=True):
         assert isinstance(act, Act)
-        np.testing.assert_allclose(
-            act.action, begun(policy, number).act(view(number)).action, atol=ATOL
-        )
+        alone = begun(policy, number).act(view(number))
+        np.testing.assert_allclose(act.action, alone.action, atol=ATOL)
 
     plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
     theirs.policy.config.rtc_config = RTCConfig(enabled=True)
     theirs.policy.init_rtc_processor()
-    seen = theirs.preprocess(view())
+    inputs = theirs.preprocess(view())
     steps = {type(step).__name__: step for step in theirs.before.steps}
-    left = reanchor_relative_rtc_prefix(
+    leftover = reanchor_relative_rtc_prefix(
         torch.from_numpy(plan),
         torch.from_numpy(view().state["joints"]),
         steps["RelativeActionsProcessorStep"],
@@ -175,11 +178,15 @@ def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
         "cpu",
     )
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
-    noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
-    given = {"noise": noise, "prev_chunk_left_over": left[None], "inference_delay": 2}
-    wanted = theirs.after(theirs.policy.predict_action_chunk(seen, **given))[0].detach().numpy()
+    noise = draws_of(policy).standard_normal(shape, dtype=np.float32)
+    chunk = theirs.policy.predict_action_chunk(
+        inputs,
+        noise=torch.from_numpy(noise),
+        prev_chunk_left_over=leftover[None],
+        inference_delay=2,
+    )
     ours = begun(policy).act(view(**{LEFTOVER: plan, DELAY: 2})).action
-    np.testing.assert_allclose(ours, wanted, atol=1e-4)
+    np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -189,33 +196,33 @@ def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
     policy = _loaded(made(kind), noise_level=0.5)
     network = policy.model.sampler.policy.model
     read: list[int] = []
-    alone: dict[str, Any] = {}
+    step_inputs: dict[str, Any] = {}
     embed, step = network.embed_prefix, network.denoise_step
 
-    def counted(images: Any, *rest: Any) -> Any:
+    def count_and_embed(images: Any, *args: Any) -> Any:
         read.append(len(images[0]))
-        return embed(images, *rest)
+        return embed(images, *args)
 
-    def kept(**inputs: Any) -> Any:
-        alone.update(inputs)
+    def keep_and_step(**inputs: Any) -> Any:
+        step_inputs.update(inputs)
         return step(**inputs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, "denoise_step", kept)
+        patch.setattr(network, "denoise_step", keep_and_step)
         begun(policy, 1).act(view(1))
-    monkeypatch.setattr(network, "embed_prefix", counted)
+    monkeypatch.setattr(network, "embed_prefix", count_and_embed)
     act = begun(policy, 1).act(view(1, **{WANT: ["logprob", "replay"], SAMPLES: 2}))
     assert read == [1]
 
     def velocity(noisy: Any, time: float) -> Any:
+        timestep = torch.tensor([time], dtype=torch.float32)
         with torch.inference_mode():
-            return step(
-                **alone | {"x_t": noisy, "timestep": torch.tensor([time], dtype=torch.float32)}
-            )
+            return step(**step_inputs | {"x_t": noisy, "timestep": timestep})
 
-    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
-    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
-    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+    behaviour, samples = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [behaviour["replay"]["chain"], *samples["replay"]["chain"]]
+    logprobs = [behaviour["logprob"], *samples["logprob"]]
+    for chain, logprob in zip(chains, logprobs, strict=True):
         total = logprob_of_steps(velocity, chain, 0.5)[: len(act.action), : tiny.ACTION]
         np.testing.assert_allclose(logprob, total, atol=5e-3)
 
@@ -225,17 +232,17 @@ def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) 
     plain = _loaded(made(kind))
     with counting_compiler() as programs:
         compiled = _loaded(made(kind), compile="require", batch_sizes=[2])
-        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
+        assert programs.rows == [2, 2]  # the encoding of observations, and a step of the flow
         for size in (1, 2, 3):
             views = [view(i) for i in range(size)]
-            found = [
+            expected, acts = (
                 policy.act_batch(views, [begun(policy, i) for i in range(size)])
                 for policy in (plain, compiled)
-            ]
-            for one, other in zip(*found, strict=True):
-                assert isinstance(one, Act)
-                assert isinstance(other, Act)
-                np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+            )
+            for expected_act, act in zip(expected, acts, strict=True):
+                assert isinstance(expected_act, Act)
+                assert isinstance(act, Act)
+                np.testing.assert_allclose(expected_act.action, act.action, atol=ATOL)
         assert programs.rows == [2, 2]
 
 
@@ -243,8 +250,9 @@ OF_FAST = pytest.mark.skipif(not tiny.NEW, reason="π0-FAST is tried with LeRobo
 
 
 def settings_of_fast(made: Callable[[str], Path]) -> dict[str, Any]:
-    """Of the checkpoint of π0-FAST; LeRobot does not save the name of its action tokenizer's
-    text tokenizer.
+    """Return the settings that the checkpoint of π0-FAST needs.
+
+    LeRobot does not save the name of its action tokenizer's text tokenizer.
     """
     step = {"paligemma_tokenizer_name": str(made(FAST).parent / "tokenizer")}
     return {"trust_remote_code": True, "processors": {"action_tokenizer_processor": step}}
@@ -253,10 +261,9 @@ def settings_of_fast(made: Callable[[str], Path]) -> dict[str, Any]:
 @OF_FAST
 @pytest.mark.verifies("parity")
 def test_tokens_drawn_from_the_same_seed_are_theirs(made: Callable[[str], Path]) -> None:
-    policy, theirs = (
-        _loaded(made(FAST), **settings_of_fast(made)),
-        Theirs(made(FAST), **settings_of_fast(made)["processors"]),
-    )
+    settings = settings_of_fast(made)
+    policy = _loaded(made(FAST), **settings)
+    theirs = Theirs(made(FAST), **settings["processors"])
     rows = begun(policy).act(view()).action
     assert len(rows) == tiny.EXECUTED
     torch.manual_seed(int(draws_of(policy).integers(2**63)))
@@ -277,16 +284,17 @@ def test_tokens_that_are_no_actions_fail_their_own_session(
 ) -> None:
     policy = _loaded(made(FAST), **settings_of_fast(made))
     alone = begun(policy, 2).act(view(2)).action
-    network, read = policy.model.sampler.policy, list[int]()
+    network = policy.model.sampler.policy
     decode = network.detokenize_actions
+    calls: list[None] = []
 
-    def checked(*tokens: Any, **shape: Any) -> Any:
-        read.append(1)
-        # Those of the first row, which are random.
-        network.config.validate_action_token_prefix = len(read) == 1
+    def check_first_and_decode(*tokens: Any, **shape: Any) -> Any:
+        calls.append(None)
+        # Only the first row's tokens, which are random, are checked.
+        network.config.validate_action_token_prefix = len(calls) == 1
         return decode(*tokens, **shape)
 
-    monkeypatch.setattr(network, "detokenize_actions", checked)
+    monkeypatch.setattr(network, "detokenize_actions", check_first_and_decode)
     broken, whole = policy.act_batch([view(1), view(2)], [begun(policy, 1), begun(policy, 2)])
     assert isinstance(broken, Exception)
     assert isinstance(whole, Act)
@@ -308,15 +316,14 @@ def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(
     file = made(kind) / "model.safetensors"
     whole = load_file(file)
     try:
-        save_file(
-            {name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}, file
-        )
+        partial = {name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}
+        save_file(partial, file)
         with pytest.raises(ConfigError, match="action_out_proj"):
             _loaded(made(kind))
         file.write_bytes(b"not a checkpoint")
         with pytest.raises(ConfigError, match="is it complete"):
             _loaded(made(kind))
-        # As openpi names them.
+        # openpi's names.
         save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)
         _loaded(made(kind))
     finally:
@@ -324,17 +331,17 @@ def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(
 
 
 def _write_fast(folder: Path) -> None:
-    """A checkpoint of π0-FAST in a folder with a tokenizer, and the code of an action tokenizer
-    beside it.
+    """Write a checkpoint of π0-FAST, and the code of an action tokenizer, into a folder with a
+    tokenizer.
     """
     code = folder / "actions"
     code.mkdir()
     (code / "characters.py").write_text(ACTION_TOKENIZER)
-    named = {
+    processor = {
         "processor_class": "Characters",
         "auto_map": {"AutoProcessor": "characters.Characters"},
     }
-    (code / "processor_config.json").write_text(json.dumps(named))
+    (code / "processor_config.json").write_text(json.dumps(processor))
     names = {"text_tokenizer_name": str(folder / "tokenizer"), "action_tokenizer_name": str(code)}
     tokens = {
         "max_decoding_steps": 16,
@@ -342,7 +349,7 @@ def _write_fast(folder: Path) -> None:
         "temperature": 1.0,
         "validate_action_token_prefix": False,
     }
-    # Images of 224 pixels, as it has no other.
+    # Images have 224 pixels, the only size that it supports.
     sizes = {"dtype": "float32", "n_action_steps": tiny.EXECUTED}
     (folder / FAST).mkdir()
     tiny.write(
@@ -357,10 +364,12 @@ def _loaded(folder: Path, **config: Any) -> LeRobot:
 
 
 def _normalised(plan: np.ndarray, mode: str) -> np.ndarray:
-    of = tiny.statistics()["action"]
+    """Return actions in the policy's units."""
+    statistics = tiny.statistics()["action"]
     if mode == "MEAN_STD":
-        return (plan - of["mean"]) / of["std"]
-    return 2 * (plan - of["q01"]) / (of["q99"] - of["q01"]) - 1
+        return (plan - statistics["mean"]) / statistics["std"]
+    low, high = statistics["q01"], statistics["q99"]
+    return 2 * (plan - low) / (high - low) - 1
 
 
 def _small_vision(config: Any) -> Any:

@@ -18,4 +18,5 @@ pytestmark = FILTERS
 @pytest.mark.verifies("size")
 def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     policy, _ = recipe.make_policy(Recipe("pi05", tmp_path, "full", "bfloat16"))
-    assert sum(one.numel() for one in policy.parameters()) == pytest.approx(3.6e9, rel=0.03)
+    parameters = sum(parameter.numel() for parameter in policy.parameters())
+    assert parameters == pytest.approx(3.6e9, rel=0.03)

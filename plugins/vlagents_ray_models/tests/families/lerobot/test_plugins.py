@@ -1,5 +1,5 @@
-"""A policy type that somebody else registers with LeRobot is served one row at a time, and its
-sessions stay apart.
+"""A policy type that another package registers with LeRobot is served one row at a time, with
+independent sessions.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from lerobot.policies.act.processor_act import make_act_pre_post_processors as m
 
 @pytest.fixture
 def checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of a type in a package beside LeRobot, as pip would have installed it."""
+    """A checkpoint of a type in a separate package, which looks as if pip had installed it."""
     info = tmp_path / f"{PACKAGE}-1.dist-info"
     (tmp_path / PACKAGE).mkdir()
     info.mkdir()
@@ -83,7 +83,7 @@ def test_an_unknown_type_is_served_row_by_row_and_refused_if_it_keeps_a_history(
     session = begun(policy)
     first, second = session.act(view()).action, session.act(view()).action
     assert first.shape == (tiny.EXECUTED, tiny.ACTION)
-    assert not np.allclose(first, second, atol=1e-3)  # it draws
+    assert not np.allclose(first, second, atol=1e-3)  # each call draws other numbers
     with pytest.raises(ConfigError, match="by itself"):
         LeRobot.from_config(
             {"checkpoint": str(checkpoint), "overrides": {"n_obs_steps": 2}}

@@ -1,11 +1,10 @@
-"""Prefixes of π0.5 as LeRobot gives them; conftest.py leaves this file out where LeRobot has
-none, as 0.6.1.
+"""Prefixes of π0.5 in LeRobot; conftest.py leaves this file out if LeRobot has none, like
+0.6.1.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ LONGEST = 4
 
 @pytest.fixture(scope="module")
 def trained(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    """A checkpoint of π0.5 whose config says that it was trained with prefixes."""
+    """A checkpoint of π0.5 whose config has prefixes."""
     folder = tmp_path_factory.mktemp("prefixed")
     chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
     (folder / "pi05").mkdir()
@@ -39,27 +38,26 @@ def trained(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.mark.parametrize("mode", ["trained", "guided"])
 @pytest.mark.parametrize("delay", [1, LONGEST])
-def test_given_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None:
-    chosen = {} if mode == "trained" else {"overrides": {"rtc_config": {"mode": mode}}}
-    policy, theirs = _loaded(trained, execute=tiny.CHUNK, **chosen), Theirs(trained)
+def test_actions_after_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None:
+    settings = {} if mode == "trained" else {"overrides": {"rtc_config": {"mode": mode}}}
+    policy, theirs = _loaded(trained, execute=tiny.CHUNK, **settings), Theirs(trained)
+
     plan = np.random.default_rng(5).uniform(-1, 1, (6, tiny.ACTION)).astype(np.float32)
     theirs.policy.config.rtc_config = RTCConfig(enabled=True, mode=mode)
     theirs.policy.init_rtc_processor()
-    left = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
+    leftover = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
     shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
-    given: dict[str, Any] = {
-        "noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32)),
-        "prev_chunk_left_over": torch.from_numpy(left)[None],
-        "inference_delay": delay,
-    }
-    wanted = (
-        theirs.after(theirs.policy.predict_action_chunk(theirs.preprocess(view()), **given))[0]
-        .detach()
-        .numpy()
+    noise = draws_of(policy).standard_normal(shape, dtype=np.float32)
+    chunk = theirs.policy.predict_action_chunk(
+        theirs.preprocess(view()),
+        noise=torch.from_numpy(noise),
+        prev_chunk_left_over=torch.from_numpy(leftover)[None],
+        inference_delay=delay,
     )
+    expected = theirs.after(chunk)[0].detach().numpy()
+
     act = begun(policy).act(view(**{LEFTOVER: plan, DELAY: delay}))
-    ours = act.action
     assert act.info.get(GIVEN) == (delay if mode == "trained" else None)
-    np.testing.assert_allclose(ours, wanted, atol=1e-4)
+    np.testing.assert_allclose(act.action, expected, atol=1e-4)
     if mode == "trained":
-        np.testing.assert_allclose(ours[:delay], plan[:delay], atol=1e-5)
+        np.testing.assert_allclose(act.action[:delay], plan[:delay], atol=1e-5)

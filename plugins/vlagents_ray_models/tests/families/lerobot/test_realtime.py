@@ -1,5 +1,5 @@
-"""Real-time chunking: new chunks go on from what each robot is doing, whatever its neighbours
-do.
+"""Real-time chunking: a new chunk continues the plan of its robot, independently of other
+robots.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ def test_leftovers_and_delays_of_neighbours_do_not_matter(loaded: Load) -> None:
         view(3, **{LEFTOVER: plan[:0], DELAY: 3}),
         view(4, **{LEFTOVER: np.tile(plan, (4, 1)), DELAY: 0}),
     ]
-    alone = [begun(policy, i).act(one).action for i, one in enumerate(views)]
+    alone = [begun(policy, i).act(obs).action for i, obs in enumerate(views)]
     acts = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
-    for act, wanted in zip(acts, alone, strict=True):
+    for act, expected in zip(acts, alone, strict=True):
         assert not isinstance(act, Exception)
-        np.testing.assert_allclose(act.action, wanted, atol=1e-5)
+        np.testing.assert_allclose(act.action, expected, atol=1e-5)
 
 
-def test_a_chunk_goes_on_from_what_the_robot_is_doing(loaded: Load) -> None:
+def test_a_chunk_continues_the_plan_of_the_robot(loaded: Load) -> None:
     policy = loaded("smolvla", execute=tiny.CHUNK)
     plan = begun(policy, 5).act(view(5)).action[2:]
     free = begun(policy).act(view()).action
@@ -81,42 +81,43 @@ def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
     assert used.prefix_attention_schedule.name == "EXP"
 
 
-def test_single_actions_do_not_go_on_from_a_plan(loaded: Load) -> None:
+def test_policies_of_single_actions_do_not_continue_plans(loaded: Load) -> None:
     assert not loaded("smolvla", actions="queue").continues_plans
     assert not loaded("act").continues_plans
 
 
-LONGEST, STEP = 3, 0.1  # rows of a prefix, and what the network below adds in each further row
+LONGEST = 3  # rows of a prefix
+STEP = 0.1  # what the network below adds in each row after the prefix
 
 
-def _continue(self: Any, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-    """The velocity of a network that goes on from the last row at time 0; neither 0.4.4 nor
-    0.6.1 has one.
+def _continue(self: Any, encoded: Any, present: Any, state: Any, actions: Any, times: Any) -> Any:
+    """Return the velocity of a network that continues from the last row at time 0.
+
+    Neither LeRobot 0.4.4 nor 0.6.1 has such a network.
     """
-    given = times == 0
-    last = given.sum(1) - 1
+    in_prefix = times == 0
+    last = in_prefix.sum(1) - 1
     start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
-    behind = torch.arange(actions.shape[1])[None, :, None] - last[:, None, None]
-    return (actions - start[:, None] - STEP * behind) / times.clamp(min=1e-6)[..., None]
+    rows_after = torch.arange(actions.shape[1])[None, :, None] - last[:, None, None]
+    return (actions - start[:, None] - STEP * rows_after) / times.clamp(min=1e-6)[..., None]
 
 
 @pytest.fixture
 def prefixed(made: Made, monkeypatch: pytest.MonkeyPatch) -> LeRobot:
-    """A policy whose checkpoint says that it was trained with prefixes, as those of LeRobot
-    after 0.6.1 do.
-    """
+    """A policy whose config has prefixes, as a checkpoint of a LeRobot after 0.6.1."""
 
     @dataclasses.dataclass
     class Config(configuration_rtc.RTCConfig):  # type: ignore[misc]
         mode: str = "guided"
 
-    def trained(folder: Path, config: LeRobotConfig) -> Any:
-        settings = read(folder, config)
+    read_settings = checkpoint._read_settings
+
+    def read_with_prefixes(folder: Path, config: LeRobotConfig) -> Any:
+        settings = read_settings(folder, config)
         setattr(settings, LONGEST_PREFIX, LONGEST)
         return settings
 
-    read = checkpoint._settings
-    monkeypatch.setattr(checkpoint, "_settings", trained)
+    monkeypatch.setattr(checkpoint, "_read_settings", read_with_prefixes)
     monkeypatch.setattr(configuration_rtc, "RTCConfig", Config)
     monkeypatch.setattr(SmolVLAPasses, "velocity", _continue)
     policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "execute": tiny.CHUNK})
@@ -124,16 +125,15 @@ def prefixed(made: Made, monkeypatch: pytest.MonkeyPatch) -> LeRobot:
     return policy
 
 
-def test_a_checkpoint_trained_with_prefixes_is_given_them(prefixed: LeRobot) -> None:
+def test_a_checkpoint_trained_with_prefixes_continues_them(prefixed: LeRobot) -> None:
     plan = np.random.default_rng(5).uniform(-1, 1, (6, tiny.ACTION)).astype(np.float32)
-    delays = {0: LONGEST, 2: 2, 5: LONGEST}  # 0: not known yet
-    views = [view(0, **{LEFTOVER: plan, DELAY: delay}) for delay in delays]
+    prefix_rows = {0: LONGEST, 2: 2, 5: LONGEST}  # by the delay, of which 0 is not known yet
+    views = [view(0, **{LEFTOVER: plan, DELAY: delay}) for delay in prefix_rows]
     acts = prefixed.act_batch([*views, view(0)], [begun(prefixed, i) for i in range(4)])
     scale = tiny.statistics()["action"]["std"]
-    for act, given in zip(acts, [*delays.values(), 0], strict=True):
+    for act, rows in zip(acts, [*prefix_rows.values(), 0], strict=True):
         assert not isinstance(act, Exception)
-        assert act.info.get(GIVEN, 0) == given
-        np.testing.assert_allclose(act.action[:given], plan[:given], atol=1e-5)
-        np.testing.assert_allclose(
-            np.diff(act.action[max(given - 1, 0) :], axis=0) / scale, STEP, atol=1e-4
-        )
+        assert act.info.get(GIVEN, 0) == rows
+        np.testing.assert_allclose(act.action[:rows], plan[:rows], atol=1e-5)
+        steps = np.diff(act.action[max(rows - 1, 0) :], axis=0) / scale
+        np.testing.assert_allclose(steps, STEP, atol=1e-4)

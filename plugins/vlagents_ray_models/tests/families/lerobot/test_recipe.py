@@ -27,12 +27,11 @@ pytestmark = FILTERS
 def test_smolvla_loads_and_acts(tmp_path: Path, dtype: str) -> None:
     written = write_checkpoint("smolvla", tmp_path / "made", "small", dtype)
     policy = acts(written.config)
-    network = policy.model.sampler.policy.model.vlm_with_expert
-    assert {one.dtype for one in network.vlm.parameters()} == {getattr(torch, dtype)}
-    assert {one.dtype for one in network.lm_expert.parameters()} == {torch.float32}
-    assert written.parameters == sum(
-        one.numel() for one in policy.model.sampler.policy.parameters()
-    )
+    network = policy.model.sampler.policy
+    vlm, expert = network.model.vlm_with_expert.vlm, network.model.vlm_with_expert.lm_expert
+    assert {parameter.dtype for parameter in vlm.parameters()} == {getattr(torch, dtype)}
+    assert {parameter.dtype for parameter in expert.parameters()} == {torch.float32}
+    assert written.parameters == sum(parameter.numel() for parameter in network.parameters())
 
 
 @pytest.mark.parametrize("family", ["act", "diffusion"])
@@ -50,9 +49,8 @@ def test_others_load_and_act(tmp_path: Path, family: str) -> None:
 )
 def test_the_full_size_is_the_published_one(tmp_path: Path, family: str, millions: float) -> None:
     policy, _ = recipe.make_policy(Recipe(family, tmp_path, "full", "bfloat16"))
-    assert sum(one.numel() for one in policy.parameters()) == pytest.approx(
-        millions * 1e6, rel=0.03
-    )
+    parameters = sum(parameter.numel() for parameter in policy.parameters())
+    assert parameters == pytest.approx(millions * 1e6, rel=0.03)
 
 
 def test_a_pi05_of_another_size_is_refused(tmp_path: Path) -> None:
@@ -72,7 +70,7 @@ def test_a_pi05_needs_the_transformers_that_serves_it(
 
 
 def acts(config: dict[str, Any]) -> LeRobot:
-    """A policy that loaded the checkpoint, and whose actions follow what it sees."""
+    """Load a policy, and require that its actions depend on the observations."""
     policy = LeRobot.from_config(config)
     policy.initialize()
     chunks = []
