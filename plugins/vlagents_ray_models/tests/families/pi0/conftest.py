@@ -46,7 +46,7 @@ def seen(seed: int, side: tuple[int, int] = (224, 224), **info: Any) -> Obs:
 
 
 def begun(policy: Pi0, i: int) -> Pi0:
-    """Session `i`: with its own instruction and seed."""
+    """Return session `i`, in an episode with its own instruction and seed."""
     session = copy.copy(policy)
     session.reset(seen(i), WORDS[i % len(WORDS)], seed=i)
     return session

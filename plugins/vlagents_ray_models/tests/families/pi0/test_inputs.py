@@ -1,4 +1,6 @@
-"""The inputs of π0's network: images as bytes to the device, and what an act then asks of a GPU."""
+"""The inputs of π0's network, whose images reach the device as bytes, and how often a call waits
+for a GPU.
+"""
 
 from __future__ import annotations
 
@@ -48,19 +50,19 @@ def test_inputs_are_those_of_the_processor_itself(folder: Path, settings: dict[s
     policy.model = LoadedPi0(
         **{**vars(policy.model), "scale": _scale(processor, policy.model.staging)}
     )
-    found = policy._inputs([row(policy, i, obs) for i, obs in enumerate(views)])
-    wanted = processor(
+    inputs = policy._inputs([row(policy, i, obs) for i, obs in enumerate(views)])
+    expected = processor(
         images=[[obs.cameras["front"], obs.cameras["wrist"]] for obs in views],
         text=list(WORDS),
         state=np.stack([np.concatenate(list(obs.state.values())) for obs in views]),
         padding="max_length",
-        max_length=found["input_ids"].shape[1],
+        max_length=inputs["input_ids"].shape[1],
     )
-    assert found.keys() == wanted.keys()
-    for name, tensor in wanted.items():
-        # Bytes without `do_rescale`.
-        assert found[name].dtype == tensor.dtype or name == "pixel_values"
-        torch.testing.assert_close(found[name].to(tensor.dtype), tensor, rtol=1e-6, atol=1e-6)
+    assert inputs.keys() == expected.keys()
+    for name, tensor in expected.items():
+        # The processor returns bytes without `do_rescale`.
+        assert inputs[name].dtype == tensor.dtype or name == "pixel_values"
+        torch.testing.assert_close(inputs[name].to(tensor.dtype), tensor, rtol=1e-6, atol=1e-6)
 
 
 SIDES = ((480, 640), (640, 480), (224, 224), (100, 37), (1080, 1920))
@@ -76,14 +78,14 @@ def test_images_of_any_size_are_those_of_the_processor_itself(
     for i, side in enumerate(SIDES):
         obs = seen(i, side)
         obs.cameras["wrist"] = seen(i, SIDES[i - 1]).cameras["wrist"]  # of another size
-        found = policy._inputs([row(policy, i, obs)])
-        wanted = policy.model.processor(
+        inputs = policy._inputs([row(policy, i, obs)])
+        expected = policy.model.processor(
             images=[[obs.cameras["front"], obs.cameras["wrist"]]],
             text=[WORDS[0]],
             return_tensors="pt",
         )
         torch.testing.assert_close(
-            found["pixel_values"], wanted["pixel_values"], rtol=1e-6, atol=1e-6
+            inputs["pixel_values"], expected["pixel_values"], rtol=1e-6, atol=1e-6
         )
 
 

@@ -1,6 +1,4 @@
-"""What π0 states of its acts for learners, what its samples cost, and that compiled cores act as
-it does without.
-"""
+"""The outputs of π0 for learners, the shared observation of its samples, and its compiled cores."""
 
 from __future__ import annotations
 
@@ -54,12 +52,13 @@ def learnt(folder: Path) -> Pi0:
 
 
 def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
-    """What sessions see, as the model's inputs."""
-    sessions = [begun(policy, seed) for seed in seeds]
-    for session, seed in zip(sessions, seeds, strict=True):
+    """Return the model's inputs for the observations of sessions."""
+    rows = []
+    for seed in seeds:
+        session = begun(policy, seed)
         session.observe(seen(seed))
-    episodes = [session.episode for session in sessions]
-    rows = [pi0.Row(tuple(one.frames), one.instruction, one.rng) for one in episodes]
+        episode = session.episode
+        rows.append(pi0.Row(tuple(episode.frames), episode.instruction, episode.rng))
     return dict(policy._inputs(rows))
 
 
@@ -69,40 +68,43 @@ def test_it_offers_what_random_steps_have(plain: Pi0, learnt: Pi0) -> None:
 
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: Pi0) -> None:
-    said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
+    behaviour = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
+    chain = behaviour["replay"]["chain"]
     network, inputs = learnt.model.network, encoded(learnt, 0)
 
     def velocity(noisy: Any, time: float) -> Any:
-        """The network's, of images, words and actions in one pass, without a cache."""
+        """Return the network's velocity, from one pass over images, words and actions without a
+        cache.
+        """
         with torch.no_grad():
             return network(**inputs, noise=noisy, timestep=torch.tensor([time])).logits
 
-    total = logprob_of_steps(velocity, said["replay"]["chain"], LEVEL)[:, : tiny.ACTION_DIM]
-    np.testing.assert_allclose(said["logprob"], total, atol=SUMMED)
-    steps = len(said["replay"]["chain"]) - 1
-    assert said["entropy"] == pytest.approx(normal_entropies(steps) * total.numel(), rel=1e-5)
+    total = logprob_of_steps(velocity, chain, LEVEL)[:, : tiny.ACTION_DIM]
+    np.testing.assert_allclose(behaviour["logprob"], total, atol=SUMMED)
+    entropy = normal_entropies(len(chain) - 1) * total.numel()
+    assert behaviour["entropy"] == pytest.approx(entropy, rel=1e-5)
 
 
 def normal_entropies(steps: int) -> float:
-    """The entropies of a number's steps."""
+    """Return the sum of the entropies of a number's steps."""
     times = [1 - step / steps for step in range(steps)]
     stds = [LEVEL * (time / max(1 - time, 1 / steps) / steps) ** 0.5 for time in times]
     return float(sum(torch.distributions.Normal(0, std).entropy() for std in stds))
 
 
-def test_a_learner_recomputes_what_was_stated_of_several_acts(learnt: Pi0) -> None:
+def test_a_learner_recomputes_the_log_probabilities_of_several_acts(learnt: Pi0) -> None:
     sessions = [begun(learnt, seed) for seed in range(3)]
     acts = learnt.act_batch([seen(seed, **{WANT: ALL}) for seed in range(3)], sessions)
-    said = [act.info[BEHAVIOUR] for act in acts if isinstance(act, Act)]
-    chain = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said]))
+    behaviours = [act.info[BEHAVIOUR] for act in acts if isinstance(act, Act)]
+    chains = np.stack([behaviour["replay"]["chain"] for behaviour in behaviours])
+    logprobs = np.stack([behaviour["logprob"] for behaviour in behaviours])
+    noise_level = behaviours[0]["replay"]["noise_level"]
     with torch.no_grad():
         velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0, 1, 2), torch.float32)
-        again = logprob_of_chain(velocity, chain, said[0]["replay"]["noise_level"])[
-            :, :, : tiny.ACTION_DIM
-        ]
-    np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
-    for act, one in zip(acts, said, strict=True):
-        np.testing.assert_array_equal(act.action, learnt.model.actions(one["replay"]["chain"][-1]))
+        recomputed = logprob_of_chain(velocity, torch.from_numpy(chains), noise_level)
+    np.testing.assert_allclose(recomputed[:, :, : tiny.ACTION_DIM], logprobs, atol=SUMMED)
+    for act, chain in zip(acts, chains, strict=True):
+        np.testing.assert_array_equal(act.action, learnt.model.actions(chain[-1]))
 
 
 def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(
@@ -110,15 +112,19 @@ def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(
 ) -> None:
     short = made(folder, noise_level=LEVEL, execute=4)
     act = begun(short, 0).act(seen(0, **{WANT: ALL, SAMPLES: 3}))
-    found = act.info[DISTRIBUTION]
+    samples = act.info[DISTRIBUTION]
     assert act.info[BEHAVIOUR]["logprob"].shape == act.action.shape == (4, tiny.ACTION_DIM)
-    assert found["logprob"].shape == found["samples"].shape == (3, 4, tiny.ACTION_DIM)
+    assert samples["logprob"].shape == samples["samples"].shape == (3, 4, tiny.ACTION_DIM)
+
     with torch.no_grad():
         velocity = pi0.flow_velocity(
             learnt.model.network, encoded(learnt, 0), torch.float32, [0, 0, 0]
         )
-        again = logprob_of_chain(velocity, torch.from_numpy(found["replay"]["chain"]), LEVEL)
-    np.testing.assert_allclose(again[:, :4, : tiny.ACTION_DIM], found["logprob"], atol=SUMMED)
+        chains = torch.from_numpy(samples["replay"]["chain"])
+        recomputed = logprob_of_chain(velocity, chains, LEVEL)
+    np.testing.assert_allclose(
+        recomputed[:, :4, : tiny.ACTION_DIM], samples["logprob"], atol=SUMMED
+    )
 
 
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(
@@ -127,11 +133,11 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
     read: list[int] = []
     embed = learnt.model.network.model.embed_prefix
 
-    def counted(tokens: Any, *rest: Any) -> Any:
+    def count_and_embed(tokens: Any, *args: Any) -> Any:
         read.append(len(tokens))
-        return embed(tokens, *rest)
+        return embed(tokens, *args)
 
-    monkeypatch.setattr(learnt.model.network.model, "embed_prefix", counted)
+    monkeypatch.setattr(learnt.model.network.model, "embed_prefix", count_and_embed)
     views = [seen(0, **{SAMPLES: 8, WANT: ALL}), seen(1), seen(2, **{SAMPLES: 3})]
     check_shared_readings(learnt, views, begun, pi0, BATCHED)
     assert read == [3, 14]
@@ -150,21 +156,21 @@ def programs() -> Iterator[list[int]]:
 @pytest.fixture(scope="module")
 def compiled(folder: Path, programs: list[int]) -> Pi0:
     policy = made(folder, noise_level=LEVEL, compile="require", batch_sizes=[SIZE])
-    assert programs == [SIZE, SIZE]  # what is seen, and one step of the flow
+    assert programs == [SIZE, SIZE]  # the encoding of observations, and one step of the flow
     return policy
 
 
 def acts(policy: Pi0, views: list[Obs]) -> list[Act]:
-    found = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
-    assert all(isinstance(act, Act) for act in found)
-    return found  # type: ignore[return-value]
+    outcomes = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
+    assert all(isinstance(outcome, Act) for outcome in outcomes)
+    return outcomes  # type: ignore[return-value]
 
 
 def test_batches_of_any_size_are_those_without_compilation(learnt: Pi0, compiled: Pi0) -> None:
     for size in (1, 2, SIZE, SIZE + 1):
         views = [seen(i) for i in range(size)]
-        for one, other in zip(acts(learnt, views), acts(compiled, views), strict=True):
-            np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+        for expected, act in zip(acts(learnt, views), acts(compiled, views), strict=True):
+            np.testing.assert_allclose(expected.action, act.action, atol=BATCHED)
 
 
 def test_plans_samples_and_random_steps_are_those_without_compilation(
@@ -175,13 +181,13 @@ def test_plans_samples_and_random_steps_are_those_without_compilation(
         seen(0, **{LEFTOVER: plan, DELAY: 2}),
         seen(1, **{SAMPLES: 2, WANT: ["logprob"]}),
     ]
-    for one, other in zip(acts(learnt, views), acts(compiled, views), strict=True):
-        np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
-        if DISTRIBUTION in one.info:
-            samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+    for pair in zip(acts(learnt, views), acts(compiled, views), strict=True):
+        np.testing.assert_allclose(*(act.action for act in pair), atol=BATCHED)
+        if DISTRIBUTION in pair[0].info:
+            samples = [act.info[DISTRIBUTION]["samples"] for act in pair]
             np.testing.assert_allclose(*samples, atol=BATCHED)
-            said = [act.info[BEHAVIOUR]["logprob"] for act in (one, other)]
-            np.testing.assert_allclose(*said, atol=2e-3)  # sums over steps of a tenth
+            logprobs = [act.info[BEHAVIOUR]["logprob"] for act in pair]
+            np.testing.assert_allclose(*logprobs, atol=2e-3)  # sums over steps of a tenth
     assert programs == [SIZE, SIZE]
 
 
@@ -192,10 +198,10 @@ def test_it_acts_with_pushed_weights(compiled: Pi0, programs: list[int]) -> None
 
 def test_in_a_child_process_it_acts_with_pushed_weights(folder: Path) -> None:
     policy = made(folder)
-    pushed = {
-        name: 0.8 * value if value.is_floating_point() else value
-        for name, value in policy.parameters().items()
-    }
+    pushed = {}
+    for name, value in policy.parameters().items():
+        pushed[name] = 0.8 * value if value.is_floating_point() else value
+
     settings = Settings("pi0", {"checkpoint": str(folder)}, 1, "1")
     served = Engine(ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": str(ROOT)})))
     served.start()
@@ -222,6 +228,7 @@ def test_nothing_is_compiled_in_service(compiled: Pi0, programs: list[int], samp
     with torch.compiler.set_stance("fail_on_recompile"):
         for size in range(1, SIZE + 3):
             for info in ({}, plan, {WANT: ALL}):
-                given = info | ({SAMPLES: samples} if samples else {})
-                acts(compiled, [seen(i, **(given if i % 2 == 0 else {})) for i in range(size)])
+                requested = info | ({SAMPLES: samples} if samples else {})
+                views = [seen(i, **(requested if i % 2 == 0 else {})) for i in range(size)]
+                acts(compiled, views)
     assert programs == [SIZE, SIZE]

@@ -1,4 +1,4 @@
-"""Which wrong programs of π0 in bfloat16 the comparison with the eager cores refuses."""
+"""The comparison of compiled programs of π0 in bfloat16 with the eager cores rejects wrong ones."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ def scaled(core: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def without_state(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda encoded, seen, state, actions, times: core(
-        encoded, seen, 0 * state, actions, times
+    return lambda encoded, present, state, actions, times: core(
+        encoded, present, 0 * state, actions, times
     )
 
 
 def at_the_next_time(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda encoded, seen, state, actions, times: core(
-        encoded, seen, state, actions, times - 0.1
+    return lambda encoded, present, state, actions, times: core(
+        encoded, present, state, actions, times - 0.1
     )
 
 
 def with_padding(core: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda encoded, seen, *others: core(encoded, torch.ones_like(seen), *others)
+    return lambda encoded, present, *args: core(encoded, torch.ones_like(present), *args)
 
 
 def cameras_exchanged(core: Callable[..., Any]) -> Callable[..., Any]:

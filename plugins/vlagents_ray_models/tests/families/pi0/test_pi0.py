@@ -81,8 +81,8 @@ def test_neighbours_change_nothing(loaded: Pi0, size: int) -> None:
     batch = loaded.act_batch(
         [seen(i) for i in range(size)], [begun(loaded, i) for i in range(size)]
     )
-    for one, act in zip(alone, batch, strict=True):
-        np.testing.assert_allclose(act.action, one, atol=BATCHED)
+    for action, act in zip(alone, batch, strict=True):
+        np.testing.assert_allclose(act.action, action, atol=BATCHED)
 
 
 def test_state_images_and_instruction_all_matter(loaded: Pi0) -> None:
