@@ -1,4 +1,4 @@
-"""Draws of a model's code from its rows' own generators."""
+"""Draws of a model's code from the generators of its rows."""
 
 from __future__ import annotations
 
@@ -33,39 +33,42 @@ def test_each_row_has_the_numbers_that_it_has_alone(model: Any) -> None:
     with RowDraws(rngs(1, 2), model):
         noise, chosen = model.draw(4)  # two rows of each session
     generator = generator_of(np.random.default_rng(2))
-    wanted = (
+    expected_noise = (
         torch.randn(2, 3, generator=generator).bfloat16().float(),
         torch.randn(2, 2, generator=generator),
     )
-    assert torch.equal(noise[2:], torch.cat(wanted, 1))
+    assert torch.equal(noise[2:], torch.cat(expected_noise, 1))
     assert torch.equal(chosen[2:], torch.multinomial(torch.ones(2, 50), 1, generator=generator))
+
     with RowDraws(rngs(2), model):
-        for alone, one in zip(model.draw(2), (noise, chosen), strict=True):
-            assert torch.equal(alone, one[2:])
+        noise_alone, chosen_alone = model.draw(2)
+    assert torch.equal(noise_alone, noise[2:])
+    assert torch.equal(chosen_alone, chosen[2:])
 
 
 def test_only_the_models_own_draws_in_the_context_are_the_rows(model: Any) -> None:
     from vlagents_ray_models.sampling_rng import RowDraws
 
-    def of_torch(draw: Any) -> bool:
+    def draws_from_torch(draw: Any) -> bool:
+        """Return whether a function draws from torch's global generator."""
         torch.manual_seed(0)
         drawn = draw()
         torch.manual_seed(0)
         return torch.equal(drawn, torch.randn((2, 3), dtype=torch.bfloat16).float())
 
-    found: list[bool] = []
+    in_thread: list[bool] = []
     with RowDraws(rngs(1, 2), model):
-        # Which each call of torch would pass through.
+        # Each call of torch would pass through such a mode.
         assert torch.overrides._get_current_function_mode() is None
-        assert of_torch(lambda: torch.randn((2, 3), dtype=torch.bfloat16).float())
+        assert draws_from_torch(lambda: torch.randn((2, 3), dtype=torch.bfloat16).float())
         thread = threading.Thread(
-            target=lambda: found.append(of_torch(lambda: model.draw(2)[0][:, :3]))
+            target=lambda: in_thread.append(draws_from_torch(lambda: model.draw(2)[0][:, :3]))
         )
         thread.start()
         thread.join()
-        assert not of_torch(lambda: model.draw(2)[0][:, :3])
-    assert found == [True]
-    assert of_torch(lambda: model.draw(2)[0][:, :3])
+        assert not draws_from_torch(lambda: model.draw(2)[0][:, :3])
+    assert in_thread == [True]
+    assert draws_from_torch(lambda: model.draw(2)[0][:, :3])
     assert torch.nn.modules.linear.torch is torch.nn.modules.module.torch is torch
 
 
@@ -97,7 +100,11 @@ def test_noise_made_ahead_is_that_made_one_by_one(model: Any, ahead: int) -> Non
     proxy = sys.modules["drawing_model"]
     with RowNoise(rows, ahead, model):
         drawn = [proxy.torch.randn((2, 5, 3)) for _ in range(4)]
-    own = rngs(1, 2)
-    wanted = [[rng.standard_normal((5, 3), dtype=np.float32) for _ in range(4)] for rng in own]
-    np.testing.assert_array_equal(torch.stack(drawn, 1).numpy(), wanted)
-    assert [row.rng.random() for row in rows] == [rng.random() for rng in own]  # no more was drawn
+
+    generators = rngs(1, 2)
+    expected = []
+    for rng in generators:
+        expected.append([rng.standard_normal((5, 3), dtype=np.float32) for _ in range(4)])
+    np.testing.assert_array_equal(torch.stack(drawn, 1).numpy(), expected)
+    # No more was drawn.
+    assert [row.rng.random() for row in rows] == [rng.random() for rng in generators]

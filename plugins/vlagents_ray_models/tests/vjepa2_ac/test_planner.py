@@ -31,12 +31,13 @@ def noise(settings: VJepa2AcConfig, *seeds: int) -> torch.Tensor:
 
 
 def world(features: torch.Tensor, actions: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-    """One token: position and closedness after the last action."""
+    """Return the features of the next frame, according to the last action."""
     assert features.shape[1] == actions.shape[1] == poses.shape[1]
-    return seen(moved(poses[:, -1], actions[:, -1]))
+    return features_at(moved(poses[:, -1], actions[:, -1]))
 
 
-def seen(poses: torch.Tensor) -> torch.Tensor:
+def features_at(poses: torch.Tensor) -> torch.Tensor:
+    """Return the features of images at poses, one token each: position and closedness."""
     return poses[:, None, [0, 1, 2, 6]]
 
 
@@ -57,7 +58,9 @@ def test_a_plan_goes_where_the_goal_is() -> None:
     settings = config(iterations=20, maxnorm=0.05)
     start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.0], [0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 1.0])
     goal = poses_at([0.36, -0.03, 0.4, 3.1, 0.0, 0.0, 1.0], [0.25, 0.08, 0.42, 3.1, 0.0, 0.0, 1.0])
-    plans = plan(world, seen(start), start, seen(goal), noise(settings, 0, 1), settings)
+    plans = plan(
+        world, features_at(start), start, features_at(goal), noise(settings, 0, 1), settings
+    )
     assert plans.actions.shape == plans.std.shape == (2, settings.rollout, 7)
     assert torch.allclose(plans.actions[..., :3].sum(1), (goal - start)[:, :3], atol=0.01)
     assert plans.actions[0, :, 6].sum() >= 0.9  # closes
@@ -70,12 +73,19 @@ def test_a_session_gets_the_same_plan_in_any_company_and_in_passes_of_any_size()
     settings = config(samples=50)
     start = poses_at(*([0.1 * i, 0.0, 0.4, 3.1, 0.2, 0.0, 0.5] for i in range(3)))
     goal = start + 0.04
-    together = plan(world, seen(start), start, seen(goal), noise(settings, 0, 1, 2), settings)
+    together = plan(
+        world, features_at(start), start, features_at(goal), noise(settings, 0, 1, 2), settings
+    )
     small = config(samples=50, pass_size=7)
     for i in range(3):
-        one = slice(i, i + 1)
+        start_pose, goal_pose = start[i : i + 1], goal[i : i + 1]
         alone = plan(
-            world, seen(start[one]), start[one], seen(goal[one]), noise(settings, i), small
+            world,
+            features_at(start_pose),
+            start_pose,
+            features_at(goal_pose),
+            noise(settings, i),
+            small,
         )
         assert torch.allclose(alone.actions[0], together.actions[i], atol=1e-6)
         assert torch.allclose(alone.energy[0], together.energy[i], atol=1e-6)
@@ -84,14 +94,14 @@ def test_a_session_gets_the_same_plan_in_any_company_and_in_passes_of_any_size()
 def test_small_changes_of_the_gripper_are_none() -> None:
     settings = config(iterations=20, rollout=1)
     start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.5])
-    plans = plan(world, seen(start), start, seen(start), noise(settings, 0), settings)
+    plans = plan(world, features_at(start), start, features_at(start), noise(settings, 0), settings)
     assert not plans.actions[..., 6].any()
 
 
 def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
     settings = config(rollout=3, close_gripper=1)
     start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.0])
-    plans = plan(world, seen(start), start, seen(start), noise(settings, 0), settings)
+    plans = plan(world, features_at(start), start, features_at(start), noise(settings, 0), settings)
     assert torch.allclose(plans.actions[0, 1:, 6], torch.ones(2), atol=1e-4)
     assert plans.actions[0, 0, 6] <= 0.75
 
@@ -120,7 +130,7 @@ class PoseWorld:
 
     def encode(self, pixels: Sequence[np.ndarray]) -> torch.Tensor:
         self.encoded += len(pixels)
-        return seen(torch.from_numpy(np.stack(pixels)))
+        return features_at(torch.from_numpy(np.stack(pixels)))
 
     def __call__(self, *inputs: torch.Tensor) -> torch.Tensor:
         return world(*inputs)
@@ -136,24 +146,25 @@ def test_the_features_of_a_goal_move_without_its_device_and_are_not_computed_aga
         np.random.default_rng(0),
         memory={"goal": Goal(start + np.float32(0.04))},
     )
-    samples = [
-        Row(row.frames, "", np.random.default_rng(i), memory=copy.deepcopy(row.memory))
-        for i in (1, 2)
-    ]
+    samples = []
+    for seed in (1, 2):
+        memory = copy.deepcopy(row.memory)
+        samples.append(Row(row.frames, "", np.random.default_rng(seed), memory=memory))
     policy._plans([row, *samples])
     assert network.encoded == 3 + 1  # the images of three rows, and one goal
+
     pickled = pickle.dumps(row.memory)
     assert b"torch" not in pickled, "a tensor of a GPU can only be unpickled where the same GPU is"
-    there = pickle.loads(pickled)  # noqa: S301 - the test wrote it
-    np.testing.assert_array_equal(there["goal"].features, row.memory["goal"].features)
+    moved_memory = pickle.loads(pickled)  # noqa: S301 - the test wrote it
+    np.testing.assert_array_equal(moved_memory["goal"].features, row.memory["goal"].features)
 
     def planned(memory: dict[str, Any]) -> np.ndarray:
         [prediction] = policy._plans([Row(row.frames, "", np.random.default_rng(5), memory=memory)])
         return prediction.actions
 
-    np.testing.assert_array_equal(planned(there), planned(row.memory))
+    np.testing.assert_array_equal(planned(moved_memory), planned(row.memory))
     assert network.encoded == 4 + 2
-    assert isinstance(there["goal"].features, torch.Tensor), (
+    assert isinstance(moved_memory["goal"].features, torch.Tensor), (
         "once it is on the device, it stays there"
     )
-    assert b"torch" not in pickle.dumps(there)
+    assert b"torch" not in pickle.dumps(moved_memory)

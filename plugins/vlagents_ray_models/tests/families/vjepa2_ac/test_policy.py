@@ -81,12 +81,12 @@ def test_keeps_the_promises_of_an_agent(checkpoint: Path) -> None:
 @pytest.mark.verifies("batches")
 def test_a_session_gets_the_same_in_any_company(policy: VJepa2Ac) -> None:
     views = [obs(10 + i) for i in range(8)]
-    alone = [begun(policy, i, goal=i).act(one).action for i, one in enumerate(views)]
+    alone = [begun(policy, i, goal=i).act(view).action for i, view in enumerate(views)]
     for size in (1, 2, 3, 8):
         acts = policy.act_batch(views[:size], [begun(policy, i, goal=i) for i in range(size)])
-        for act, own in zip(acts, alone, strict=False):
+        for act, expected in zip(acts, alone, strict=False):
             assert isinstance(act, Act)
-            assert np.allclose(act.action, own, atol=1e-5)
+            assert np.allclose(act.action, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("between", ["act", "observe"])
@@ -97,32 +97,30 @@ def test_a_goal_is_taken_from_an_observation_that_no_plan_is_made_for(
         {"checkpoint": str(checkpoint), **SETTINGS, "actions": "queue", "execute": 2}
     )
     queueing.initialize()
-    turned, wanted = begun(queueing, 0, goal=0), begun(queueing, 0, goal=1)
-    for session in (turned, wanted):
+    changed, expected = begun(queueing, 0, goal=0), begun(queueing, 0, goal=1)
+    for session in (changed, expected):
         session.act(obs(4))
-    getattr(turned, between)(obs(5, goal=1))
-    wanted.act(obs(5))
+    getattr(changed, between)(obs(5, goal=1))
+    expected.act(obs(5))
     if between == "observe":
-        turned.act(obs(5))
-    assert np.allclose(turned.act(obs(6)).action, wanted.act(obs(6)).action, atol=1e-5)
+        changed.act(obs(5))
+    assert np.allclose(changed.act(obs(6)).action, expected.act(obs(6)).action, atol=1e-5)
 
 
 def test_bfloat16_plans_nearly_as_float32(checkpoint: Path, policy: VJepa2Ac) -> None:
-    quick = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "dtype": "bfloat16"})
-    quick.initialize()
-    one, other = (begun(which, 3).act(obs(4)) for which in (quick, policy))
-    assert one.info["energy"] == pytest.approx(other.info["energy"], rel=0.05)
-    # Of at most 0.05 to each side.
-    assert np.allclose(one.action[:, :3], other.action[:, :3], atol=0.05)
+    half = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "dtype": "bfloat16"})
+    half.initialize()
+    act, expected = begun(half, 3).act(obs(4)), begun(policy, 3).act(obs(4))
+    assert act.info["energy"] == pytest.approx(expected.info["energy"], rel=0.05)
+    # Steps are at most 0.05 to each side.
+    assert np.allclose(act.action[:, :3], expected.action[:, :3], atol=0.05)
 
 
 @pytest.mark.verifies("parity")
 def test_plans_are_those_of_upstreams_own_planner(
     policy: VJepa2Ac, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same images, pose and draws, through upstream's encoder, predictor, transform and
-    `cem`.
-    """
+    """Upstream's encoder, predictor, transform and `cem` have the same images, pose and draws."""
     import torch
 
     ours = begun(policy, seed=3).act(obs(4))
@@ -154,19 +152,21 @@ def test_plans_are_those_of_upstreams_own_planner(
         },
         device="cpu",
     )
-    now = obs(4)
-    pose = torch.tensor([[[*now.state["xyzrpy"].tolist(), 1 - now.gripper]]])  # type: ignore[operator]
+    view = obs(4)
+    pose = torch.tensor([[[*view.state["xyzrpy"].tolist(), 1 - view.gripper]]])  # type: ignore[operator]
     with torch.no_grad():
-        reps = [theirs.encode(image)[:, None] for image in (now.cameras["front"], goal_image(0))]
-        steps = theirs.infer_next_action(reps[0], pose, reps[1]).numpy()
+        current = theirs.encode(view.cameras["front"])[:, None]
+        goal = theirs.encode(goal_image(0))[:, None]
+        steps = theirs.infer_next_action(current, pose, goal).numpy()
     assert np.allclose(ours.action[0, :6], steps[0, :6], atol=1e-5)
-    closedness = np.clip(1 - now.gripper + steps[0, 6], 0, 1)  # type: ignore[operator]
+    closedness = np.clip(1 - view.gripper + steps[0, 6], 0, 1)  # type: ignore[operator]
     assert ours.action[0, 6] == pytest.approx(1 - closedness, abs=1e-5)
 
 
 def upstream_transform(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """That of upstream's notebook; OpenCV, which its augmentations for training are made with,
-    is not needed.
+    """Return the transform of upstream's notebook.
+
+    OpenCV, which upstream imports for augmentations in training, is not needed.
     """
     monkeypatch.setitem(sys.modules, "cv2", ModuleType("cv2"))
     import src.datasets.utils.video.transforms as video
@@ -235,28 +235,28 @@ def test_a_bad_observation_fails_its_own_session_alone(policy: VJepa2Ac) -> None
 def test_samples_are_other_plans_to_the_same_goal(policy: VJepa2Ac) -> None:
     view = obs(1)
     view.info[SAMPLES] = 3
-    found = begun(policy, 0).act(view).info[DISTRIBUTION]
-    assert found["samples"].shape == (3, 1, 7)
-    assert found["mean"].shape == found["std"].shape == (1, 7)
-    assert (found["std"][:, :3] > 0).all()
+    distribution = begun(policy, 0).act(view).info[DISTRIBUTION]
+    assert distribution["samples"].shape == (3, 1, 7)
+    assert distribution["mean"].shape == distribution["std"].shape == (1, 7)
+    assert (distribution["std"][:, :3] > 0).all()
 
 
-def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path:
-    """The checkpoint without a part, or without one of its tensors."""
+def altered(checkpoint: Path, folder: Path, network: str, tensor: str | None) -> Path:
+    """Write the checkpoint without a network, or without one of its tensors."""
     import torch
 
-    parts = torch.load(checkpoint, weights_only=True)
-    if lose is None:
-        del parts[part]
+    networks = torch.load(checkpoint, weights_only=True)
+    if tensor is None:
+        del networks[network]
     else:
-        del parts[part][lose]
-    torch.save(parts, folder / "altered.pt")
+        del networks[network][tensor]
+    torch.save(networks, folder / "altered.pt")
     return folder / "altered.pt"
 
 
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
-    ("part", "lose", "says"),
+    ("network", "tensor", "says"),
     [
         ("predictor", None, "want 'predictor' among them"),
         ("encoder", None, "it has no 'encoder'"),
@@ -270,13 +270,12 @@ def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path
     ],
 )
 def test_a_checkpoint_that_is_not_whole_is_refused(
-    part: str, lose: str | None, says: str, checkpoint: Path, tmp_path: Path
+    network: str, tensor: str | None, says: str, checkpoint: Path, tmp_path: Path
 ) -> None:
-    made = VJepa2Ac.from_config(
-        {**SETTINGS, "checkpoint": str(altered(checkpoint, tmp_path, part, lose))}
-    )
+    file = altered(checkpoint, tmp_path, network, tensor)
+    policy = VJepa2Ac.from_config({**SETTINGS, "checkpoint": str(file)})
     with pytest.raises(ConfigError, match=f"(?s){says}"):
-        made.initialize()
+        policy.initialize()
 
 
 @pytest.mark.verifies("loading")
@@ -322,12 +321,12 @@ def test_plans_of_batches_of_any_size_are_those_without_compilation(
         for size in (1, SIZE, SIZE + 1):
             views = [obs(10 + i) for i in range(size)]
             views[0].info[SAMPLES] = 2
-            acts = [
-                which.act_batch(views, [begun(which, i, goal=i) for i in range(size)])
-                for which in (policy, compiled)
-            ]
-            for one, other in zip(*acts, strict=True):
-                assert isinstance(one, Act)
-                assert isinstance(other, Act)
-                np.testing.assert_allclose(one.action, other.action, atol=1e-4)
+            expected, acts = (
+                agent.act_batch(views, [begun(agent, i, goal=i) for i in range(size)])
+                for agent in (policy, compiled)
+            )
+            for expected_act, act in zip(expected, acts, strict=True):
+                assert isinstance(expected_act, Act)
+                assert isinstance(act, Act)
+                np.testing.assert_allclose(expected_act.action, act.action, atol=1e-4)
         assert len(compiler.rows) == 3
