@@ -318,7 +318,7 @@ class Pi0(ModelPolicy):
         Their images are scaled on the device, as the image processor does.
         """
         model, torch = self.loaded(), require("torch")
-        inputs = model.staging.stack([row.frames[-1] for row in rows])
+        inputs: dict[str, Any] = model.staging.stack([row.frames[-1] for row in rows])
         images = inputs.pop("images").movedim(-1, 2)  # (P, cameras, 3, S, S)
         device = images.device
         factor, summand, padding = model.scale
