@@ -13,8 +13,10 @@ import golden
 import jsonschema
 import numpy as np
 import pytest
+from asgi_server import served
 from in_flight import read_requests
 from starlette.testclient import TestClient
+from websockets.sync.client import connect
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import MalformedMessage
@@ -246,10 +248,10 @@ def test_what_a_server_answers_is_what_the_schema_says(client: TestClient) -> No
     )
     require_valid(unpack(answer.content, DEFAULT_LIMITS)[0], "replies_header")
     require_valid(client.post("/v1/close", headers=session).json(), "close_answer")
-    with client.websocket_connect("/v1/stream") as stream:
+    with served(client.app) as port, connect(f"ws://127.0.0.1:{port}/v1/stream") as stream:
         for data, error in ((encode_requests([Request("reset", Obs())]), False), (b"VLA", True)):
-            stream.send_bytes(data)
-            reply = stream.receive_bytes()
+            stream.send(data)
+            reply = stream.recv(10)
             require_valid(unpack(reply, DEFAULT_LIMITS)[0], "replies_header")
             assert isinstance(decode_replies(reply)[0], Reply)
             assert (decode_replies(reply)[0].error is not None) == error

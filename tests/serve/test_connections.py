@@ -41,13 +41,15 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits, Requ
 from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints import answers, websocket
 from vlagents_ray.serve.endpoints import shm as local
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.websocket_connection import WebSocketConnection
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.intake import Intake
@@ -486,15 +488,18 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
 ) -> None:
     probe = bytes_probe(size)
     app = build_http_app(keyed.engine, dict, MessageLimits(body_bytes=100_000))
-    with TestClient(AccessMiddleware(app, None, "app")).websocket_connect("/v1/stream") as stream:
-        stream.send_bytes(probe)
-        assert is_probe_answer(stream.receive_bytes(), probe)
+    with (
+        served(AccessMiddleware(app, None, "app")) as port,
+        connect(f"ws://127.0.0.1:{port}/v1/stream", max_size=None) as stream,
+    ):
+        stream.send(probe)
+        assert is_probe_answer(stream.recv(10), probe)
         assert len(keyed.engine.sessions) == 0
-        stream.send_bytes(b"VLA?\0\0")
-        error = decode_replies(stream.receive_bytes())[0].error
+        stream.send(b"VLA?\0\0")
+        error = decode_replies(stream.recv(10))[0].error
         assert error.code == "malformed"
-        stream.send_bytes(encode_requests([Request("reset", Obs())]))
-        assert decode_replies(stream.receive_bytes())[0].error is None
+        stream.send(encode_requests([Request("reset", Obs())]))
+        assert decode_replies(stream.recv(10))[0].error is None
     assert not keyed.policy.acting.is_set()
 
 
@@ -502,7 +507,7 @@ FAULTS = [
     (Intake, "admit"),
     (Sender, "admission"),
     (Sender, "send"),
-    (Sender, "throttled_s"),
+    (Caller, "throttled_s"),
     (Sender, "release"),
     (IncomingMessage, "decoded"),
     (answers, "as_frame"),
@@ -512,12 +517,13 @@ FAULTS = [
     (MessageAdmission, "hold"),
     (MessageAdmission, "decode_on_thread"),
     (ReceiveBuffer, "parse"),
-    (websocket.WebSocketConnection, "_read"),
-    (websocket.WebSocketConnection, "_accept_handshake"),
-    (websocket.WebSocketConnection, "_process"),
-    (websocket.WebSocketConnection, "_submit"),
-    (websocket.WebSocketConnection, "_hold_partial"),
-    (websocket.WebSocketConnection, "overdue"),
+    (WebSocketConnection, "_read"),
+    (websocket.PortConnection, "_accept_handshake"),
+    (WebSocketConnection, "_process_messages"),
+    (RequestStream, "receive"),
+    (RequestStream, "_submit"),
+    (WebSocketConnection, "_count_partial"),
+    (WebSocketConnection, "overdue"),
     (websocket.WebSocketServer, "identify"),
     (local.UnixConnection, "_read"),
     (local.UnixConnection, "_submit"),

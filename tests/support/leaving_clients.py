@@ -54,10 +54,11 @@ from vlagents_ray.serve.dialects.base import (
     ReplicaContext,
     dialect_routes,
 )
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.endpoints.shutdown import Shutdown
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -24,7 +25,8 @@ class Endpoint(PolledServer[Any]):
     def __init__(self) -> None:
         listener = socket.create_server(("127.0.0.1", 0))
         listener.settimeout(5)
-        super().__init__(cast(Any, None), MessageLimits(), NoKey.OPEN, listener)
+        engine = SimpleNamespace(queue=SimpleNamespace(poller=None))
+        super().__init__(cast(Any, engine), MessageLimits(), NoKey.OPEN, listener)
         self.clients: list[socket.socket] = []
         self.broken = False
 

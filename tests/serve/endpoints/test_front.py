@@ -4,11 +4,8 @@ of the server.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
 import socket
-import threading
 from typing import Any
 
 import pytest
@@ -20,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from vlagents_ray.protocol.messages import STREAM_BYTES
-from vlagents_ray.serve.endpoints import front
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 
 
@@ -30,7 +27,7 @@ async def _echo(websocket: WebSocket) -> None:
         await websocket.send_bytes(message[:1])
 
 
-APP = FrontMiddleware(Starlette(routes=[WebSocketRoute("/", _echo)]))
+APP = FrontMiddleware(AccessMiddleware(Starlette(routes=[WebSocketRoute("/", _echo)]), None, "app"))
 
 
 def _close_of(url: str, size: int) -> tuple[int, str]:
@@ -81,35 +78,3 @@ def test_headers_that_are_not_utf_8_are_malformed(header: bytes) -> None:
             problem: dict[str, Any] = json.loads(body[body.index(b"{") :])
             assert problem["code"] == "malformed"
             assert "UTF-8" in problem["detail"]
-
-
-def test_what_is_discarded_of_many_connections_has_one_rate(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """At full speed the clients would send as much as 8 times the largest message each."""
-    monkeypatch.setattr(front, "_DRAINED_BYTES_PER_S", 2**20)
-    monkeypatch.setattr(front, "_DRAINED_S", 2.0)
-    sent = [0] * 8
-
-    async def discard_all() -> None:
-        discarder = front._Discarder()
-        pairs = [socket.socketpair() for _ in sent]
-        ended = threading.Event()
-
-        def send(number: int) -> None:
-            with pairs[number][0] as client, contextlib.suppress(OSError):
-                while not ended.is_set():
-                    sent[number] += client.send(bytes(2**16))
-
-        threads = [threading.Thread(target=send, args=(number,)) for number in range(len(sent))]
-        for thread in threads:
-            thread.start()
-        await asyncio.gather(*(discarder.discard(server) for _, server in pairs))
-        ended.set()
-        for thread in threads:
-            await asyncio.to_thread(thread.join)
-
-    asyncio.run(discard_all())
-    # 2 s at 1 MiB/s, a first read of each, and the buffers of the kernel.
-    assert sum(sent) < 8 * 2**20
-    assert all(sent)

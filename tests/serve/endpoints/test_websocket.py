@@ -25,7 +25,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_requests, encode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints import websocket
+from vlagents_ray.serve.endpoints import websocket_connection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -104,40 +104,48 @@ def test_an_ordinary_websocket_client_is_served_too(
         assert decode_replies(socket_.recv(5))[0].error is None
 
 
-@pytest.mark.parametrize("fragments", [True, False])
-def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
-    endpoint: WebSocketServer, fragments: bool
-) -> None:
+def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: WebSocketServer) -> None:
     other = stream(endpoint)
     ask(other, "reset")
-    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
-
-    def send() -> None:
-        if fragments:
-            with connect(url, compression=None) as client:
-                client.send([b"a", b"b"])
-                client.recv(5)
-        # Reads nothing before it has sent everything.
-        with contextlib.closing(stream(endpoint)) as late:
-            late.send(bytes(STREAM_BYTES + 9 * 2**20), 5)
+    # It reads nothing before it has sent everything.
+    with contextlib.closing(stream(endpoint)) as late:
+        late.send(bytes(STREAM_BYTES + 9 * 2**20), 5)
+        with pytest.raises(ConnectionClosed, match="1009"):
             late.recv(5)
-
-    # Says why.
-    with pytest.raises(
-        (ConnectionClosed, ConnectionResetError), match="1003" if fragments else "1009"
-    ):
-        send()
     wait_for(lambda: len(endpoint._clients) == 1)
     act = ask(other, "act", 7).act
     assert act.action.tolist() == [7]
     other.close()
 
 
+@pytest.mark.parametrize("fragments", [1, 2, 8])
+def test_a_message_in_fragments_is_answered_as_a_whole_one(
+    endpoint: WebSocketServer, fragments: int
+) -> None:
+    """Browsers send large messages in fragments."""
+    frame = encode_requests([Request("reset", Obs({"front": np.zeros((64, 64, 3), np.uint8)}))])
+    size = -(-len(frame) // fragments)
+    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
+    with connect(url, compression=None) as client:
+        client.send([frame[at : at + size] for at in range(0, len(frame), size)])
+        assert decode_replies(client.recv(5))[0].error is None
+        client.send([frame[:100], frame[100:]])
+        assert decode_replies(client.recv(5))[0].error is None
+
+
+def test_many_small_fragments_end_their_connection(endpoint: WebSocketServer) -> None:
+    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
+    with connect(url, compression=None) as client:
+        client.send([b"a"] * 50)
+        with pytest.raises(ConnectionClosed, match="small fragments"):
+            client.recv(5)
+
+
 @pytest.mark.parametrize("floods", [True, False])
 def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 1e9 if floods else 0.2)
+    monkeypatch.setattr(websocket_connection, "_CLOSING_S", 1e9 if floods else 0.2)
     endpoint.limits = MessageLimits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")
@@ -154,7 +162,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
 def test_a_client_that_takes_no_replies_holds_up_nobody(
     endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket._SLOW_S", 0.5)
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.send_buffer._SLOW_S", 0.5)
     slow, other = stream(endpoint), stream(endpoint)
     for client in (slow, other):
         ask(client, "reset")
@@ -203,7 +211,7 @@ def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
             raise RuntimeError
         return decode_requests(frame, budget)
 
-    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket.decode_requests", decode)
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.request_stream.decode_requests", decode)
     other, client = stream(endpoint), stream(endpoint)
     for each in (other, client):
         ask(each, "reset")

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from asgi_server import served
 from eval_fakes import wait_for
 from in_flight import send, submit
 from starlette.testclient import TestClient
+from websockets.sync.client import connect
 
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.interface import Act, Agent, Obs
@@ -94,11 +96,11 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     for op, obs in (("act", OBS), ("reset", OBS), ("act", OBS), ("act", Obs(info={"fail": 1}))):
         client.post(f"/v1/{op}", content=encode_requests([Request(op, obs)]), headers=headers)  # type: ignore[arg-type]
     client.post("/v1/act", content=b"VLA", headers=headers)
-    with client.websocket_connect("/v1/stream") as socket:
-        socket.send_bytes(b"garbage")
-        socket.receive_bytes()
-        socket.send_bytes(encode_requests([Request("reset", OBS)]))
-        socket.receive_bytes()
+    with served(client.app) as port, connect(f"ws://127.0.0.1:{port}/v1/stream") as socket:
+        socket.send(b"garbage")
+        socket.recv(10)
+        socket.send(encode_requests([Request("reset", OBS)]))
+        socket.recv(10)
         assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
     batches: list[int] = []
     requests: Counter[Any] = Counter()

@@ -8,17 +8,16 @@ WebSocket is refused before it is accepted.
 
 When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels
 requests over HTTP. None of the client's waiting requests is executed then. When the replica stops
-(`Shutdown`), the messages that have arrived are answered before a WebSocket ends.
+(`Shutdown`), the messages that have arrived are answered before a WebSocket ends. Both are done by
+`vlagents_ray.serve.endpoints.asgi_websocket`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import time
 import uuid
-from collections.abc import Awaitable, Callable, Collection
-from contextlib import suppress
+from collections.abc import Collection
 
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -27,47 +26,31 @@ from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, Unauthorize
 from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
+from vlagents_ray.serve.endpoints.asgi_websocket import (
+    NO_SOCKET,
+    AsgiWebSocket,
+    AsgiWebSockets,
+    uncancel,
+)
+from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
 from vlagents_ray.serve.endpoints.http_messages import (
     headers_of,
     problem_response,
     valid_request_id,
 )
-from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
+from vlagents_ray.serve.endpoints.shutdown import STOPPING, Shutdown
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.pauses import note_connection
+from vlagents_ray.serve.queue.poller import Poller
 
 logger = logging.getLogger(__name__)
 
 _HEALTH = "/healthz"
 
-_TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
+_TICK_S = 0.5  # period at which the time limit of an upload is checked
 _DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
-_GOING_AWAY, _POLICY_VIOLATION, _SERVICE_RESTART = 1001, 1008, 1012  # WebSocket close codes
+_POLICY_VIOLATION = 1008  # WebSocket close code
 _TIMEOUT = 408
-_QUIET_S = 1.0  # time after which a silent connection ends when its replica stops
-_STOPPING = "the replica is stopping; connect again"
-
-
-class Shutdown:
-    """The end of a replica, before which its WebSockets and incomplete uploads end; its methods are
-    thread-safe.
-
-    A WebSocket is a request for Serve, which ends a replica after its last request, and kills it
-    after a time limit.
-    """
-
-    def __init__(self) -> None:
-        self._begun = float("inf")  # time.monotonic(), s
-        self._patience_s = 0.0
-
-    def begin(self, patience_s: float = 0.0) -> None:
-        """End the connections that are silent for a second, and after `patience_s` all of them."""
-        self._begun, self._patience_s = time.monotonic(), patience_s
-
-    def is_due(self, silent_s: float) -> bool:
-        """Return whether a connection has to end whose client has been silent for `silent_s`."""
-        stopping_s = time.monotonic() - self._begun
-        return stopping_s >= self._patience_s or (stopping_s >= 0 and silent_s >= _QUIET_S)
 
 
 class AccessMiddleware:
@@ -85,6 +68,7 @@ class AccessMiddleware:
         idle_s: float = 600.0,
         hosts: Collection[str] = (),
         admission: Admission | None = None,
+        poller: Poller | None = None,
         shutdown: Shutdown | None = None,
         public: Collection[str] = (),
     ) -> None:
@@ -99,6 +83,8 @@ class AccessMiddleware:
             hosts: Further host names of the server, see `require_own_page`.
             admission: The memory in flight of the replica, which also counts incomplete messages of
                 WebSockets.
+            poller: The poller of the batch queue, which reads the WebSockets; without one a thread
+                of the process does.
             shutdown: The end of the replica; by default it has none.
             public: The paths of pages without data, which need no key.
         """
@@ -107,10 +93,10 @@ class AccessMiddleware:
         self._name = name
 
         self._slow_s = slow_s
-        self._idle_s = idle_s
         self._hosts = hosts
-        self._admission = admission
+        self._is_replica = poller is not None
         self._shutdown = shutdown or Shutdown()
+        self.websockets = AsgiWebSockets(poller, admission, slow_s, idle_s, self._shutdown)
         self._public = frozenset({_HEALTH, *public})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -162,14 +148,14 @@ class AccessMiddleware:
     async def _run_websocket(
         self, caller: Identity, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        frames: IncomingFrames | None = scope.get(SCOPE_KEY)
-        if frames is not None:
-            frames.supervise(caller, self._admission)
-
-        socket = _TimedWebSocket(
-            caller, self._slow_s, self._idle_s, receive, send, frames, self._shutdown
-        )
-        await socket.run(self._app, scope)
+        client: ClientSocket | None = scope.get(SCOPE_KEY) or ClientSocket.below(receive)
+        if client is not None:
+            websocket = AsgiWebSocket(self.websockets, client, caller, receive, send)
+            await websocket.run(self._app, scope)
+        elif self._is_replica:
+            await _refuse(PolicyUnavailable(NO_SOCKET), "", scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
 
 
 def _is_page(scope: Scope, public: Collection[str]) -> bool:
@@ -230,7 +216,7 @@ async def _run_upload(
             )
             refusal = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
         elif shutdown.is_due(waited_s):
-            refusal = problem_response(PolicyUnavailable(_STOPPING), uuid.uuid4().hex)
+            refusal = problem_response(PolicyUnavailable(STOPPING), uuid.uuid4().hex)
         else:
             timer = loop.call_later(min(_TICK_S, slow_s), check_time)
             return
@@ -259,151 +245,11 @@ async def _run_upload(
     except asyncio.CancelledError:
         if refusal is None or answering:
             raise
-        _uncancel(task)
+        uncancel(task)
         refusal.headers["connection"] = "close"
         await refusal(scope, receive, send)
     finally:
         timer.cancel()
-
-
-class _TimedWebSocket:
-    """A WebSocket that ends with its client and its replica, and if its key becomes invalid or its
-    client is too slow.
-
-    Messages are read ahead of the application, so that the end of the client is noticed while the
-    application acts. `IncomingFrames` limits the number of messages that the application has not
-    taken.
-    """
-
-    def __init__(
-        self,
-        caller: Identity,
-        slow_s: float,
-        idle_s: float,
-        receive: Receive,
-        send: Send,
-        frames: IncomingFrames | None,
-        shutdown: Shutdown,
-    ) -> None:
-        self._caller = caller
-        self._slow_s = slow_s
-        self._idle_s = idle_s
-        self._receive = receive
-        self._send = send
-        self._frames = frames
-        self._shutdown = shutdown
-        self._loop = asyncio.get_running_loop()
-
-        self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()  # read ahead
-        # Start of the wait for the next message, s; None if there is no wait.
-        self._silent_since: float | None = None
-        # Start of the current sending, s; None if there is none.
-        self._sending_since: float | None = None
-        # Close code and reason, once the WebSocket has to end.
-        self._end: tuple[int, str] | None = None
-        self._is_cancelled = False  # whether the application's task was cancelled
-        self._is_closed = False  # whether either side has closed the WebSocket
-
-    async def run(self, app: ASGIApp, scope: Scope) -> None:
-        """Run the application until it returns or the WebSocket has to end."""
-        task = asyncio.current_task()
-
-        def cancel() -> None:
-            self._is_cancelled = True
-            if task is not None:
-                task.cancel()
-
-        def tick() -> None:
-            """End the WebSocket if that is due, and schedule the next check."""
-            # The next check is scheduled first, so that an error below cannot stop the checks.
-            self._timer = self._loop.call_later(_TICK_S, tick)
-            cause = self._close_cause()
-            if cause is not None:
-                self._end = cause
-                self._timer.cancel()
-                cancel()
-            elif self._end is None and self._shutdown.is_due(self._silent_s()):
-                self._end = _SERVICE_RESTART, _STOPPING
-                self._messages.put_nowait(
-                    {"type": "websocket.disconnect", "code": _SERVICE_RESTART}
-                )
-
-        self._timer = self._loop.call_later(_TICK_S, tick)
-        reading = self._loop.create_task(self._read_ahead(cancel))
-        try:
-            await app(scope, self._timed_receive, self._timed_send)
-        except asyncio.CancelledError:
-            if not self._is_cancelled:
-                raise
-            _uncancel(task)
-        finally:
-            self._timer.cancel()
-            reading.cancel()
-
-        if self._end is not None and not self._is_closed:
-            await self._close(*self._end)
-
-    async def _close(self, code: int, reason: str) -> None:
-        logger.info("a WebSocket is closed: %s", reason)
-        closing: Awaitable[None]
-        if self._frames is not None and self._frames.arriving_s > 0:
-            closing = self._frames.end(code, reason)
-        else:
-            closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
-
-        # These errors mean that the client does not read, or has closed the connection.
-        with suppress(asyncio.TimeoutError, RuntimeError):
-            await asyncio.wait_for(closing, _TICK_S)
-
-    async def _read_ahead(self, client_left: Callable[[], None]) -> None:
-        while True:
-            try:
-                message = await self._receive()
-            except Exception as error:  # noqa: BLE001 - raised where the application receives
-                self._messages.put_nowait(error)
-                return
-            self._messages.put_nowait(message)
-            if message["type"] == "websocket.disconnect":
-                if not self._is_closed:
-                    self._is_closed = True
-                    client_left()
-                return
-
-    async def _timed_receive(self) -> Message:
-        _cancel_again(self._is_cancelled)
-        self._silent_since = self._loop.time()
-        message = await self._messages.get()
-        self._silent_since = None
-
-        if isinstance(message, Exception):
-            raise message
-        if self._frames is not None and message["type"] == "websocket.receive":
-            self._frames.taken()
-        return message
-
-    async def _timed_send(self, message: Message) -> None:
-        self._is_closed = self._is_closed or message["type"] == "websocket.close"
-        self._sending_since = self._loop.time()
-        await self._send(message)
-        self._sending_since = None
-
-    def _silent_s(self) -> float:
-        """Return for how long the application has waited for a message, s; 0 while it acts."""
-        return 0.0 if self._silent_since is None else self._loop.time() - self._silent_since
-
-    def _close_cause(self) -> tuple[int, str] | None:
-        """Return the close code and the reason if the WebSocket has to end at once."""
-        if (
-            self._sending_since is not None
-            and self._loop.time() - self._sending_since > self._slow_s
-        ):
-            return _POLICY_VIOLATION, "replies are not taken"
-        if self._frames is not None and self._frames.arriving_s > self._slow_s:
-            return _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
-        if self._silent_s() > self._idle_s:
-            return _GOING_AWAY, "silent for too long"
-        refusal = self._caller.refusal() if isinstance(self._caller, Caller) else None
-        return None if refusal is None else (_POLICY_VIOLATION, refusal)
 
 
 def _cancel_again(over: bool) -> None:
@@ -414,9 +260,3 @@ def _cancel_again(over: bool) -> None:
     """
     if over:
         raise asyncio.CancelledError
-
-
-def _uncancel(task: asyncio.Task[object] | None) -> None:
-    """Undo this module's cancellation of the task, after it was handled."""
-    if task is not None and hasattr(task, "uncancel"):  # since Python 3.11
-        task.uncancel()

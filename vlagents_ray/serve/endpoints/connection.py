@@ -32,8 +32,9 @@ from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray.serve.token_bucket import TokenBucket
 
@@ -89,15 +90,13 @@ class ReadBuffer(threading.local):
 class PolledConnection(ABC):
     """One connection of a client; its sessions end with it."""
 
-    def __init__(self, server: PolledServer[Any], connection: socket.socket) -> None:
-        self._engine = server.engine
-        self._poller = server.engine.queue.poller
-        self._remove = server.remove
-        self._name = server.name
+    def __init__(self, owner: ConnectionOwner[Any], connection: socket.socket) -> None:
+        self._poller = owner.poller
+        self._remove = owner.remove
+        self._name = owner.name
         self._connection = connection
 
         self.caller: Identity | None = None  # None until the client has sent its key
-        self._sender: Sender | None = None  # None until the client has sent its key
         # Guards sending: other threads send answers, or end the connection.
         self._sending = threading.Lock()
         self._ended = False
@@ -109,20 +108,8 @@ class PolledConnection(ABC):
         """Read from the connection, which is readable."""
 
     @abstractmethod
-    def _send_answers(self, message: IncomingMessage) -> None:
-        """Encode and send the answers of a message."""
-
-    def deliver(self, message: IncomingMessage) -> None:
-        """Send and record the answers of a message, on the thread of the last one.
-
-        An unexpected error ends this connection, and nothing else.
-        """
-        try:
-            self._send_answers(message)
-            self._engine.stats.record(message)
-        except Exception:
-            logger.exception("%s: a client's answers cannot be sent", self._name)
-            self.end("its answers cannot be sent", INTERNAL_ERROR)
+    def _end_sessions(self) -> None:
+        """End the sessions of a connection that is about to be closed."""
 
     @abstractmethod
     def _discard(self) -> None:
@@ -184,10 +171,10 @@ class PolledConnection(ABC):
         """Pause the connection while the client's key is over its rate; return whether it is."""
         if THROTTLED in self._unpolled_for:
             return True
-        if self._ended or self._sender is None:
+        if self._ended or not isinstance(self.caller, Caller):
             return False
 
-        wait_s = self._sender.throttled_s()
+        wait_s = self.caller.throttled_s()
         if wait_s <= 0:
             return False
         self._pause(THROTTLED)
@@ -211,21 +198,23 @@ class PolledConnection(ABC):
             self.disconnect()
         return not self._ended and not self._throttle()
 
-    def _decode(
+    def decode(
         self,
-        message: IncomingMessage,
         read: Callable[[Budget], Decoded],
         admission: MessageAdmission,
         submit: Callable[[Decoded], None],
+        refuse: Callable[[VLAgentsError], None],
     ) -> None:
         """Decode a message with `read`, on another thread if that is slow, and `submit` its
         requests.
+
+        An error of the other thread is passed to `refuse`, one of this thread is raised.
         """
         try:
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
-            then = partial(self._decoded, message, submit)
+            then = partial(self._decoded, submit, refuse)
             admission.decode_on_thread(read).add_done_callback(
                 lambda done: self._call_soon(partial(then, done.result))
             )
@@ -234,8 +223,8 @@ class PolledConnection(ABC):
 
     def _decoded(
         self,
-        message: IncomingMessage,
         submit: Callable[[Decoded], None],
+        refuse: Callable[[VLAgentsError], None],
         result: Callable[[], Decoded],
     ) -> None:
         """Submit the requests that another thread has decoded; called on the polling thread."""
@@ -243,9 +232,26 @@ class PolledConnection(ABC):
             if not self._ended:
                 submit(result())
         except VLAgentsError as error:
-            message.refuse(error)
-            self.deliver(message)
+            refuse(error)
         self._resume(DECODING)
+
+    def send_answers(
+        self,
+        message: IncomingMessage,
+        send: Callable[[IncomingMessage], None],
+        stats: MetricsBuffer,
+    ) -> None:
+        """Encode and send the answers of a message with `send`, and record them, on the thread of
+        the last one.
+
+        An unexpected error ends this connection, and nothing else.
+        """
+        try:
+            send(message)
+            stats.record(message)
+        except Exception:
+            logger.exception("%s: a client's answers cannot be sent", self._name)
+            self.end("its answers cannot be sent", INTERNAL_ERROR)
 
     def overdue(
         self, now: float, refusal: Callable[[Caller], str | None]
@@ -291,8 +297,7 @@ class PolledConnection(ABC):
     def release(self) -> None:
         """End the sessions, and close the connection."""
         try:
-            if self._sender is not None:
-                self._sender.release()
+            self._end_sessions()
         finally:
             with self._sending:
                 self._ended = True  # its descriptor's number may soon be reused
@@ -308,46 +313,22 @@ def _spare_descriptor() -> BinaryIO:
     return Path(os.devnull).open("rb")
 
 
-class PolledServer(ABC, Generic[C]):
-    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all
-    connections.
-
-    Args:
-        admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason
-            why no key is needed.
-        listener: A non-blocking socket.
-    """
+class ConnectionOwner(Generic[C]):
+    """The open connections of one endpoint, which are ended when they are overdue."""
 
     name: ClassVar[str]
 
-    def __init__(
-        self, engine: Engine, limits: MessageLimits, admit: Admit | NoKey, listener: socket.socket
-    ) -> None:
-        self.engine = engine
-        self.limits = limits
-        self.admit = admit
+    def __init__(self, poller: Poller) -> None:
+        self.poller = poller
         self._clients: set[C] = set()
-        self._listener = listener
-        self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
-        # Without a free descriptor a client could not even be refused, and the listener would stay
-        # readable.
-        self._spare = _spare_descriptor()
-
-    @abstractmethod
-    def _add_client(self, connection: socket.socket) -> None:
-        """Serve a client by `_serve`, or close its connection, which is non-blocking."""
 
     def open(self) -> None:
-        """Accept clients; call this before the engine starts."""
-        self.engine.queue.poller.watch(self._listener, self.accept)
+        """Begin to end overdue connections."""
         each_half_second.add(self.close_overdue)
 
     def close(self) -> None:
-        """Close the listener and all connections; call this after the engine has ended."""
+        """Close all connections, after their clients have received their answers."""
         each_half_second.remove(self.close_overdue)
-        self._listener.close()
-        self._spare.close()
-
         clients = list(self._clients)
         reason = "the replica is stopping; connect again"
         for client in clients:
@@ -359,6 +340,66 @@ class PolledServer(ABC, Generic[C]):
             client.end(reason, _SERVICE_RESTART)
             client.release()
 
+    def close_overdue(self) -> None:
+        """Close the connections that are overdue, or whose key is no longer valid; may be called
+        on any thread.
+        """
+        now = time.monotonic()
+        refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
+        for client in list(self._clients):
+            cause = client.overdue(now, refusal)
+            if cause is not None:
+                reason, code = cause
+                client.end(reason, code)
+
+    def remove(self, client: C) -> None:
+        """Remove a client whose connection is closed."""
+        self._clients.discard(client)
+
+    def serve(self, client: C, connection: socket.socket) -> None:
+        """Begin to read a client's connection; called on the polling thread."""
+        self.poller.watch(connection, client.ready)
+        self._clients.add(client)
+
+
+class PolledServer(ConnectionOwner[C], ABC):
+    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all
+    connections.
+
+    Args:
+        admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason
+            why no key is needed.
+        listener: A non-blocking socket.
+    """
+
+    def __init__(
+        self, engine: Engine, limits: MessageLimits, admit: Admit | NoKey, listener: socket.socket
+    ) -> None:
+        super().__init__(engine.queue.poller)
+        self.engine = engine
+        self.limits = limits
+        self.admit = admit
+        self._listener = listener
+        self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
+        # Without a free descriptor a client could not even be refused, and the listener would stay
+        # readable.
+        self._spare = _spare_descriptor()
+
+    @abstractmethod
+    def _add_client(self, connection: socket.socket) -> None:
+        """Serve a client by `serve`, or close its connection, which is non-blocking."""
+
+    def open(self) -> None:
+        """Accept clients; call this before the engine starts."""
+        self.poller.watch(self._listener, self.accept)
+        super().open()
+
+    def close(self) -> None:
+        """Close the listener and all connections; call this after the engine has ended."""
+        self._listener.close()
+        self._spare.close()
+        super().close()
+
     def accept(self) -> None:
         """Accept one client; the listener is readable.
 
@@ -369,9 +410,8 @@ class PolledServer(ABC, Generic[C]):
         """
         wait_s = self._accepting.take(time.monotonic())
         if wait_s > 0:
-            poller = self.engine.queue.poller
-            poller.unwatch(self._listener)
-            poller.call_later(wait_s, self._listen_again)
+            self.poller.unwatch(self._listener)
+            self.poller.call_later(wait_s, self._listen_again)
             return
 
         try:
@@ -400,29 +440,13 @@ class PolledServer(ABC, Generic[C]):
             connection.close()
 
     def _listen_again(self) -> None:
-        self.engine.queue.poller.watch(self._listener, self.accept)
-
-    def close_overdue(self) -> None:
-        """Close the connections that are overdue, or whose key is no longer valid; may be called
-        on any thread.
-        """
-        now = time.monotonic()
-        refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
-        for client in list(self._clients):
-            cause = client.overdue(now, refusal)
-            if cause is not None:
-                reason, code = cause
-                client.end(reason, code)
+        self.poller.watch(self._listener, self.accept)
 
     def remove(self, client: C) -> None:
-        """Remove a client whose connection is closed."""
-        self._clients.discard(client)
+        """Remove a client whose connection is closed, and count it no longer for its key."""
+        super().remove(client)
         if isinstance(client.caller, Caller):
             client.caller.hold(-1)
-
-    def _serve(self, client: C, connection: socket.socket) -> None:
-        self.engine.queue.poller.watch(connection, client.ready)
-        self._clients.add(client)
 
 
 def enable_timestamps(connection: socket.socket) -> None:

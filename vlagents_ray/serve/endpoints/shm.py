@@ -136,7 +136,7 @@ class UnixServer(PolledServer["UnixConnection"]):
             connection.close()
             return
 
-        self._serve(UnixConnection(self, connection), connection)
+        self.serve(UnixConnection(self, connection), connection)
 
 
 def _descriptors_in(control: AncillaryData) -> list[int]:
@@ -153,6 +153,7 @@ class UnixConnection(PolledConnection):
 
     def __init__(self, server: UnixServer, connection: socket.socket) -> None:
         super().__init__(server, connection)
+        self._engine = server.engine
         self._admit = server.admit
         self._limits = server.limits
         self._ops = server.ops
@@ -161,6 +162,7 @@ class UnixConnection(PolledConnection):
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
+        self._sender: Sender | None = None  # None until the client has sent its key
         self._refused_keys = 0  # number of messages whose key was refused
         self._unanswered = 0  # number of unanswered messages
         self._paused = False  # whether too many messages are unanswered
@@ -195,8 +197,7 @@ class UnixConnection(PolledConnection):
             else:
                 self._receive(sender, message, time_in_socket_s(control), data, descriptors)
         except VLAgentsError as error:
-            message.refuse(error)
-            self.deliver(message)
+            self._refuse(message, error)
             if self._sender is None:
                 self._refused_keys += 1
                 if self._refused_keys >= REFUSALS:
@@ -233,8 +234,11 @@ class UnixConnection(PolledConnection):
         if not compact_form:
             admission = sender.admission(self._limits)
             submit = partial(self._submit, sender, message, admission, waited_s)
-            self._decode(
-                message, partial(decode_requests, memory.data, ops=self._ops), admission, submit
+            self.decode(
+                partial(decode_requests, memory.data, ops=self._ops),
+                admission,
+                submit,
+                partial(self._refuse, message),
             )
             return
 
@@ -256,6 +260,14 @@ class UnixConnection(PolledConnection):
         if DECODING in self._unpolled_for:
             waited_s += time.perf_counter() - message.arrived
         sender.send(message, decoded, self, admission=admission, waited_s=waited_s)
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Send the answers of a message."""
+        self.send_answers(message, self._send_answers, self._engine.stats)
+
+    def _refuse(self, message: IncomingMessage, error: VLAgentsError) -> None:
+        message.refuse(error)
+        self.deliver(message)
 
     def _authenticate(self, message: bytes) -> Sender | None:
         """Identify the client by the key in its first message.
@@ -292,6 +304,10 @@ class UnixConnection(PolledConnection):
             if is_late and not has_unread(self._connection):
                 return "no key", POLICY_VIOLATION
         return None
+
+    def _end_sessions(self) -> None:
+        if self._sender is not None:
+            self._sender.release()
 
     def _discard(self) -> None:
         self._payload.free()

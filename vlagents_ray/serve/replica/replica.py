@@ -28,11 +28,13 @@ from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import answers
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSockets
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.endpoints.shutdown import Shutdown
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
@@ -131,6 +133,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._stream = (
             _stream_endpoint(self._engine, settings, admit) if settings.stream.enabled else None
         )
+        # Those of the server's port, once Serve has asked for its application.
+        self._websockets: AsgiWebSockets | None = None
         self._opened = True
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
@@ -191,7 +195,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             await self._migrator.hand_over()
         await self._migrator.close()
         await asyncio.to_thread(self._engine.close)
-        for endpoint in (self._local, self._plasma, self._stream):
+        for endpoint in (self._local, self._plasma, self._stream, self._websockets):
             if endpoint is not None:
                 endpoint.close()
         for part in (self._parts, self._metrics):
@@ -238,7 +242,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         inside = build_http_app(
             self._engine, self.metadata, self._limits, self._metadata_for_machine, more
         )
-        return AccessMiddleware(
+        access = AccessMiddleware(
             inside,
             self._keys,
             self._app,
@@ -246,9 +250,12 @@ class PolicyReplica(ClientApi, SiblingApi):
             idle_s=idle_s,
             hosts=hosts,
             admission=self._engine.admission,
+            poller=self._engine.queue.poller,
             shutdown=self._shutdown,
             public=self._parts.pages(inside.routes),
         )
+        self._websockets = access.websockets
+        return access
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""

@@ -1,0 +1,375 @@
+"""WebSockets of an ASGI application, whose connections the thread of the batch queue reads.
+
+uvicorn receives and answers the handshake. Then its socket becomes a `WebSocketConnection`, which
+has the limits, the time-outs and the end of all other WebSockets of the replica. The application
+receives and sends messages as specified by ASGI; or an endpoint that needs no event loop accepts
+the WebSocket with a `MessageHandler` of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+import socket
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from websockets.protocol import State
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.protocol.messages import STREAM_BYTES
+from vlagents_ray.serve.access.api_keys import Caller, Identity
+from vlagents_ray.serve.endpoints.client_socket import ClientSocket
+from vlagents_ray.serve.endpoints.connection import (
+    INTERNAL_ERROR,
+    ConnectionOwner,
+    enable_timestamps,
+)
+from vlagents_ray.serve.endpoints.shutdown import STOPPING, Shutdown
+from vlagents_ray.serve.endpoints.websocket_connection import (
+    MessageHandler,
+    WebSocketConnection,
+)
+from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.queue.poller import Poller
+
+logger = logging.getLogger(__name__)
+
+NO_SOCKET = (
+    "WebSockets reach this replica only with HAProxy as Serve's ingress, which comes with "
+    "ray[serve] (RAY_SERVE_ENABLE_HA_PROXY=1), or at the replica's own port, which `stream` in GET "
+    "/v1/metadata names"
+)
+SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
+_WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
+_WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
+_NORMAL, _SERVICE_RESTART, _TRY_AGAIN_LATER = 1000, 1012, 1013  # close codes
+_POLL_S = 60.0  # maximum time for which the thread without a batch queue waits, s
+
+MakeHandler = Callable[[WebSocketConnection], MessageHandler]
+
+
+class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
+    """The WebSockets of one ASGI application.
+
+    Args:
+        poller: The poller of the batch queue; without one, a thread of this object polls.
+        admission: The memory in flight of the replica; None without a replica.
+        slow_s: Maximum time that a message may take to arrive, s.
+        idle_s: Maximum time that a WebSocket may be silent, s.
+        shutdown: The end of the replica.
+    """
+
+    name: ClassVar[str] = "websocket"
+
+    def __init__(
+        self,
+        poller: Poller | None,
+        admission: Admission | None,
+        slow_s: float,
+        idle_s: float,
+        shutdown: Shutdown,
+    ) -> None:
+        super().__init__(poller or _own_poller())
+        self.admission = admission
+        self.slow_s = slow_s
+        self.idle_s = idle_s
+        self.shutdown = shutdown
+
+    def serve(self, client: TakenConnection, connection: socket.socket) -> None:
+        """Begin to read a client's connection; called on the polling thread."""
+        super().serve(client, connection)
+        if len(self._clients) == 1:
+            self.open()
+
+    def remove(self, client: TakenConnection) -> None:
+        """Remove a client whose connection is closed."""
+        super().remove(client)
+        if not self._clients:
+            each_half_second.remove(self.close_overdue)
+
+
+class TakenConnection(WebSocketConnection):
+    """A WebSocket whose handshake uvicorn has answered."""
+
+    def __init__(
+        self,
+        owner: AsgiWebSockets,
+        connection: socket.socket,
+        caller: Identity,
+        on_end: Callable[[], None],
+    ) -> None:
+        """Create the connection of an accepted WebSocket; `on_end` is called when it has ended."""
+        super().__init__(
+            owner,
+            connection,
+            owner.admission,
+            slow_s=owner.slow_s,
+            idle_s=owner.idle_s,
+            pings=True,
+        )
+        self.caller = caller
+        self._shutdown = owner.shutdown
+        self._on_end = on_end
+        self._protocol.state = State.OPEN
+
+    def _end_sessions(self) -> None:
+        super()._end_sessions()
+        self._on_end()
+
+    def overdue(
+        self, now: float, refusal: Callable[[Caller], str | None]
+    ) -> tuple[str, int] | None:
+        """Return a reason and a close code, as in `WebSocketConnection`; when the replica stops,
+        end the connection after its answers.
+        """
+        cause = super().overdue(now, refusal)
+        if cause is None and self._shutdown.is_due(self.silent_s(now)):
+            self.finish(STOPPING, _SERVICE_RESTART)
+        return cause
+
+
+class AsgiWebSocket:
+    """One WebSocket, for the application that serves it."""
+
+    def __init__(
+        self,
+        owner: AsgiWebSockets,
+        client: ClientSocket,
+        caller: Identity,
+        receive: Receive,
+        send: Send,
+    ) -> None:
+        """Prepare to run an application; `receive` and `send` are those of uvicorn."""
+        self._owner = owner
+        self._client = client
+        self._caller = caller
+        self._receive_first = receive
+        self._send_first = send
+        self._loop = asyncio.get_running_loop()
+        self._task = asyncio.current_task()
+        self._connection: TakenConnection | None = None  # None before it is accepted
+        self._messages: _AsgiMessages | None = None  # None if another handler receives them
+        self._over = asyncio.Event()  # set when the connection has ended
+        self._is_cancelled = False  # whether the application's task was cancelled
+
+    async def run(self, app: ASGIApp, scope: Scope) -> None:
+        """Run the application until it returns or the WebSocket has to end."""
+        code, reason = _NORMAL, ""
+        try:
+            await app({**scope, SCOPE_KEY: self}, self._receive, self._send)
+        except asyncio.CancelledError:
+            if not self._is_cancelled:
+                raise
+            uncancel(self._task)
+        except BaseException:
+            code, reason = INTERNAL_ERROR, "internal error"
+            raise
+        finally:
+            if self._messages is not None and self._messages.ending is not None:
+                reason, code = self._messages.ending
+            if self._connection is not None:
+                self._connection.end(reason, code)
+
+    async def serve(self, make_handler: MakeHandler) -> None:
+        """Accept the WebSocket, serve its messages with a handler, and wait for its end."""
+        await self._receive_first()  # the "websocket.connect" message
+        await self._accept({"type": "websocket.accept"}, make_handler)
+        await self._over.wait()
+
+    def _on_end(self) -> None:
+        """Cancel the application, as the connection has ended; called on the polling thread."""
+        self._client.ended()
+        with contextlib.suppress(RuntimeError):  # the event loop is closed
+            self._loop.call_soon_threadsafe(self._cancel)
+
+    def _cancel(self) -> None:
+        self._over.set()
+        if self._messages is not None and self._task is not None:
+            self._is_cancelled = True
+            self._task.cancel()
+
+    async def _accept(self, message: Message, make_handler: MakeHandler) -> None:
+        """Accept the WebSocket, and take its connection from uvicorn.
+
+        Raises:
+            OSError: The client has closed the connection.
+        """
+        self._client.claim()
+        await self._send_first(message)
+        taken = await self._client.take()
+        if taken is None:
+            raise OSError("the client has closed the connection")
+
+        enable_timestamps(taken)
+        connection = TakenConnection(self._owner, taken, self._caller, self._on_end)
+        connection.accepted(make_handler(connection))
+        self._connection = connection
+        self._owner.poller.call_soon(partial(self._owner.serve, connection, taken))
+
+    def _make_messages(self, connection: WebSocketConnection) -> MessageHandler:
+        self._messages = _AsgiMessages(connection, self._owner.admission, self._caller, self._loop)
+        return self._messages
+
+    async def _receive(self) -> Message:
+        if self._messages is None:
+            return await self._receive_first()
+        return await self._messages.next()
+
+    async def _send(self, message: Message) -> None:
+        connection = self._connection
+        if connection is None and message["type"] == "websocket.accept":
+            await self._accept(message, self._make_messages)
+        elif connection is None:  # the WebSocket is refused
+            await self._send_first(message)
+        elif message["type"] == "websocket.close":
+            connection.end(message.get("reason") or "", message.get("code", _NORMAL))
+        elif self._over.is_set():
+            raise OSError("the connection has ended")
+        else:
+            data = message.get("bytes")
+            connection.send(message["text"] if data is None else data)
+
+
+class _AsgiMessages(MessageHandler):
+    """The messages that an application receives; its event loop takes them in order."""
+
+    most_unanswered = _WAITING_MESSAGES
+    most_unanswered_bytes = _WAITING_BYTES
+
+    def __init__(
+        self,
+        connection: WebSocketConnection,
+        admission: Admission | None,
+        caller: Identity,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        self._connection = connection
+        self._loop = loop
+        # Messages, and their sizes.
+        self._queue: asyncio.Queue[tuple[Message, int]] = asyncio.Queue()
+        self._waiting = _WaitingBytes(connection, admission, caller)
+        self._current = -1  # size of the message that the application serves; -1 without one
+        self._is_over = False  # whether the application has received the end
+        # Reason and close code with which the connection ends when the application returns.
+        self.ending: tuple[str, int] | None = None
+
+    def begin(self) -> MessageAdmission | None:
+        return None
+
+    def receive(
+        self,
+        message: bytes | str,
+        arrived: float,
+        admission: MessageAdmission | None,
+    ) -> None:
+        size = len(message)
+        self._connection.add_unanswered(size)
+        if self._waiting.add(size):
+            field = "text" if isinstance(message, str) else "bytes"
+            self._put({"type": "websocket.receive", field: message}, size)
+
+    def ended(self, code: int) -> None:
+        self._waiting.release()
+        self._put({"type": "websocket.disconnect", "code": code}, 0)
+
+    def finish(self, reason: str, code: int) -> None:
+        self.ending = reason, code
+        self._put({"type": "websocket.disconnect", "code": code}, 0)
+
+    async def next(self) -> Message:
+        """Return the next message, when it is there; the application has served the one before."""
+        if self._is_over:
+            # Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the
+            # awaited event, such as the message of a client whose key has just been revoked.
+            raise asyncio.CancelledError
+        if self._current >= 0:
+            self._connection.remove_unanswered(self._current)
+            self._current = -1
+
+        message, size = await self._queue.get()
+        if message["type"] == "websocket.disconnect":
+            self._is_over = True
+        else:
+            self._waiting.remove(size)
+            self._current = size
+        return message
+
+    def _put(self, message: Message, size: int) -> None:
+        with contextlib.suppress(RuntimeError):  # the event loop is closed
+            self._loop.call_soon_threadsafe(self._queue.put_nowait, (message, size))
+
+
+class _WaitingBytes:
+    """The bytes of the messages that wait for an application, as part of the memory in flight.
+    Thread-safe.
+    """
+
+    def __init__(
+        self, connection: WebSocketConnection, admission: Admission | None, caller: Identity
+    ) -> None:
+        self._connection = connection
+        self._lock = threading.Lock()
+        self._size = 0
+        self._memory: ArrivingBytes | None = None
+        if admission is not None:
+            key = caller.name if isinstance(caller, Caller) else None
+            is_robot = not isinstance(caller, Caller) or caller.priority != "simulation"
+            self._memory = ArrivingBytes(admission, key, is_robot, self._give_up)
+
+    def add(self, size: int) -> bool:
+        """Count `size` more bytes; end the connection and return False if there is no room."""
+        with self._lock:
+            self._size += size
+            try:
+                self._resize()
+            except VLAgentsError as error:
+                self._connection.end(str(error), _TRY_AGAIN_LATER)
+                return False
+        return True
+
+    def remove(self, size: int) -> None:
+        """Count `size` bytes less."""
+        with self._lock:
+            self._size = max(0, self._size - size)
+            self._resize()
+
+    def release(self) -> None:
+        """Count no bytes any more."""
+        with self._lock:
+            self._size = 0
+            self._resize()
+
+    def _resize(self) -> None:
+        if self._memory is not None:
+            self._memory.resize(self._size)
+
+    def _give_up(self) -> None:
+        """End the connection, as a complete message needs the memory; called on any thread."""
+        self._connection.end("a complete message needs the memory", _TRY_AGAIN_LATER)
+
+
+def uncancel(task: asyncio.Task[object] | None) -> None:
+    """Undo this server's cancellation of a task, after it was handled."""
+    if task is not None and hasattr(task, "uncancel"):  # since Python 3.11
+        task.uncancel()
+
+
+@functools.cache
+def _own_poller() -> Poller:
+    """Return a poller with a thread of its own, for applications without a batch queue."""
+    poller = Poller()
+
+    def poll() -> None:
+        """Run the callbacks of the poller for as long as the process runs."""
+        while True:
+            poller.poll(_POLL_S)
+
+    threading.Thread(target=poll, name="websockets", daemon=True).start()
+    return poller

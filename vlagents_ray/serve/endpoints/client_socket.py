@@ -1,0 +1,106 @@
+"""The connection below a WebSocket of uvicorn, from which it is taken once it is accepted.
+
+ASGI exposes no connection; uvicorn's bound method `receive` has its protocol and transport.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from typing import Any
+
+from starlette.types import Message, Receive, Send
+
+SCOPE_KEY = "vlagents_ray.client_socket"  # key of the `ClientSocket` in the ASGI scope
+_EXTENSIONS = "Sec-WebSocket-Extensions"
+_CLOSED = 1006  # WebSocket close code: the connection ended without one
+
+
+class ClientSocket:
+    """The socket of one WebSocket, whose handshake uvicorn has received.
+
+    uvicorn reads nothing after the handshake until the WebSocket is accepted. If it is claimed by
+    then, uvicorn reads nothing at all; it considers the connection open until `ended`.
+    """
+
+    def __init__(self, receive: Receive, protocol: Any) -> None:
+        """Stop reading; called on uvicorn's event loop."""
+        self._receive = receive
+        self._protocol = protocol
+        self._transport = protocol.transport
+        self._loop = asyncio.get_running_loop()
+        self._is_claimed = False
+        self._end = asyncio.Event()
+
+        # Compressed messages would be inflated before any limit applies.
+        protocol.conn.extensions = []
+        if _EXTENSIONS in protocol.response.headers:
+            del protocol.response.headers[_EXTENSIONS]
+        self._transport.pause_reading()
+
+    @classmethod
+    def below(cls, receive: Receive) -> ClientSocket | None:
+        """Return the socket of the WebSocket with this `receive`; None if uvicorn is not below."""
+        protocol: Any = getattr(receive, "__self__", None)
+        transport = getattr(protocol, "transport", None)
+        if transport is None or transport.is_closing():
+            return None
+        return cls(receive, protocol)
+
+    def __reduce__(self) -> tuple[type[None], tuple[()]]:
+        """Pickle as None: Serve's own proxy sends the scope to another process."""
+        return type(None), ()
+
+    def claim(self) -> None:
+        """Announce `take`, before the WebSocket is accepted; may be called on any thread."""
+        self._is_claimed = True
+
+    async def take(self) -> socket.socket | None:
+        """Take the socket of the accepted WebSocket from uvicorn; may be called on any event loop.
+
+        Returns:
+            The non-blocking socket; None if the client has closed the connection.
+        """
+        taking = asyncio.run_coroutine_threadsafe(self._take(), self._loop)
+        return await asyncio.wrap_future(taking)
+
+    async def _take(self) -> socket.socket | None:
+        connection = self._transport.get_extra_info("socket")
+        if self._transport.is_closing() or connection is None or connection.fileno() < 0:
+            self._end.set()
+            return None
+        while self._transport.get_write_buffer_size():  # the answer to the handshake
+            await asyncio.sleep(0.001)
+        taken = socket.socket(fileno=os.dup(connection.fileno()))
+        taken.setblocking(False)
+        self._transport.abort()  # the duplicate keeps the connection open
+        return taken
+
+    def ended(self) -> None:
+        """Let uvicorn and Serve know that the connection has ended; may be called on any thread."""
+        with contextlib.suppress(RuntimeError):  # the event loop is closed
+            self._loop.call_soon_threadsafe(self._end.set)
+
+    async def receive(self) -> Message:
+        """Receive a message as uvicorn's `receive`; after `take`, the end of the connection.
+
+        uvicorn reports an end when the socket is taken.
+        """
+        message = await self._receive()
+        if self._is_claimed and message["type"] == "websocket.disconnect":
+            await self._end.wait()
+        return message
+
+    def sending(self, send: Send) -> Send:
+        """Return a `send` after which uvicorn reads an accepted WebSocket that is not claimed."""
+
+        async def send_and_read(message: Message) -> None:
+            """Send a message as uvicorn's `send`."""
+            await send(message)
+            is_accepted = message["type"] == "websocket.accept"
+            if is_accepted and not self._is_claimed and not self._transport.is_closing():
+                self._transport.resume_reading()
+
+        return send_and_read

@@ -1,0 +1,586 @@
+"""An open WebSocket that the thread of the batch queue reads: its frames, its limits and its end.
+
+All WebSockets of a replica are `WebSocketConnection`s, whichever port their clients used: the
+replica's own port (`vlagents_ray.serve.endpoints.websocket`), or the server's port, where uvicorn
+accepts the handshake and gives its socket away (`vlagents_ray.serve.endpoints.asgi_websocket`).
+A `MessageHandler` serves the messages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+
+from vlagents_ray.errors import Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.protocol.messages import STREAM_BYTES
+from vlagents_ray.protocol.websocket_frames import (
+    CONTROL_FRAMES,
+    CONTROL_FRAMES_PER_S,
+    HEAD_BYTES,
+    ReceiveBuffer,
+    frame_head,
+    frame_size,
+)
+from vlagents_ray.serve.access.api_keys import Caller
+from vlagents_ray.serve.endpoints.connection import (
+    BACKLOGGED,
+    DECODING,
+    POLICY_VIOLATION,
+    THROTTLED,
+    ConnectionOwner,
+    PolledConnection,
+    ReadBuffer,
+    has_unread,
+    time_in_socket_s,
+    wait_delivered,
+)
+from vlagents_ray.serve.endpoints.send_buffer import SendBuffer
+from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission
+from vlagents_ray.serve.engine.sender import REFUSED
+from vlagents_ray.serve.token_bucket import TokenBucket
+
+logger = logging.getLogger(__name__)
+
+_READ_BYTES = 1024 * 1024  # maximum size of a read; room for a message with two or three raw images
+# Maximum number of frames that are read from a connection before others have their turn.
+_FRAMES_PER_READ = 16
+_DISCARD_BYTES = 64 * 1024  # maximum size of a read after the end
+# Maximum number of bytes that are discarded after the end, and maximum time, s, in which a client
+# must close its connection.
+_MOST_DISCARDED_BYTES = 8 * STREAM_BYTES
+_CLOSING_S = 5.0
+_FINISHING = "it ends after its answers"  # a further reason for not polling a connection
+_FINISHING_S = 0.01  # period at which it is checked whether all messages are answered
+# Maximum rate of discarding, of all connections together: above it, a client waits. At full speed,
+# 32 connections take a quarter of a core.
+_DISCARDED_BYTES_PER_S = 64 * 2**20
+_DISCARDING = "too many bytes are discarded"  # a further reason for not polling a connection
+_FRAGMENT_BYTES = 16 * 1024  # size below which a fragment of a message counts like a control frame
+# A client behind a proxy that has disappeared is found out by pings: the kernel's own probes reach
+# the proxy only.
+_PING_S = 20.0
+GOING_AWAY, _INVALID_DATA, _ABNORMAL, _TRY_AGAIN_LATER = 1001, 1007, 1006, 1013  # close codes
+
+read_buffer = ReadBuffer(_READ_BYTES)
+_discarding = TokenBucket(_DISCARDED_BYTES_PER_S, time.monotonic(), capacity=_DISCARD_BYTES)
+
+
+class MessageHandler(ABC):
+    """Serves the messages of one WebSocket; the polling thread calls its methods."""
+
+    most_unanswered: int  # number of unanswered messages above which no more are read
+    most_unanswered_bytes: int  # the same of their bytes
+
+    @abstractmethod
+    def begin(self) -> MessageAdmission | None:
+        """Charge a message to the key of which a part has arrived, before the rest is read.
+
+        Returns:
+            The admission for `receive`; None if the message is charged when it is complete.
+        """
+
+    @abstractmethod
+    def receive(
+        self, message: bytes | str, arrived: float, admission: MessageAdmission | None
+    ) -> None:
+        """Serve a complete message; a text is a `str`.
+
+        Args:
+            arrived: Time at which its last byte arrived, s, of `time.perf_counter`.
+            admission: The result of `begin`, if the message arrived in parts.
+        """
+
+    @abstractmethod
+    def ended(self, code: int) -> None:
+        """End the sessions of a connection that has ended with this close code."""
+
+    @abstractmethod
+    def finish(self, reason: str, code: int) -> None:
+        """End the connection once all messages that have arrived are answered; no further ones
+        will be received.
+        """
+
+    @property
+    def refused_too_often(self) -> bool:
+        """Whether so many consecutive messages were refused that the connection has to end."""
+        return False
+
+
+class WebSocketConnection(PolledConnection):
+    """One WebSocket, from its handshake to its end."""
+
+    def __init__(
+        self,
+        owner: ConnectionOwner[WebSocketConnection],
+        connection: socket.socket,
+        admission: Admission | None,
+        *,
+        slow_s: float,
+        idle_s: float,
+        pings: bool = False,
+    ) -> None:
+        """Create a connection that is read once it is `owner.serve`d.
+
+        Args:
+            admission: The memory in flight of the replica, as part of which incomplete messages
+                count; None without a replica.
+            slow_s: Maximum time that a message may take to arrive, s.
+            idle_s: Maximum time that the connection may be silent, s.
+            pings: Whether the client has to answer pings.
+        """
+        super().__init__(owner, connection)
+        self._admission = admission
+        self._slow_s = slow_s
+        self._idle_s = idle_s
+        self._pings = pings
+        self._is_rated = False  # whether its client's key may be over a rate
+        self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
+        self._handler: MessageHandler | None = None  # None before the handshake is accepted
+
+        self._arrived = 0.0  # arrival time of the bytes read last, s
+        self._frame_head = b""  # received part of a frame's head, until the head is complete
+        self._frame_left = 0  # unread bytes of the current frame, once its head is complete
+        self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
+        self._received = ReceiveBuffer(STREAM_BYTES)
+        self._fragments: list[bytes] = []  # frames of a message whose last one has not arrived
+        self._fragments_bytes = 0
+        self._is_text = False  # whether those are of a text
+        # Received but unprocessed messages, their arrival times, s, and the admissions of those
+        # received in parts.
+        self._messages: deque[tuple[bytes | str, float, MessageAdmission | None]] = deque()
+        self._partial: MessageAdmission | None = None  # admission of a partly received message
+        self._is_partial = False  # whether a part of a message has been counted
+        self._arriving: ArrivingBytes | None = None  # bytes of a partly received message
+        self._message_count = 0  # number of messages received so far
+
+        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._unanswered = 0  # number of unanswered messages
+        self._unanswered_bytes = 0  # size of the unanswered messages with their decoded images
+        self._paused = False  # whether too many messages are unanswered; guarded by the lock
+
+        self._ended_at = float("inf")  # time at which a close code was sent, s
+        self._has_ended_sessions = False
+        self._is_finishing = False  # whether it ends once all messages are answered
+        self._discarded = 0  # number of bytes that were discarded after the end
+
+        # Only `overdue` uses these.
+        self._count_before = 0  # number of messages at its last call
+        self._quiet_since = time.monotonic()  # time of the last message or answer, s
+        self._part_since = float("inf")  # arrival time of the current partial message, s
+        # Times of the last bytes, and of the last ping since then, s; 0 without one.
+        self._alive_at = time.monotonic()
+        self._pinged_at = 0.0
+
+    def accepted(self, handler: MessageHandler) -> None:
+        """Serve messages by `handler`, since the handshake is accepted."""
+        self._received.attach(self._protocol)
+        self._is_rated = isinstance(self.caller, Caller)
+        self._handler = handler
+
+    # Handlers call these methods.
+
+    def send(self, message: bytes | str) -> None:
+        """Send a message; may be called on any thread, and does nothing after the end."""
+        with self._sending:
+            if self._ended or self._protocol.state is not State.OPEN:
+                return
+            if isinstance(message, str):
+                self._protocol.send_text(message.encode())
+                self._flush()
+            else:
+                self._out.send(frame_head(len(message)) + message)
+
+    def finish(self, reason: str, code: int) -> None:
+        """Read no further messages, and end the connection once those that have arrived are
+        answered; may be called on any thread.
+        """
+        if not self._is_finishing:
+            self._is_finishing = True
+            self._call_soon(lambda: self._finish(reason, code))
+
+    def _finish(self, reason: str, code: int) -> None:
+        self._pause(_FINISHING)
+        if self._messages or self._unpolled_for & {DECODING, THROTTLED}:
+            self._call_later(_FINISHING_S, lambda: self._finish(reason, code))
+        elif self._handler is not None:
+            self._handler.finish(reason, code)
+
+    def end_when_answered(self, reason: str, code: int) -> None:
+        """End the connection once no message is unanswered; called on the polling thread."""
+        if self._unanswered:
+            self._call_later(_FINISHING_S, lambda: self.end_when_answered(reason, code))
+        else:
+            self.end(reason, code)
+            self._resume(_FINISHING)
+
+    def add_unanswered(self, size: int) -> None:
+        """Count a message of `size` bytes with its images as unanswered."""
+        with self._sending:
+            self._unanswered += 1
+            self._unanswered_bytes += size
+
+    def remove_unanswered(self, size: int) -> None:
+        """Count a message as answered, and read again if only such messages prevented that; may
+        be called on any thread.
+        """
+        with self._sending:
+            self._unanswered -= 1
+            self._unanswered_bytes -= size
+            may_resume = self._paused and not self._is_backlogged()
+            self._paused = self._paused and not may_resume
+        if may_resume:
+            self._call_soon(lambda: self._resume(BACKLOGGED))
+
+    # Reading.
+
+    def _read(self) -> None:
+        frames = 0
+        while self._read_part() and frames < _FRAMES_PER_READ:
+            frames += 1
+
+    def _read_part(self) -> bool:
+        """Read a part of a frame; return whether more may be read, since a frame is complete."""
+        if self._is_rated and self._throttle():
+            return False
+
+        data: bytes | memoryview
+        is_closing = self._protocol.state in (State.CLOSING, State.CLOSED)
+        try:
+            size = _DISCARD_BYTES if is_closing else self._bytes_to_read()
+            data, control = read_buffer.receive(self._connection, size)
+            self._arrived = time.perf_counter() - time_in_socket_s(control)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            logger.info("%s client: %s", self._name, error)
+            data = b""
+
+        self._alive_at = time.monotonic()
+        if is_closing:
+            self._discard_bytes(len(data))
+            return False
+        return self._receive_bytes(data)
+
+    def _discard_bytes(self, count: int) -> None:
+        """Discard bytes that were read after the end: unread bytes would reset the connection
+        before the client reads the close code.
+
+        No bytes mean that the client has closed the connection.
+        """
+        self._discarded += count
+        if not count or self._discarded > _MOST_DISCARDED_BYTES:
+            self.disconnect()
+            return
+        wait_s = _discarding.take(time.monotonic(), count)
+        if wait_s > 0:
+            self._pause(_DISCARDING)
+            self._call_later(wait_s, lambda: self._resume(_DISCARDING))
+
+    def _receive_bytes(self, data: bytes | memoryview) -> bool:
+        """Process received bytes, none of which means that the connection has ended; return as
+        `_read_part`.
+        """
+        if self._frame_left:
+            self._frame_left -= len(data)
+        self._receive(data)
+        return not self._frame_left and self._polled and not self._ended
+
+    def _bytes_to_read(self) -> int:
+        """Return how many bytes to read now: at most one frame.
+
+        The bytes after it stay in the socket until it is known whether the client may send more.
+        If the connection has ended, the number is 1, which reads its end. Raises `BlockingIOError`
+        if the socket is empty.
+        """
+        if not self._frame_left:
+            peeked = self._connection.recv(HEAD_BYTES - len(self._frame_head), socket.MSG_PEEK)
+            head = self._frame_head + peeked
+            size = frame_size(head)
+            if size is None:
+                self._frame_head = head
+                return len(peeked) or 1
+            self._frame_left = size - len(self._frame_head)
+            self._frame_head = b""
+        return min(self._frame_left, _READ_BYTES)
+
+    def _receive(self, data: bytes | memoryview) -> None:
+        """Process bytes of one frame; empty `data` means that the connection has ended."""
+        was_open = self._protocol.state is State.OPEN
+        with self._sending:
+            if data:
+                self._received.parse(data)
+            else:
+                self._protocol.receive_eof()
+            events = self._protocol.events_received()
+            self._flush()
+
+        for event in events:
+            if isinstance(event, Frame) and not self._receive_frame(event):
+                return
+
+        if was_open and self._protocol.state is State.CLOSING and self._protocol.close_rcvd is None:
+            self._ended_at = time.monotonic()
+            self._charge_abuse()  # the frame is invalid; bytes after it are discarded
+        self._process_messages()
+        if (self._received.size or self._fragments) and not self._ended:
+            self._count_partial()
+
+        is_closed = self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None
+        if not data or is_closed:
+            self.disconnect()
+            return
+
+        with self._sending:
+            paused = self._is_backlogged() and self._protocol.state is State.OPEN
+            self._paused = paused
+        if paused:
+            self._pause(BACKLOGGED)
+
+    def _receive_frame(self, frame: Frame) -> bool:
+        """Queue the message that a frame completes; return False if the connection ends."""
+        is_data = frame.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT)
+        is_fragment = frame.opcode is Opcode.CONT or not frame.fin
+        is_limited = not is_data or (is_fragment and len(frame.data) < _FRAGMENT_BYTES)
+        if is_limited and self._control_frames.take(time.monotonic()) > 0:
+            self._charge_abuse()
+            self.end(f"more than {CONTROL_FRAMES} control frames or small fragments at once")
+            return False
+        if not is_data:
+            return True
+
+        if frame.opcode is not Opcode.CONT:
+            self._is_text = frame.opcode is Opcode.TEXT
+        data = bytes(frame.data)
+        if is_fragment:
+            self._fragments.append(data)
+            self._fragments_bytes += len(data)
+            if not frame.fin:
+                return True
+            data = b"".join(self._fragments)
+            self._fragments = []
+            self._fragments_bytes = 0
+
+        message: bytes | str = data
+        if self._is_text:
+            try:
+                message = data.decode()
+            except UnicodeDecodeError:
+                self._charge_abuse()
+                self.end("a text is not UTF-8", _INVALID_DATA)
+                return False
+
+        self._message_count += 1
+        self._messages.append((message, self._arrived, self._partial))
+        self._partial, self._is_partial = None, False
+        if self._arriving is not None:
+            self._arriving.release()
+        return True
+
+    def _charge_abuse(self) -> None:
+        """Charge a message to the key, as for a message that is refused, before the connection
+        ends.
+        """
+        if isinstance(self.caller, Caller):
+            with contextlib.suppress(VLAgentsError):
+                self.caller.admit()
+
+    def _count_partial(self) -> None:
+        """Count a partly received message for its key before the rest is read, and its bytes as
+        they arrive.
+        """
+        handler = self._handler
+        if handler is None:
+            return
+        try:
+            if not self._is_partial:
+                self._partial = handler.begin()
+                self._is_partial = True
+            if self._arriving is None and self._admission is not None:
+                caller = self.caller if isinstance(self.caller, Caller) else None
+                is_robot = caller is None or caller.priority != "simulation"
+                key = None if caller is None else caller.name
+                self._arriving = ArrivingBytes(self._admission, key, is_robot, self._give_up)
+            if self._arriving is not None:
+                self._arriving.resize(self._received.size + self._fragments_bytes)
+        except TooManyRequests:  # the rest stays unread until the key is under its rate
+            self._throttle()
+            if handler.refused_too_often:
+                self.end(REFUSED)
+        except VLAgentsError as error:
+            self.end(
+                str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION
+            )
+
+    def _give_up(self) -> None:
+        """End the connection, as a complete message needs the memory; called on any thread."""
+        reason = "a complete message needs the memory"
+        self._call_soon(lambda: self.end(reason, _TRY_AGAIN_LATER))
+
+    def _is_backlogged(self) -> bool:
+        """Return whether the client has too many unanswered messages or bytes; the caller holds
+        the lock.
+        """
+        handler = self._handler
+        return handler is not None and (
+            self._unanswered >= handler.most_unanswered
+            or self._unanswered_bytes > handler.most_unanswered_bytes
+        )
+
+    def _process_messages(self) -> None:
+        """Serve the received messages in order, until one of them has to wait."""
+        while self._messages and not (
+            self._ended or self._is_closed_here or self._unpolled_for & {DECODING, THROTTLED}
+        ):
+            message, arrived, admission = self._messages.popleft()
+            if self._handler is None:  # no frame is read before the handshake is accepted
+                raise VLAgentsError("stream: a message before the handshake was accepted")
+            self._handler.receive(message, arrived, admission)
+            if self._handler.refused_too_often:
+                self.end(REFUSED)
+            if self._is_rated:
+                self._throttle()
+
+    def _unthrottle(self) -> None:
+        if not self._end_throttling():
+            return
+        if (self._received.size or self._fragments) and not self._is_partial:
+            self._count_partial()
+        self._continue()
+
+    def _continue(self) -> None:
+        self._process_messages()
+        super()._continue()
+
+    # The end.
+
+    def _end_sessions(self) -> None:
+        if self._handler is None or self._has_ended_sessions:
+            return
+        self._has_ended_sessions = True
+        close = self._protocol.close_rcvd or self._protocol.close_sent
+        self._handler.ended(_ABNORMAL if close is None else int(close.code))
+
+    def _discard(self) -> None:
+        # A connection without a message costs as much as one; so does a message that is not paid.
+        if not self._message_count or (self._is_partial and self._partial is None):
+            self._charge_abuse()
+        self._partial = None
+        self._fragments = []
+        if self._arriving is not None:
+            self._arriving.release()
+        self._received.discard()
+        self._out.close()
+
+    def overdue(
+        self, now: float, refusal: Callable[[Caller], str | None]
+    ) -> tuple[str, int] | None:
+        """Return a reason and a close code if the connection is too slow or has to end; see
+        `PolledConnection`.
+
+        A connection that has been closed, and that its client leaves open, is cut off.
+
+        Time counts against the client only if the server has read all bytes that arrived: a slow
+        policy keeps the thread from reading.
+        """
+        if self._protocol.state in (State.CLOSING, State.CLOSED):
+            if now - self._ended_at > _CLOSING_S:
+                self._cut_off()
+            return None
+        cause = super().overdue(now, refusal)
+        if cause is not None:
+            return cause
+
+        if self._message_count != self._count_before or self._unanswered or not self._polled:
+            self._count_before = self._message_count
+            self._quiet_since = now
+            self._part_since = float("inf")
+        if not (self._received.size or self._fragments or self._frame_head):
+            self._part_since = float("inf")
+        elif self._part_since > now:
+            self._part_since = now
+
+        cause = self._slow_cause(now)
+        with self._sending:
+            if cause is not None and not self._ended and has_unread(self._connection):
+                self._quiet_since = self._alive_at = now
+                self._part_since = float("inf")
+                return None
+        return cause
+
+    def _slow_cause(self, now: float) -> tuple[str, int] | None:
+        """Return a reason and a close code if the client is too slow at `now`, s."""
+        if now - self._part_since > self._slow_s:
+            return f"a message took longer than {self._slow_s:g} s", POLICY_VIOLATION
+        if now - self._quiet_since > self._idle_s:
+            return "silent for too long", GOING_AWAY
+        return self._ping(now) if self._pings else None
+
+    def _ping(self, now: float) -> tuple[str, int] | None:
+        """Ping a client that is silent at `now`, s; return a reason and a close code if it does
+        not answer.
+        """
+        if now - self._alive_at <= _PING_S:
+            self._pinged_at = 0.0
+        elif not self._pinged_at:
+            self._pinged_at = now
+            with self._sending:
+                if not self._ended and self._protocol.state is State.OPEN:
+                    self._protocol.send_ping(b"")
+                    self._flush()
+        elif now - self._pinged_at > _PING_S:
+            return f"no answer to a ping within {_PING_S:g} s", GOING_AWAY
+        return None
+
+    @property
+    def _is_closed_here(self) -> bool:
+        """Whether this side has sent a close code first."""
+        return self._ended_at != float("inf")
+
+    def silent_s(self, now: float) -> float:
+        """Return for how long the client has sent no message at `now`, s, of `time.monotonic`;
+        0 while messages are unanswered.
+        """
+        return now - self._quiet_since
+
+    def end(self, reason: str, code: int = POLICY_VIOLATION) -> None:
+        """Send a close code and its reason after the answers; may be called on any thread.
+
+        Bytes that still arrive are discarded until the client closes the connection, at most for
+        `_CLOSING_S`, so that it can read the reason although it is still sending.
+        """
+        logger.info("%s: a WebSocket is closed: %s", self._name, reason)
+        self.announce_end(reason, code)
+        self._call_soon(self._end_sessions)
+
+    def _send_close(self, code: int, reason: str) -> None:
+        if self._protocol.state is State.OPEN:
+            self._ended_at = time.monotonic()
+            self._protocol.send_close(code, reason[:120])
+            self._out.send(b"".join(self._protocol.data_to_send()), last=True)
+
+    def _cut_off(self) -> None:
+        """End both directions of the connection, so that the polling thread reads its end."""
+        with self._sending:
+            if not self._ended:
+                with contextlib.suppress(OSError):  # the client has already closed it
+                    self._connection.shutdown(socket.SHUT_RDWR)
+        self._call_soon(self.disconnect)
+
+    def wait_answered(self, until: float) -> None:
+        self._out.wait_sent(until)
+        wait_delivered(self._connection, until)
+
+    def _flush(self) -> None:
+        """Send the bytes that the protocol has produced; the caller holds the lock."""
+        pieces = self._protocol.data_to_send()
+        if pieces:
+            self._out.send(b"".join(pieces), last=b"" in pieces)
