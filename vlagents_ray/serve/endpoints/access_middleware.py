@@ -41,7 +41,6 @@ from vlagents_ray.serve.endpoints.http_messages import (
 from vlagents_ray.serve.endpoints.shutdown import STOPPING, Shutdown
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.pauses import note_connection
-from vlagents_ray.serve.queue.poller import Poller
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +67,7 @@ class AccessMiddleware:
         idle_s: float = 600.0,
         hosts: Collection[str] = (),
         admission: Admission | None = None,
-        poller: Poller | None = None,
+        needs_socket: bool = False,
         shutdown: Shutdown | None = None,
         public: Collection[str] = (),
     ) -> None:
@@ -83,8 +82,8 @@ class AccessMiddleware:
             hosts: Further host names of the server, see `require_own_page`.
             admission: The memory in flight of the replica, which also counts incomplete messages of
                 WebSockets.
-            poller: The poller of the batch queue, which reads the WebSockets; without one a thread
-                of the process does.
+            needs_socket: Whether WebSockets are refused whose socket cannot be taken from uvicorn,
+                as they would have no limits. That is so behind Serve's own proxy.
             shutdown: The end of the replica; by default it has none.
             public: The paths of pages without data, which need no key.
         """
@@ -94,9 +93,9 @@ class AccessMiddleware:
 
         self._slow_s = slow_s
         self._hosts = hosts
-        self._is_replica = poller is not None
+        self._needs_socket = needs_socket
         self._shutdown = shutdown or Shutdown()
-        self.websockets = AsgiWebSockets(poller, admission, slow_s, idle_s, self._shutdown)
+        self.websockets = AsgiWebSockets(admission, slow_s, idle_s, self._shutdown)
         self._public = frozenset({_HEALTH, *public})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -148,11 +147,15 @@ class AccessMiddleware:
     async def _run_websocket(
         self, caller: Identity, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        client: ClientSocket | None = scope.get(SCOPE_KEY) or ClientSocket.below(receive)
+        client: ClientSocket | None = scope.get(SCOPE_KEY)
+        if client is None:  # a server without the `FrontMiddleware`
+            client = ClientSocket.below(receive)
+            if client is not None:
+                receive, send = client.receive, client.sending(send)
         if client is not None:
             websocket = AsgiWebSocket(self.websockets, client, caller, receive, send)
             await websocket.run(self._app, scope)
-        elif self._is_replica:
+        elif self._needs_socket:
             await _refuse(PolicyUnavailable(NO_SOCKET), "", scope, receive, send)
         else:
             await self._app(scope, receive, send)

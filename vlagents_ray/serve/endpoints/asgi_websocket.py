@@ -1,9 +1,12 @@
-"""WebSockets of an ASGI application, whose connections the thread of the batch queue reads.
+"""WebSockets of an ASGI application, whose connections one thread of the process reads.
 
 uvicorn receives and answers the handshake. Then its socket becomes a `WebSocketConnection`, which
 has the limits, the time-outs and the end of all other WebSockets of the replica. The application
 receives and sends messages as specified by ASGI; or an endpoint that needs no event loop accepts
 the WebSocket with a `MessageHandler` of its own.
+
+The thread is not that of the policy, which answers no ping during a call that is unexpectedly long:
+clients of other systems end a connection after 20 s without an answer.
 """
 
 from __future__ import annotations
@@ -50,7 +53,7 @@ SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI s
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
 _WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
 _NORMAL, _SERVICE_RESTART, _TRY_AGAIN_LATER = 1000, 1012, 1013  # close codes
-_POLL_S = 60.0  # maximum time for which the thread without a batch queue waits, s
+_POLL_S = 60.0  # maximum time for which the polling thread waits at once, s
 
 MakeHandler = Callable[[WebSocketConnection], MessageHandler]
 
@@ -59,7 +62,6 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
     """The WebSockets of one ASGI application.
 
     Args:
-        poller: The poller of the batch queue; without one, a thread of this object polls.
         admission: The memory in flight of the replica; None without a replica.
         slow_s: Maximum time that a message may take to arrive, s.
         idle_s: Maximum time that a WebSocket may be silent, s.
@@ -70,13 +72,12 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
 
     def __init__(
         self,
-        poller: Poller | None,
         admission: Admission | None,
         slow_s: float,
         idle_s: float,
         shutdown: Shutdown,
     ) -> None:
-        super().__init__(poller or _own_poller())
+        super().__init__(_own_poller())
         self.admission = admission
         self.slow_s = slow_s
         self.idle_s = idle_s
@@ -363,7 +364,7 @@ def uncancel(task: asyncio.Task[object] | None) -> None:
 
 @functools.cache
 def _own_poller() -> Poller:
-    """Return a poller with a thread of its own, for applications without a batch queue."""
+    """Return the poller of this process for all its applications, with a thread of its own."""
     poller = Poller()
 
     def poll() -> None:

@@ -32,6 +32,7 @@ class ClientSocket:
         self._transport = protocol.transport
         self._loop = asyncio.get_running_loop()
         self._is_claimed = False
+        self._accepted = asyncio.Event()  # set when uvicorn has answered the handshake
         self._end = asyncio.Event()
 
         # Compressed messages would be inflated before any limit applies.
@@ -67,6 +68,8 @@ class ClientSocket:
         return await asyncio.wrap_future(taking)
 
     async def _take(self) -> socket.socket | None:
+        # Serve passes messages of the application on from another thread.
+        await self._accepted.wait()
         connection = self._transport.get_extra_info("socket")
         if self._transport.is_closing() or connection is None or connection.fileno() < 0:
             self._end.set()
@@ -99,8 +102,9 @@ class ClientSocket:
         async def send_and_read(message: Message) -> None:
             """Send a message as uvicorn's `send`."""
             await send(message)
-            is_accepted = message["type"] == "websocket.accept"
-            if is_accepted and not self._is_claimed and not self._transport.is_closing():
-                self._transport.resume_reading()
+            if message["type"] == "websocket.accept":
+                self._accepted.set()
+                if not self._is_claimed and not self._transport.is_closing():
+                    self._transport.resume_reading()
 
         return send_and_read

@@ -1,4 +1,4 @@
-"""An open WebSocket that the thread of the batch queue reads: its frames, its limits and its end.
+"""An open WebSocket that a polling thread reads: its frames, its limits and its end.
 
 All WebSockets of a replica are `WebSocketConnection`s, whichever port their clients used: the
 replica's own port (`vlagents_ray.serve.endpoints.websocket`), or the server's port, where uvicorn

@@ -250,7 +250,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             idle_s=idle_s,
             hosts=hosts,
             admission=self._engine.admission,
-            poller=self._engine.queue.poller,
+            needs_socket=True,
             shutdown=self._shutdown,
             public=self._parts.pages(inside.routes),
         )
