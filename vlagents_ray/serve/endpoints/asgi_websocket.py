@@ -52,6 +52,10 @@ NO_SOCKET = (
 SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
 _WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
+# Maximum number of bytes that a client has not read when the application may send the next message,
+# and period of checking that, s.
+_UNSENT_BYTES = 2**16
+_UNSENT_S = 0.01
 _NORMAL, _SERVICE_RESTART, _TRY_AGAIN_LATER = 1000, 1012, 1013  # close codes
 _POLL_S = 60.0  # maximum time for which the polling thread waits at once, s
 
@@ -231,9 +235,12 @@ class AsgiWebSocket:
             await self._send_first(message)
         elif message["type"] == "websocket.close":
             connection.end(message.get("reason") or "", message.get("code", _NORMAL))
-        elif self._over.is_set():
-            raise OSError("the connection has ended")
         else:
+            # An application waits for a client that reads slowly.
+            while connection.unsent_bytes > _UNSENT_BYTES and not self._over.is_set():
+                await asyncio.sleep(_UNSENT_S)
+            if self._over.is_set():
+                raise OSError("the connection has ended")
             data = message.get("bytes")
             connection.send(message["text"] if data is None else data)
 

@@ -55,6 +55,11 @@ class SendBuffer:
         elif len(self._unsent) > self._limit:
             self._disconnect()
 
+    @property
+    def unsent_bytes(self) -> int:
+        """Number of unsent bytes; may be read without the lock."""
+        return len(self._unsent)
+
     def wait_sent(self, until: float) -> None:
         """Wait until the kernel has all bytes, but at most until a time of `time.monotonic`, s;
         call this without the lock.

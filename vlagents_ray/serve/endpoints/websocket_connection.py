@@ -199,6 +199,11 @@ class WebSocketConnection(PolledConnection):
             else:
                 self._out.send(frame_head(len(message)) + message)
 
+    @property
+    def unsent_bytes(self) -> int:
+        """Number of bytes that the client has not read yet, beyond what the kernel holds."""
+        return self._out.unsent_bytes
+
     def finish(self, reason: str, code: int) -> None:
         """Read no further messages, and end the connection once those that have arrived are
         answered; may be called on any thread.
@@ -208,6 +213,10 @@ class WebSocketConnection(PolledConnection):
             self._call_soon(lambda: self._finish(reason, code))
 
     def _finish(self, reason: str, code: int) -> None:
+        if self._polled and not self._ended and has_unread(self._connection):
+            self._read()
+        if self._ended:
+            return
         self._pause(_FINISHING)
         if self._messages or self._unpolled_for & {DECODING, THROTTLED}:
             self._call_later(_FINISHING_S, lambda: self._finish(reason, code))
@@ -220,7 +229,6 @@ class WebSocketConnection(PolledConnection):
             self._call_later(_FINISHING_S, lambda: self.end_when_answered(reason, code))
         else:
             self.end(reason, code)
-            self._resume(_FINISHING)
 
     def add_unanswered(self, size: int) -> None:
         """Count a message of `size` bytes with its images as unanswered."""
@@ -560,6 +568,7 @@ class WebSocketConnection(PolledConnection):
         logger.info("%s: a WebSocket is closed: %s", self._name, reason)
         self.announce_end(reason, code)
         self._call_soon(self._end_sessions)
+        self._call_soon(lambda: self._resume(_FINISHING))
 
     def _send_close(self, code: int, reason: str) -> None:
         if self._protocol.state is State.OPEN:
