@@ -15,6 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from websockets.frames import Frame, Opcode
 from websockets.protocol import State
@@ -120,7 +121,7 @@ class WebSocketConnection(PolledConnection):
 
     def __init__(
         self,
-        owner: ConnectionOwner[WebSocketConnection],
+        owner: ConnectionOwner[Any],
         connection: socket.socket,
         admission: Admission | None,
         *,
