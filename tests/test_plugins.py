@@ -18,7 +18,6 @@ from vlagents_ray.cli.listing import policies_and_wrappers
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.results import settings_of_export
 from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
-from vlagents_ray.evaluate.trackers import tracker_class
 from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
 from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.loop import robot_factory
@@ -209,7 +208,7 @@ def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(
     with pytest.raises(ConfigError, match="export format 'hdf9' is in vlagents-ray-tables"):
         registry.registered_function("exports", "hdf9")
     with pytest.raises(ConfigError, match="tracker 'notebook9' is in vlagents-ray-tables"):
-        tracker_class("notebook9")
+        registry.registered_class("trackers", "notebook9")
     [listed] = [row for row in policies_and_wrappers() if row.name == "pi9"]
     assert listed.what == "in vlagents-ray-models"
     assert listed.missing == "not installed: pip install vlagents-ray-models"

@@ -35,6 +35,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 
@@ -100,14 +101,14 @@ def test_out_of_time_has_an_exit_status_of_its_own(
 ) -> None:
     ends: list[float] = []
 
-    def evaluate(_config: EvalConfig, *, end_at: float, **_: Any) -> NoReturn:
+    def evaluate(_plan: ResolvedPlan, *, end_at: float, **_: Any) -> NoReturn:
         ends.append(end_at)
         raise OutOfTime(SimpleNamespace(total=SimpleNamespace(episodes=3, planned=9), out=tmp_path))  # type: ignore[arg-type]
 
-    monkeypatch.setattr(run, "evaluate", evaluate)
+    monkeypatch.setattr(run, "evaluate_plan", evaluate)
     monkeypatch.setattr(run, "print_summary", lambda *_: None)
     monkeypatch.setattr(
-        run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {}))
+        run, "served", lambda config, *_, **__: contextlib.nullcontext((resolve(config), {}))
     )
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
@@ -146,8 +147,8 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
     of_a = [{"name": "a", "url": "http://127.0.0.1:9"}]
     suites = [{"envs": ["tabletop"], "episodes": 4}]
     config = EvalConfig.model_validate({"policies": of_a, "suites": suites, "out": out, **changes})
-    with Store(config) as store:
-        store.begin_run(config, {})
+    with Store(resolve(config)) as store:
+        store.begin_run({})
         first, *others = plan(store.cases)
         failure = Failure(
             "worker", "env_failed", "env step: RuntimeError: it exploded\nand more", ""
@@ -165,10 +166,10 @@ def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, st
     results.
     """
     summary = summarize(Results.load(config.out))
-    monkeypatch.setattr(run, "evaluate", lambda *_args, **_options: summary)
+    monkeypatch.setattr(run, "evaluate_plan", lambda *_args, **_options: summary)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(
-        run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {}))
+        run, "served", lambda config, *_, **__: contextlib.nullcontext((resolve(config), {}))
     )
     done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})
     assert "Traceback" not in done.output
@@ -191,7 +192,7 @@ def test_a_case_that_stopped_early_misses_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     config = lost(tmp_path, stop={"target": 0.01, "at_least": 1})
-    with Store(config.model_copy(update={"resume": True})) as store:
+    with Store(resolve(config.model_copy(update={"resume": True}))) as store:
         store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True, 3), 1)
     [case] = Results.load(tmp_path).cases
     assert case.stopped_at is not None
@@ -206,7 +207,7 @@ def test_only_what_was_asked_for_now_is_missed(
     config = lost(tmp_path)
     suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
     other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
-    with Store(other) as store:
+    with Store(resolve(other)) as store:
         for job in plan(store.cases):
             store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
     assert end_of(other, monkeypatch) == (0, "")

@@ -26,6 +26,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.interface import Act, Agent, Obs
 
 
@@ -57,7 +58,7 @@ def eval_of(
     )
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(
-        run, "served", lambda *_, **__: contextlib.nullcontext((config, {"policy": agent}))
+        run, "served", lambda *_, **__: contextlib.nullcontext((resolve(config), {"policy": agent}))
     )
     return CliRunner().invoke(
         app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"}

@@ -18,6 +18,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.base import ModelConfig
@@ -59,21 +60,23 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
     )
     played: list[list[int]] = []
 
-    def play(config: EvalConfig, _progress: Progress, **_: Any) -> Summary:
-        played.append(config.policies[0].steps)
-        with Store(config) as store:
-            store.begin_run(config, {})
+    def play(resolved: ResolvedPlan, _progress: Progress, **_: Any) -> Summary:
+        played.append(resolved.policies[0].steps)
+        with Store(resolved) as store:
+            store.begin_run({})
             for job in plan(store.cases):
                 status: Status = (
                     "infra_failed" if job.case.step == 10 and job.key.episode == 3 else "done"
                 )
                 store.record(EpisodeResult(job.key, status, status == "done"), 1)
             store.end_run("complete")
-        return summarize(Results.load(config.out))
+        return summarize(Results.load(resolved.out))
 
     monkeypatch.setattr(run, "evaluate_and_print", play)
     monkeypatch.setattr(run, "rounds", lambda *_: iter([[10], [20, 30]]))
-    monkeypatch.setattr(run, "served", lambda config, *_: contextlib.nullcontext((config, {})))
+    monkeypatch.setattr(
+        run, "served", lambda config, *_: contextlib.nullcontext((resolve(config), {}))
+    )
     with pytest.raises(typer.Exit) as ended:
         watch_training(config.model_copy(update={"workers": 0}), tmp_path)
     assert played == [[10], [20, 30]]

@@ -23,8 +23,9 @@ from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan import resolved
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers import base, in_process, rollout
+from vlagents_ray.evaluate.workers import in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 
@@ -75,13 +76,13 @@ def test_a_short_evaluation_that_needs_no_ray_has_no_workers(
     changes: dict[str, Any], workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr(base, "node_of_this_process", lambda: None)
-    assert base.chosen_workers(flat_config(envs=[LINE], out="out", **changes)) == workers
+    monkeypatch.setattr(resolved, "node_of_this_process", lambda: None)
+    assert resolved.resolve(flat_config(envs=[LINE], out="out", **changes)).workers == workers
 
 
 def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
-    assert base.chosen_workers(flat_config(envs=[LINE], out="out")) == 1
+    assert resolved.resolve(flat_config(envs=[LINE], out="out")).workers == 1
 
 
 def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(

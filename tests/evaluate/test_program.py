@@ -20,6 +20,7 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports import rows
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.success import compare_all, families_json
 from vlagents_ray.evaluate.results.combination import combined
@@ -98,8 +99,8 @@ def played(
     }
     config = flat_config(**{**settings, "out": out, **changes})
     said = served(own_weights) | (stated or {})
-    with Store(config) as store:
-        store.begin_run(config, {})
+    with Store(resolve(config)) as store:
+        store.begin_run({})
         for job in plan(store.cases):
             if str(job.key) in store.finished():
                 continue
@@ -204,8 +205,8 @@ def test_a_worker_that_has_other_files_is_refused_also_if_changes_are_accepted(
     config = flat_config(
         envs=["prog_env:Sea"], out=tmp_path / "out", resume=True, accept_changes=True
     )
-    with Store(config) as store:
-        store.begin_run(config, {})
+    with Store(resolve(config)) as store:
+        store.begin_run({})
         program = store.cases[0].program | {"prog_env.py": "sha256:0"}
         with pytest.raises(
             ConfigError, match=r"(?s)worker on far has other files.*prog_env.py was .*, is sha256:0"
@@ -450,8 +451,8 @@ def test_a_case_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> N
     settings = {"suites": [{"envs": ["prog_env:Sea"], "episodes": 2}], "out": out, **both}
     for resume in (False, True):
         config = EvalConfig.model_validate({**settings, "resume": resume, "accept_changes": resume})
-        with Store(config) as store:
-            store.begin_run(config, {})
+        with Store(resolve(config)) as store:
+            store.begin_run({})
             for job in plan(store.cases):
                 if job.key.episode == resume:
                     store.record(EpisodeResult(job.key, "done", True, True), attempts=1)

@@ -20,6 +20,7 @@ from vlagents_ray.evaluate import exports as tables
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import PushedWeights
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.replay import actions_difference, compare, find
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Act, Obs
@@ -180,8 +181,8 @@ def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(
 ) -> None:
     recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
     settings = recorded.config(tmp_path / "again")
-    with Store(settings) as store:
-        store.begin_run(settings, {})
+    with Store(resolve(settings)) as store:
+        store.begin_run({})
         store.record(
             EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4
         )

@@ -26,6 +26,7 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.workers import pool, rollout
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
@@ -103,7 +104,7 @@ class TestOnACluster:
 
         @contextlib.contextmanager
         def looking(settings: EvalConfig) -> Iterator[None]:
-            with ray_cluster(settings):
+            with ray_cluster(resolve(settings)):
                 yield
                 found.append(json.loads((settings.out / "summary.json").read_text())["state"])
 
@@ -170,8 +171,8 @@ def test_settings_can_be_checked_before_anything_is_served(config: Config) -> No
             refuse(config(envs=["nowhere"]))
         assert not config().out.exists()
     check(config())
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
     with pytest.raises(ConfigError, match="--resume"):
         check(config())
 

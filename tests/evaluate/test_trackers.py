@@ -13,6 +13,7 @@ from in_process_evaluation import play
 from vlagents_ray import registry
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.evaluate import EvalConfig, check, evaluate
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.trackers import TrackedPolicy, TrackerFeed
 from vlagents_ray.registry import RegistryEntry
 
@@ -65,7 +66,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> None:
 def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
     """What is told of the results as they are, and nothing of before."""
     Listener.told.clear()
-    with TrackerFeed(config) as told:
+    with TrackerFeed(resolve(config)) as told:
         told.update()
     return list(Listener.told)
 
@@ -172,7 +173,7 @@ def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> Non
 
 
 def test_a_missing_package_is_an_error_before_anything_starts(config: Config) -> None:
-    for use in (TrackerFeed, check):
+    for use in (resolve, check):
         with pytest.raises(MissingDependency, match=r"pip install 'lab-trackers\[lacking\]'"):
             use(config(track=["lacking"]))
 
@@ -180,7 +181,7 @@ def test_a_missing_package_is_an_error_before_anything_starts(config: Config) ->
 def test_an_unknown_tracker_is_an_error_with_the_registered_ones_before_anything_starts(
     config: Config,
 ) -> None:
-    for use in (TrackerFeed, check):
+    for use in (resolve, check):
         with pytest.raises(
             ConfigError, match=r"'listner' is not registered: want one of .*did you mean 'listener'"
         ):

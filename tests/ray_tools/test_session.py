@@ -20,6 +20,7 @@ from ray_processes import ray_folder as ray_folder_of_test
 
 from vlagents_ray import ConfigError
 from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.ray_tools import session as joining
 from vlagents_ray.ray_tools.session import joined, ray_folder
@@ -199,7 +200,7 @@ def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_n
         monkeypatch.setenv("RAY_TMPDIR", str(place / "new"))
         key = f"vlr_{os.urandom(8).hex()}"
         monkeypatch.setenv(KEY_VARIABLE, key)
-        with ray_cluster(flat_config(envs=["tabletop/reach"], out=tmp_path)):
+        with ray_cluster(resolve(flat_config(envs=["tabletop/reach"], out=tmp_path))):
             (sockets,) = session().glob("sockets")
             assert (sockets / "raylet").is_socket()
             closed = [one for one in sockets.parents if one.stat().st_mode & 0o077 == 0]

@@ -41,8 +41,8 @@ def commits_reach_the_disk() -> Iterator[None]:
     """
     opened = Store._open
 
-    def without_waiting(store: Store, config: EvalConfig) -> sqlite3.Connection:
-        db = opened(store, config)
+    def without_waiting(store: Store) -> sqlite3.Connection:
+        db = opened(store)
         db.execute("PRAGMA synchronous = OFF")
         return db
 

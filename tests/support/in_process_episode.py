@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import Diverged, run_episodes
+from vlagents_ray.evaluate.episode.episode import Diverged, Images, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -33,7 +33,7 @@ def run_episode(
     key: EpisodeKey,
     *,
     executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
-    images: bool = True,
+    images: Images = "all",
     **settings: Any,
 ) -> EpisodeResult:
     """`run_episodes` with a batch of one, which stays open, and the agent as its only session.

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from eval_fakes import ToZero
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.artifacts.recorder import save
+from vlagents_ray.evaluate.artifacts.recorder import Recording, save
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.workers.rollout import Rollout
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Rollout
 from vlagents_ray.interface import Agent
+
+
+def rollout_by(config: EvalConfig, agents: AgentFactory) -> Rollout:
+    """The code of a worker that records what these settings choose."""
+    return Rollout(agents, partial(Recording, config.video, config.record))
 
 
 def play(
     config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: Iterable[int] = ()
 ) -> Results:
     """Play the plan, apart from the episodes of those numbers, one after another."""
-    worker = Rollout(config, lambda _policy: make())
-    with Store(config) as store:
-        store.begin_run(config, versions())
+    worker = rollout_by(config, lambda _policy: make())
+    with Store(resolve(config)) as store:
+        store.begin_run(versions())
         finished = store.finished()
         for job in plan(store.cases):
             if str(job.key) in finished or job.key.episode in left_out:

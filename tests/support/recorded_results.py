@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job, plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Obs
 
@@ -74,8 +75,8 @@ def record(
 
     `videos` are of those that failed, or of all if `config.video` says so.
     """
-    with Store(config) as store:
-        store.begin_run(config, versions())
+    with Store(resolve(config)) as store:
+        store.begin_run(versions())
         jobs = plan(store.cases)
         shown = config.video == "all"
         for job in jobs:

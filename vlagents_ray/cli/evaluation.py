@@ -35,18 +35,19 @@ from vlagents_ray.evaluate import (
     Progress,
     Results,
     Summary,
-    evaluate,
     print_summary,
     progress_for,
 )
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cases, summarize
+from vlagents_ray.evaluate.run import evaluate_plan
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import registered_class
@@ -84,19 +85,19 @@ def live_address(at: str | None) -> tuple[str, int]:
 
 @contextlib.contextmanager
 def shown_progress(
-    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
+    plan: ResolvedPlan, live: tuple[str, int] | None, *, goes_on: bool = False
 ) -> Iterator[Progress]:
     """Show an evaluation on the terminal and, if that has an address, on the live page, within the
     context of its Ray.
 
     Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
     """
-    progress = progress_for(out) if config.workers else LineProgress(out)
+    progress = progress_for(out) if plan.workers else LineProgress(out)
     if live is None:
         yield progress
         return
-    document = ProgressDocument(config.out, progress, goes_on=goes_on)
-    urls = [str(policy.url) for policy in config.policies]
+    document = ProgressDocument(plan.out, progress, goes_on=goes_on)
+    urls = [str(policy.url) for policy in plan.policies]
     apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
     with _page(document, apps if node_of_this_process() is not None else [], live):
         try:
@@ -145,7 +146,7 @@ def run_evaluation(
 
     with contextlib.ExitStack() as stack:
         try:
-            ready, agents = stack.enter_context(
+            plan, agents = stack.enter_context(
                 served(config, address, replica_per_gpu=replica_per_gpu)
             )
         except KeyboardInterrupt as error:
@@ -153,22 +154,22 @@ def run_evaluation(
                 "interrupted while Ray and the policies started; no episode began: repeat the "
                 "command"
             ) from error
-        progress = stack.enter_context(shown_progress(ready, live))
-        summary = evaluate_and_print(ready, progress, end_at, agents)
+        progress = stack.enter_context(shown_progress(plan, live))
+        summary = evaluate_and_print(plan, progress, end_at, agents)
 
-    require_results(ready, summary)
+    require_results(plan.cases, summary)
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
     """Serve the policy unless it is at a URL, and play one episode of it; `only` as in
     `evaluate`.
     """
-    with served(config, address) as (ready, agents), shown_progress(ready, None) as progress:
-        return evaluate(ready, agent_factory=agents, progress=progress, only=only)
+    with served(config, address) as (plan, agents), shown_progress(plan, None) as progress:
+        return evaluate_plan(plan, agent_factory=agents, progress=progress, only=only)
 
 
 def evaluate_and_print(
-    config: EvalConfig,
+    plan: ResolvedPlan,
     progress: Progress,
     end_at: float | None = None,
     agents: Agents | None = None,
@@ -177,9 +178,9 @@ def evaluate_and_print(
     so far.
     """
     try:
-        summary = evaluate(config, agent_factory=agents, progress=progress, end_at=end_at)
+        summary = evaluate_plan(plan, agent_factory=agents, progress=progress, end_at=end_at)
     except PolicyFailed as error:
-        results = Results.load(config.out)
+        results = Results.load(plan.out)
         if not failing_cases(results):
             raise
         print_summary(out, summarize(results))
@@ -193,13 +194,13 @@ def evaluate_and_print(
     return summary
 
 
-def require_results(config: EvalConfig, summary: Summary) -> None:
-    """End the command with status 3 if an error of the policy ended every episode of a case that
-    `config` plans.
+def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
+    """End the command with status 3 if an error of the policy ended every episode of one of these
+    cases.
 
     The status is 1 if infrastructure lost an episode.
     """
-    planned = {case.fingerprint for case in plan_cases(config)}
+    planned = {case.fingerprint for case in cases}
     results = [case for case in summary.results.cases if case.case_id in planned]
 
     failing = failing_cases(summary.results.among(results))
@@ -285,21 +286,22 @@ def watch_training(
     workers = 1 if config.workers is None else config.workers  # a training is long
     planned = _with_steps(config, trained, first).model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
-        ready, agents = stack.enter_context(served(planned, address))
-        if ready.workers:
+        plan, agents = stack.enter_context(served(planned, address))
+        if plan.workers:
             from vlagents_ray.evaluate.workers.cluster import ray_cluster
 
-            stack.enter_context(ray_cluster(ready))
+            stack.enter_context(ray_cluster(plan))
 
-        progress = stack.enter_context(shown_progress(ready, live, goes_on=True))
-        summary = evaluate_and_print(ready, progress, agents=agents)
-        all_steps = [*first]
+        progress = stack.enter_context(shown_progress(plan, live, goes_on=True))
+        summary = evaluate_and_print(plan, progress, agents=agents)
+        cases = [*plan.cases]
         for steps in rounds_of_steps:
-            all_steps += steps
-            later = _with_steps(ready, trained, steps).model_copy(update={"resume": True})
+            settings = _with_steps(plan.settings, trained, steps)
+            later = resolve(settings.model_copy(update={"resume": True}))
+            cases += later.cases
             summary = evaluate_and_print(later, progress, agents=agents)
 
-    require_results(_with_steps(ready, trained, all_steps), summary)
+    require_results(cases, summary)
 
 
 def _trained_policy(config: EvalConfig) -> tuple[int, str]:
@@ -341,8 +343,8 @@ def run_on_robot(
     from vlagents_ray.evaluate.robot import (
         PageOperator,
         TerminalOperator,
-        evaluate_on_robot,
-        plan_robot_cases,
+        play_trials,
+        require_trials,
         unblind,
     )
 
@@ -351,13 +353,13 @@ def run_on_robot(
         print_summary(out, unblind(config.out, key))
         return
 
-    plan_robot_cases(config)  # raises before anything starts
-    with served(config, address) as (ready, _), contextlib.ExitStack() as stack:
+    require_trials(config)  # before anything starts
+    with served(config, address) as (plan, _), contextlib.ExitStack() as stack:
         if operator == "terminal":
-            summary = evaluate_on_robot(ready, TerminalOperator())
+            summary = play_trials(plan, TerminalOperator())
         else:
             page = stack.enter_context(PageOperator(out.print))
-            summary = evaluate_on_robot(ready, page)
+            summary = play_trials(plan, page)
     print_summary(out, summary)
 
 

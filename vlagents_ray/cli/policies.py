@@ -18,9 +18,10 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.workers.base import chosen_workers
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, chosen_workers, resolve
+from vlagents_ray.evaluate.run import check_results
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.accelerator import VISIBLE
@@ -47,17 +48,19 @@ _STARTING_S = 30.0  # time limit for a server at a URL
 @contextlib.contextmanager
 def served(
     config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
-) -> Iterator[tuple[EvalConfig, Agents]]:
-    """Serve the policies that are not at a URL for the length of the context, or run them in this
-    process.
+) -> Iterator[tuple[ResolvedPlan, Agents]]:
+    """Resolve an evaluation, and serve the policies that are not at a URL for the length of the
+    context, or run them in this process.
 
     Yields:
-        The evaluation with its number of workers and the URLs of its policies; and, without
-        workers, the agents of the policies that are not at a URL.
+        The plan; and, without workers, the agents of the policies that are not at a URL.
     """
     _require_cluster_workers(config, address)
     with contextlib.ExitStack() as stack:
-        on_ray = address is not None or config.real_robot is not None or chosen_workers(config) > 0
+        # Ray is joined before the policies are resolved, as one may be served in its cluster.
+        on_ray = address is not None or config.real_robot is not None
+        if not on_ray:
+            on_ray = chosen_workers(config, plan_cases(config)) > 0
         if on_ray:
             _enter_ray(stack, address)
 
@@ -66,11 +69,18 @@ def served(
         if not on_ray and local is None:
             _enter_ray(stack)
 
+        agents: Agents = {}
+        if local is None:
+            plan = resolve(ready, workers=config.workers or 1)
+        else:
+            in_process, agents = _in_process(ready, local)
+            plan = resolve(in_process, workers=0)
+
         # Errors are raised before anything starts.
         if address is None:
-            _require_resources(ready, deployments)
-        _require_fit(ready, deployments)
-        check(ready)
+            _require_resources(plan, deployments)
+        _require_fit(plan, _by_policy(ready, deployments))
+        check_results(plan)
 
         if local is not None:
             if config.workers is None:
@@ -78,15 +88,12 @@ def served(
                     "a short evaluation, in this process without Ray (--workers 1 plays it in a "
                     "worker of Ray)"
                 )
-            yield _run_in_process(stack, ready, local)
-            return
-
-        ready = ready.model_copy(update={"workers": config.workers or 1})
-        if deployments:
+            stack.enter_context(variables(_variables(config, local)))
+        elif deployments:
             stack.enter_context(
-                _serve_on_ray(ready, deployments, address, replica_per_gpu=replica_per_gpu)
+                _serve_on_ray(plan, deployments, address, replica_per_gpu=replica_per_gpu)
             )
-        yield ready, {}
+        yield plan, agents
 
 
 def planned_workers(
@@ -103,7 +110,7 @@ def planned_workers(
         ConfigError: `workers` is 0, and something needs Ray, as in `served`.
     """
     _require_cluster_workers(config, address)
-    workers = chosen_workers(config)
+    workers = chosen_workers(config, plan_cases(config))
     if workers or address is not None or _local_policies(deployments, config.workers) is None:
         return workers or 1
     return 0
@@ -116,9 +123,9 @@ def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
         )
 
 
-def _require_resources(config: EvalConfig, deployments: Mapping[str, Deployment]) -> None:
+def _require_resources(plan: ResolvedPlan, deployments: Mapping[str, Deployment]) -> None:
     """Raise `ConfigError` or `MissingDependency` unless this machine has the GPUs and packages."""
-    needed = max(case.worker.gpus for case in plan_cases(config))
+    needed = max(case.worker.gpus for case in plan.cases)
     available = gpus_here() if needed else 0.0
     if needed > available:  # Ray would never start these workers here
         raise ConfigError(
@@ -129,32 +136,51 @@ def _require_resources(config: EvalConfig, deployments: Mapping[str, Deployment]
         require_packages(deployment)
 
 
-def _require_fit(config: EvalConfig, deployments: Mapping[str, Deployment]) -> None:
-    """Raise `ContractMismatch` unless the policies that will be served fit their simulations."""
-    if config.real_robot is not None:
-        return
-    policy_contract = cache(lambda application: stated_contract(deployments[application]))
-    for case in plan_cases(config):
-        application = str(case.policy.url).removeprefix("serve://")
-        if application not in deployments:
+def _by_policy(config: EvalConfig, deployments: Mapping[str, Deployment]) -> dict[str, Deployment]:
+    """Return the deployments by the policy's name in the evaluation, in place of the
+    application's.
+    """
+    by_policy = {}
+    for policy in config.policies:
+        application = str(policy.url).removeprefix("serve://")
+        if application in deployments:
+            by_policy[policy.name] = deployments[application]
+    return by_policy
+
+
+def _require_fit(plan: ResolvedPlan, deployments: Mapping[str, Deployment]) -> None:
+    """Raise `ContractMismatch` unless the policies that will be served fit their simulations.
+
+    Args:
+        plan: The plan.
+        deployments: The deployments of its policies, by their names in the plan.
+    """
+    policy_contract = cache(lambda policy: stated_contract(deployments[policy]))
+    for case in plan.cases:
+        if case.robot is not None or case.policy.name not in deployments:
             continue
         env_contract = known_contract(case.env, case.suite.env_options)
         if env_contract is not None:
             name = f"{case.policy.name!r} in {case.env!r}: "
-            require_match(policy_contract(application), env_contract, name)
+            require_match(policy_contract(case.policy.name), env_contract, name)
 
 
-def _run_in_process(
-    stack: contextlib.ExitStack, config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]
-) -> tuple[EvalConfig, Agents]:
-    """Prepare this process to run the policies, with the variables of workers and replicas, for
-    the same results.
+def _variables(config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]) -> dict[str, str]:
+    """Return the environment variables of workers and replicas, with which this process gives the
+    same results.
     """
     environment = dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads))
     if not any(policy.args[0].resources.num_gpus for policy in local.values()):
         environment[VISIBLE] = ""  # hides the GPUs
-    stack.enter_context(variables(environment))
+    return environment
 
+
+def _in_process(
+    config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]
+) -> tuple[EvalConfig, Agents]:
+    """Return the evaluation without the URLs of the policies that run in this process, and their
+    agents.
+    """
     agents = {}
     policies = []
     for policy in config.policies:
@@ -164,11 +190,11 @@ def _run_in_process(
             policies.append(policy.model_copy(update={"url": None}))
         else:
             policies.append(policy)
-    return config.model_copy(update={"policies": policies, "workers": 0}), agents
+    return config.model_copy(update={"policies": policies}), agents
 
 
 def _serve_on_ray(
-    config: EvalConfig,
+    plan: ResolvedPlan,
     deployments: Mapping[str, Deployment],
     address: str | None,
     *,
@@ -178,11 +204,11 @@ def _serve_on_ray(
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
     from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
 
-    workers = config.workers or 1
+    workers = max(1, plan.workers)
     if replica_per_gpu:
-        deployments = spread_over_gpus(deployments, reserved=workers * most_gpus(config))
+        deployments = spread_over_gpus(deployments, reserved=workers * most_gpus(plan.cases))
     # Ray's CPUs are logical here: the requested number of workers must fit.
-    cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(config)))
+    cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(plan.cases)))
     return running_server(together(deployments), address=address, num_cpus=cpus, ingress=False)
 
 

@@ -35,6 +35,7 @@ from vlagents_ray.evaluate.results.statistics import (
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
+    from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
     from vlagents_ray.evaluate.report.terminal import (
         Progress,
         print_summary,
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 
 _LATE = {
+    "plan.resolved": ("ResolvedPlan", "resolve"),
     "report.terminal": ("Progress", "print_summary", "progress_for", "results_table"),
     "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
     "workers.cluster": ("most_cpus", "most_gpus"),
@@ -61,6 +63,7 @@ __all__ = [
     "PolicyConfig",
     "Progress",
     "Rate",
+    "ResolvedPlan",
     "Results",
     "StopConfig",
     "SuiteConfig",
@@ -78,6 +81,7 @@ __all__ = [
     "most_gpus",
     "print_summary",
     "progress_for",
+    "resolve",
     "results_table",
     "synchronous_twin",
     "wilson",

@@ -8,9 +8,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 
-from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_code
+from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
 from vlagents_ray.evaluate.artifacts.storage import (
     driver_code,
@@ -19,24 +18,19 @@ from vlagents_ray.evaluate.artifacts.storage import (
     storing,
     versions,
 )
+from vlagents_ray.evaluate.driver import Consumer, Driver, EarlyStopping
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.plan.jobs import plan as plan_jobs
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
-from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
-from vlagents_ray.evaluate.trackers import TrackerFeed, tracker_class
-from vlagents_ray.evaluate.workers.base import (
-    SIGNAL_S,
-    FailedAttempts,
-    Workers,
-    chosen_workers,
-    dispatch,
-)
+from vlagents_ray.evaluate.trackers import TrackerFeed
+from vlagents_ray.evaluate.workers.base import SIGNAL_S, Workers
 from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import (
     AgentFactory,
@@ -119,29 +113,41 @@ def evaluate(
             row; `PolicyFailed` with the last error, after as many in a row that an error of a
             policy ended.
     """
-    if config.real_robot is not None:
+    return evaluate_plan(
+        resolve(config), agent_factory=agent_factory, progress=progress, only=only, end_at=end_at
+    )
+
+
+def evaluate_plan(
+    plan: ResolvedPlan,
+    *,
+    agent_factory: OwnAgents = None,
+    progress: Progress | None = None,
+    only: tuple[int, int] | None = None,
+    end_at: float | None = None,
+) -> Summary:
+    """Evaluate as `evaluate` does, by a plan that is already resolved."""
+    if plan.settings.real_robot is not None:
         raise ConfigError(
             "robot.arm: got a real robot, want a plan in simulation; see "
             "vlagents_ray.evaluate.robot"
         )
-    config = config.model_copy(update={"workers": chosen_workers(config)})
-    factory = agents(config, agent_factory)
-    tracking = TrackerFeed(config)
-    require_envs(config)
+    factory = agents(plan, agent_factory)
+    tracking = TrackerFeed(plan)
 
-    with Store(config) as store:
-        with storing(config.out):
-            store.begin_run(config, versions())
-            save_diffs(config.out, driver_code().values())
+    with Store(plan) as store:
+        with storing(plan.out):
+            store.begin_run(versions())
+            save_diffs(plan.out, driver_code().values())
         try:
             with tracking:
-                local = factory_programs(config, agent_factory)
-                run = _Run(config, store, progress or Progress(), tracking, only, end_at, local)
+                local = factory_programs(plan, agent_factory)
+                run = _Run(plan, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
             # A second error of the disk probably has the same cause; the first one is reported.
             with contextlib.suppress(StorageFailed):
-                conclude(config, store, "stopped")
+                conclude(store, "stopped")
             raise
 
     for stopped in (EvaluationInterrupted, OutOfTime):
@@ -150,16 +156,16 @@ def evaluate(
     return summary
 
 
-def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
+def conclude(store: Store, state: str) -> Summary:
     """Record the end of the run, and write its summary and its report."""
     # late: an evaluation begins sooner.
     from vlagents_ray.evaluate.report.page import FILE, write_report
 
-    with storing(config.out):
+    with storing(store.out):
         store.end_run(state)
-        summary = summarize(Results.load(config.out))
+        summary = summarize(Results.load(store.out))
         write_summary(summary)
-        write_report(summary.results, config.out / FILE)
+        write_report(summary.results, store.out / FILE)
     return summary
 
 
@@ -170,54 +176,64 @@ def check(config: EvalConfig) -> None:
         ConfigError: An env or a tracker is not registered or not installed, or the settings
             contradict the results in `config.out`.
     """
-    require_envs(config)
-    for name in config.track:
-        tracker_class(name)
-    if config.real_robot is None:  # a robot's results are written when all trials are judged
-        Store(config).close()
+    check_results(resolve(config))
 
 
-@dataclass(eq=False)
-class _Run:
-    """The driver's side of one run."""
+def check_results(plan: ResolvedPlan) -> None:
+    """Raise `ConfigError` if a plan contradicts the results in its folder."""
+    if plan.settings.real_robot is None:  # its results are written when all trials are judged
+        Store(plan).close()
 
-    config: EvalConfig
-    store: Store
-    progress: Progress
-    tracking: TrackerFeed
-    only: tuple[int, int] | None
-    end_at: float | None
-    local_programs: Mapping[str, Program]  # of own agents, by policy
 
-    def __post_init__(self) -> None:
-        config, store = self.config, self.store
-        self._attempts = FailedAttempts(config)
-        self._checked_gpus = not config.workers  # set when an env has first drawn
-        results = Results.load(config.out)
-        earlier = {case.case_id: case for case in results.cases}
-        self._recorded = {
-            case_id: rate_of([case], "success_once") for case_id, case in earlier.items()
-        }
-        # The number of steps, and the digest of the actions, of episodes whose simulation diverged.
-        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
+class _Run(Consumer):
+    """The driver's side of one run: its results, and what its user is shown."""
 
-        self._stopping: dict[str, Stopping] = {}  # by case
-        if config.stop is not None:
-            for case in store.cases:
-                stopping = Stopping(config.stop, case.suite.seeds, case.planned)
-                stopping.add_all(episode.result for episode in earlier[case.fingerprint].episodes)
-                self._stopping[case.fingerprint] = stopping
+    policy_cure = "mend the policy and evaluate it with a new --out, or raise abort_after"
+    loss_cure = "resume when this is mended (--resume)"
+
+    def __init__(
+        self,
+        plan: ResolvedPlan,
+        store: Store,
+        progress: Progress,
+        tracking: TrackerFeed,
+        only: tuple[int, int] | None,
+        end_at: float | None,
+        local_programs: Mapping[str, Program],
+    ) -> None:
+        """Queue the episodes without a result.
+
+        Args:
+            plan: The plan.
+            store: Its results, in which the run has begun.
+            progress: Shows the progress.
+            tracking: The plan's trackers.
+            only: As for `evaluate`.
+            end_at: As for `evaluate`.
+            local_programs: The files of agents that the workers make, by policy.
+        """
+        self._plan = plan
+        self._store = store
+        self._progress = progress
+        self._tracking = tracking
+        self._local_programs = local_programs
+        self._checked_gpus = not plan.workers  # set when an env has first drawn
+
+        results = Results.load(plan.out)
+        self._recorded = {case.case_id: rate_of([case], "success_once") for case in results.cases}
+        self._stopping = EarlyStopping(plan)
+        for episode in results.episodes:
+            self._stopping.add(episode.result)
 
         finished = store.finished()
         pending = []
-        for job in plan(store.cases):
-            is_selected = self.only in (None, (job.key.episode, job.key.seed))
-            if is_selected and str(job.key) not in finished and not self._has_stopped(job):
+        for job in plan_jobs(plan.cases):
+            is_selected = only in (None, (job.key.episode, job.key.seed))
+            if is_selected and str(job.key) not in finished and self.is_needed(job):
                 pending.append(job)
-        self._queue = JobQueue(pending)
+        self._driver = Driver(plan, pending, self)
         self._left = Counter(job.key.settings for job in pending)  # by case
-        durations_s = (episode.result.seconds for episode in results.episodes)
-        self._deadline = Deadline(self.end_at, durations_s)
+        self._deadline = Deadline(end_at, (episode.result.seconds for episode in results.episodes))
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Play all queued episodes, until a signal or the deadline ends the run; returns its state
@@ -226,20 +242,19 @@ class _Run:
         The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at
         once and the job is killed seconds later.
         """
-        if not len(self._queue):
-            return "complete", conclude(self.config, self.store, "complete")
+        queue = self._driver.queue
+        if not len(queue):
+            return "complete", conclude(self._store, "complete")
 
         with contextlib.ExitStack() as stack:
-            pool_of = workers_class(self.config, stack)
+            pool_of = workers_class(self._plan, stack)
             stop = stack.enter_context(stop_signals())
-            self.progress.begin(self.store.cases, self._recorded, len(self._queue))
+            self._progress.begin(self._plan.cases, self._recorded, len(queue))
             try:
-                with pool_of(self.config, factory) as pool:
+                with pool_of(self._plan, factory) as pool:
                     try:
                         while not stop.is_set() and not self._deadline.is_over:
-                            if not pool.busy and not (
-                                len(self._queue) and self._deadline.leaves_room
-                            ):
+                            if not pool.busy and not (len(queue) and self._deadline.leaves_room):
                                 break
                             self._poll_pool(pool, stop)
                         if not stop.is_set():
@@ -255,16 +270,16 @@ class _Run:
                             error,
                         )
 
-                    state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
+                    state = OutOfTime.why if len(queue) or pool.busy else "complete"
                     if stop.is_set():
                         state = EvaluationInterrupted.why
-                    return state, conclude(self.config, self.store, state)
+                    return state, conclude(self._store, state)
             finally:
-                self.progress.end()
+                self._progress.end()
 
     def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
         if self._deadline.leaves_room:
-            dispatch(pool, self._queue, self._deadline.begin)
+            self._driver.hand_out(pool)
         late_s = SIGNAL_S
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
@@ -275,20 +290,28 @@ class _Run:
                     continue
                 # One wait is for all failures of a poll: a lost policy fails many episodes at once.
                 late_s = 0.0
-            with storing(self.config.out):
-                self._handle(job, report)
+            with storing(self._plan.out):
+                self._driver.take(job, report)
 
-    def _handle(self, job: Job, report: Report) -> None:
+    def began(self, jobs: tuple[Job, ...]) -> None:
+        self._deadline.begin(jobs)
+
+    def described(self, job: Job, report: Report) -> None:
+        """Record the policy, the environment and the worker of a report that describes them."""
         if report.policy is not None:
             name = job.case.policy.name
-            local = {"program": self.local_programs[name]} if name in self.local_programs else {}
-            self.store.note_policy(name, local | report.policy)
-            save_diffs(self.config.out, [policy_code(report.policy)])
+            local = {}
+            if name in self._local_programs:
+                local["program"] = self._local_programs[name]
+            self._store.note_policy(name, local | report.policy)
+            save_diffs(self._plan.out, [policy_code(report.policy)])
+
         if report.env is not None:
-            self.store.note_env(job.case.place, report.env)
-            save_diffs(self.config.out, [report.env.code])
+            self._store.note_env(job.case.place, report.env)
+            save_diffs(self._plan.out, [report.env.code])
+
         if report.worker is not None:
-            self.store.note_worker(report.worker)
+            self._store.note_worker(report.worker)
             if report.worker.renderer is not None and not self._checked_gpus:
                 from vlagents_ray.evaluate.workers.cluster import unused_gpus
 
@@ -297,78 +320,39 @@ class _Run:
                 if hint is not None:
                     log.warning(hint)
 
-        if report.failure is not None:
-            self._failed(job, report.failure)
-        elif report.result is not None:
-            if report.result.status != "policy_error":
-                self._attempts.note_played()
-            reason = report.artifacts.not_repeatable
-            if reason is not None:
-                log.warning(
-                    "%s: nothing of it is recorded, as its actions do not repeat it in the "
-                    "simulator: %s; its worker renders further episodes as they are played",
-                    job.key,
-                    reason,
-                )
-            self._record(job, report.result, report.artifacts)
-            if report.result.status == "policy_error":
-                self._attempts.note_policy_error(report.result.error or "")
+    def is_needed(self, job: Job) -> bool:
+        return not self._stopping.has_stopped(job.key.settings)
 
-    def _failed(self, job: Job, failure: Failure) -> None:
-        if self._diverged_again(job, failure):
-            return
+    def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
+        self._store.record_attempt(job, failure, retried=repeated)
+        if repeated:
+            self._progress.retry(job, failure)
 
-        is_needed = not self._has_stopped(job)
-        retried = is_needed and self._attempts.repeats(job, failure)
-        self.store.record_attempt(job, failure, retried=retried)
-        if failure.cause == "user":
-            raise from_code(failure.code, failure.message)
-        if retried:
-            self._queue.put_back(job.again(alone=failure.names_no_episode))
-            self.progress.retry(job, failure)
-            return
-        if not is_needed:
-            return
-        lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
-        self._record(job, lost, Artifacts())
-        self._attempts.note_lost(failure, "resume when this is mended (--resume)")
+    def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        """Write the files and the result of an episode, and stop its case if that suffices."""
+        if artifacts.not_repeatable is not None:
+            log.warning(
+                "%s: nothing of it is recorded, as its actions do not repeat it in the simulator: "
+                "%s; its worker renders further episodes as they are played",
+                job.key,
+                artifacts.not_repeatable,
+            )
 
-    def _diverged_again(self, job: Job, failure: Failure) -> bool:
-        """Record a simulation that diverged twice under the same actions: the policy is the
-        cause, and has failed.
-        """
-        result = failure.diverged
-        if result is None:
-            return False
-        actions = (result.steps, result.actions_sha256)
-        earlier = self._diverged.get(job.key)
-        self._diverged[job.key] = actions
-        if earlier != actions:
-            return False
-        self._record(job, result, Artifacts())
-        self._attempts.note_policy_error(result.error or "")
-        return True
-
-    def _record(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
         # The files are written first: a crash in between repeats the episode, and they are
         # overwritten.
-        videos, trajectory = save(self.config.out, job.case, result, artifacts)
-        self.store.record(result, job.attempt, videos, trajectory)
-        self.progress.episode(job.case, result)
-        self._left[job.key.settings] -= 1
-        stopping = self._stopping.get(job.case.fingerprint)
-        if stopping is not None and not self._has_stopped(job):
-            stopping.add(result)
-            if stopping.at is not None:  # its outcomes suffice; running episodes are finished
-                dropped = self._queue.drop(job.case.fingerprint)
-                self._left[job.key.settings] -= dropped
-                self.progress.stopped(job.case, stopping.at, dropped)
-        if not self._left[job.key.settings]:
-            self.tracking.update()
+        videos, trajectory = save(self._plan.out, job.case, result, artifacts)
+        self._store.record(result, job.attempt, videos, trajectory)
+        self._progress.episode(job.case, result)
 
-    def _has_stopped(self, job: Job) -> bool:
-        stopping = self._stopping.get(job.case.fingerprint)
-        return stopping is not None and stopping.at is not None
+        case_id = job.key.settings
+        self._left[case_id] -= 1
+        stopped_at = self._stopping.add(result)
+        if stopped_at is not None:  # its outcomes suffice; running episodes are finished
+            dropped = self._driver.queue.drop(case_id)
+            self._left[case_id] -= dropped
+            self._progress.stopped(job.case, stopped_at, dropped)
+        if not self._left[case_id]:
+            self._tracking.update()
 
 
 class Deadline:

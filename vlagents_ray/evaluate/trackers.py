@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
-from vlagents_ray.evaluate.plan.config import EvalConfig, fingerprint
+from vlagents_ray.evaluate.plan.config import fingerprint
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
 from vlagents_ray.evaluate.results.reader import CaseResults, Results
 from vlagents_ray.evaluate.results.summary import Group, summarize
-from vlagents_ray.registry import registered_class, require_needs
 
 log = logging.getLogger(__name__)
 
@@ -60,18 +60,6 @@ class TrackerRun(Protocol):
         """Send the buffered values, and end the run."""
 
 
-def tracker_class(name: str) -> type[TrackerRun]:
-    """Return the class of a registered tracker, or of one given as "module:Class".
-
-    Raises:
-        ConfigError: There is none of this name.
-        MissingDependency: The packages that it needs are not installed.
-    """
-    cls = registered_class("trackers", name)
-    require_needs("trackers", name)
-    return cls
-
-
 class TrackerFeed:
     """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context
     manager around a run.
@@ -80,13 +68,10 @@ class TrackerFeed:
     unaffected. The results record what was logged, so that a resumed run logs only new values.
     """
 
-    def __init__(self, config: EvalConfig) -> None:
-        """Raise `ConfigError` for a tracker that is not registered, `MissingDependency` if its
-        package is missing.
-        """
-        self._classes = {name: tracker_class(name) for name in config.track}
-        self._config = config
-        self._working = list(config.track)  # those that have not failed
+    def __init__(self, plan: ResolvedPlan) -> None:
+        """Prepare the trackers of a plan."""
+        self._plan = plan
+        self._working = list(plan.trackers)  # those that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
         self._updated = threading.Event()
         self._closing = False
@@ -104,7 +89,7 @@ class TrackerFeed:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._config.track:
+        if self._plan.trackers:
             self._closing = True
             self._updated.set()
             self._thread.join(CLOSE_S)
@@ -122,7 +107,7 @@ class TrackerFeed:
             over = self._closing
             for tracker in list(self._working):
                 try:
-                    self._log_to(tracker, Results.load(self._config.out))
+                    self._log_to(tracker, Results.load(self._plan.out))
                 except Exception as error:  # noqa: BLE001 - whatever a tracker raises
                     log.warning(
                         "%s: %s: %s; nothing more is logged to it",
@@ -148,7 +133,7 @@ class TrackerFeed:
         for policy, total in zip(results.contenders, summary.totals, strict=True):
             groups.append((policy, results.of(policy), total))
 
-        with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
+        with closing(sqlite3.connect(self._plan.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(
                 db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,))
             )
@@ -174,7 +159,8 @@ class TrackerFeed:
     def _run_of(self, name: str, results: Results, policy: str) -> TrackerRun:
         run = self._runs.get((name, policy))
         if run is None:
-            run = self._runs[name, policy] = self._classes[name](self._subject(results, policy))
+            tracker = self._plan.trackers[name]
+            run = self._runs[name, policy] = tracker(self._subject(results, policy))
         return run
 
     def _videos(self, case: CaseResults) -> list[Path]:
@@ -183,11 +169,11 @@ class TrackerFeed:
         videos = []
         for episode in ordered:
             if episode.videos:
-                videos.append(self._config.out / episode.videos[0])
-        return videos[: self._config.tracking.videos]
+                videos.append(self._plan.out / episode.videos[0])
+        return videos[: self._plan.tracking.videos]
 
     def _subject(self, results: Results, policy: str) -> TrackedPolicy:
-        out, names = self._config.out, self._config.tracking
+        out, names = self._plan.out, self._plan.tracking
         metadata = results.policies.get(policy, {})
         served = {name: metadata.get(name) for name in IDENTITY}
         code: dict[str, Any] = dict(results.runs[-1].versions.get("code", {}))

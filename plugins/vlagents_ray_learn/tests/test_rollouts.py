@@ -16,10 +16,10 @@ from in_process_replicas import Replicas
 
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, PolicyFailed, UnknownEnv
-from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import Job, plan
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
@@ -34,11 +34,7 @@ class Workers(InProcessWorkers):
     played: list[str] = []  # noqa: RUF012 - the keys, in the order of the answers; each test has its own
 
     def free_slot(self) -> bool:
-        return len(self._workers) < self._config.workers
-
-    def __init__(self, config: Any, *others: Any) -> None:
-        super().__init__(config, *others)
-        self._config = config
+        return len(self._workers) < self._plan.workers
 
     def wait(self, _timeout_s: float) -> Iterator[tuple[Job, Report]]:
         for worker in self._workers:
@@ -65,10 +61,10 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     monkeypatch.setattr(Workers, "played", [])
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
 
-    def workers_class(config: EvalConfig, _stack: object) -> type[InProcessWorkers]:
+    def workers_class(plan: ResolvedPlan, _stack: object) -> type[InProcessWorkers]:
         # Without workers the real class plays, as this one would wait for a worker that it does not
         # start.
-        return Workers if config.workers else InProcessWorkers
+        return Workers if plan.workers else InProcessWorkers
 
     monkeypatch.setattr(rollouts, "workers_class", workers_class)
     return Workers
@@ -412,7 +408,7 @@ def test_at_a_steady_pace_no_episode_is_played_twice(
                 assert stale == before, "the pace is known"
                 assert max(lags) == (min(lag, 2) if step == 1 else 0)
             before = stale
-            wait_for(lambda: found._player is None or not (found._queue or found._pool.busy))  # type: ignore[union-attr]
+            wait_for(lambda: found._player is None or not (found._driver.queue or found._pool.busy))  # type: ignore[union-attr]
             versioned.version = found.version = versioned.version + step
     assert len(pool.played) == len(set(pool.played)) + found.stats.stale
 

@@ -56,11 +56,7 @@ def played(
 ) -> Report:
     settings = {"env_options": options.pop("env_options", {}), "execute": execute}
     [case] = plan_cases(flat_config(envs=[env], out="out", **settings))
-    worker = Rollout(
-        flat_config(envs=[env], out="out"),
-        lambda _: agent,
-        functools.partial(TransitionRecorder, **options),
-    )
+    worker = Rollout(lambda _: agent, functools.partial(TransitionRecorder, **options))
     [report] = worker.run((Job(key or EpisodeKey(env, 3, 3, case.fingerprint), case),))
     worker.close()
     return report
@@ -103,8 +99,7 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
         [EpisodeKey(LINE, seed, seed, "x") for seed in (1, 2, 3)],
         Stating(stated={"value": 1.0}),
     )
-    config = flat_config(envs=[LINE], out="out")
-    recorders = [TransitionRecorder(config, None, want=["value"]) for _ in keys]
+    recorders = [TransitionRecorder(None, want=["value"]) for _ in keys]
     results = run_episodes(
         SequentialBatch([Line() for _ in keys]),
         agent,
@@ -283,7 +278,7 @@ def test_an_episode_that_the_policy_broke_off_has_no_transitions() -> None:
 
 
 def test_an_observation_of_another_shape_is_the_envs_error() -> None:
-    one = TransitionRecorder(flat_config(envs=[LINE], out="out"), None)
+    one = TransitionRecorder(None)
     one.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
     with pytest.raises(
         EnvFailed,
@@ -307,4 +302,4 @@ def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state(
 def test_without_pyarrow_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(MissingDependency, match=r"vlagents-ray-learn\[rollouts\]"):
-        TransitionRecorder(flat_config(envs=[LINE], out="out"), None)
+        TransitionRecorder(None)

@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError, EnvFailed, PolicyFailed, WeightsLost, from_code
+from vlagents_ray.errors import ConfigError, EnvFailed, WeightsLost
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
+from vlagents_ray.evaluate.driver import Consumer, Driver
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import SecondPass
-from vlagents_ray.evaluate.plan.cases import plan_cases, require_envs
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
-from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.plan.resolved import resolve
+from vlagents_ray.evaluate.workers.base import Workers
 from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
@@ -39,14 +40,7 @@ _OTHER_MEMBERS = 2**31  # added to the policy seeds of a group's further members
 class TransitionRecorder(EpisodeRecorder):
     """Keeps the transitions of one episode, as `vlagents_ray_learn.columns` describes them."""
 
-    def __init__(
-        self,
-        _config: EvalConfig,
-        _hz: float | None,
-        *,
-        want: Sequence[str] = (),
-        images: bool = True,
-    ) -> None:
+    def __init__(self, _hz: float | None, *, want: Sequence[str] = (), images: bool = True) -> None:
         self._pa: Any = optional("pyarrow")
         self._want = tuple(want)
         self._images = images
@@ -212,7 +206,6 @@ def _by_row(value: Any, rows: int, name: str) -> list[float]:
 
 
 POLL_S = 0.25  # longest wait for a report before missing workers are started
-_CURE = "mend this, and go on with `first=rollouts.position`"
 
 
 @dataclass(slots=True)
@@ -327,10 +320,11 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             UnknownEnv: There is no such env.
         """
         self._pa: Any = optional("pyarrow")
+        self._settings = plan
         config = plan.config()
-        require_envs(config)
-        self._settings, self._config, self._cases = plan, config, plan_cases(config)
-        self._factory = agents(config, None if isinstance(plan.policy, str) else plan.policy)
+        self._plan = resolve(config, config.workers)
+        own_agents = None if isinstance(plan.policy, str) else plan.policy
+        self._factory = agents(self._plan, own_agents)
         self._recorders = functools.partial(
             TransitionRecorder, want=tuple(plan.want), images=plan.images
         )
@@ -339,9 +333,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             2, math.ceil(2 * plan.workers * plan.num_envs / self._block)
         )
         self._position = self._planned = plan.first
-        self._queue = JobQueue([])
         self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
-        self._attempts = FailedAttempts(config)
+        self._driver = Driver(self._plan, [], _Consumer(self))
         self._resources = ExitStack()
         self._pool: Workers | None = None
         # Held by whoever plays or asks, but not during a wait for reports.
@@ -481,7 +474,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             else:
                 self._stop_player()
             with self._state:
-                self._plan(limit or end)
+                self._plan_until(limit or end)
                 wanted = list(itertools.islice(self._episodes.items(), end - self._position))
                 self._replay_stale()
                 self._state.notify_all()
@@ -525,7 +518,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         try:
             while True:
                 with self._state:
-                    while not (self._stopping or len(self._queue) or pool.busy):
+                    while not (self._stopping or len(self._driver.queue) or pool.busy):
                         self._state.wait()
                     if self._stopping:
                         return
@@ -535,12 +528,12 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 self._error = error
                 self._state.notify_all()
 
-    def _plan(self, limit: int) -> None:
+    def _plan_until(self, limit: int) -> None:
         """Queue the episodes up to number `limit`."""
         for number in range(self._planned, limit):
             state, member = divmod(number, self._settings.groups)
-            episode, turn = divmod(state, len(self._cases))
-            case = self._cases[turn]
+            episode, turn = divmod(state, len(self._plan.cases))
+            case = self._plan.cases[turn]
             # The first of a group is the episode of an evaluation. The policy seeds of the others
             # are above all of those, so that no two episodes of an environment share their noise.
             policy_seed = self._settings.seed + _OTHER_MEMBERS + number if member else None
@@ -551,17 +544,17 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 case,
             )
             self._episodes[job.key] = _PlannedEpisode(job, number)
-            self._queue.put(job)
+            self._driver.queue.put(job)
         self._planned, self._allowed = max(self._planned, limit), limit
 
     def _play_on(self) -> None:
         """Hand out jobs, and take the reports that arrive."""
         pool = self._running_pool()
         with self._state:
-            dispatch(pool, self._queue, self._begin)
+            self._driver.hand_out(pool)
         for job, report in pool.wait(POLL_S):
             with self._state:
-                self._handle(job, report)
+                self._driver.take(job, report)
                 self._replay_stale()
                 self._state.notify_all()
 
@@ -579,41 +572,29 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
 
     def _running_pool(self) -> Workers:
         if self._pool is None:
-            pool_of = workers_class(self._config, self._resources)
+            pool_of = workers_class(self._plan, self._resources)
             self._pool = self._resources.enter_context(
-                pool_of(self._config, self._factory, self._recorders)
+                pool_of(self._plan, self._factory, self._recorders)
             )
-            self._queue = JobQueue(episode.job for episode in self._episodes.values())
+            jobs = [episode.job for episode in self._episodes.values()]
+            self._driver = Driver(self._plan, jobs, _Consumer(self))
         return self._pool
 
     def _begin(self, jobs: tuple[Job, ...]) -> None:
         for job in jobs:
             self._episodes[job.key].pushed = self._pushed
 
-    def _handle(self, job: Job, report: Report) -> None:
-        failure = report.failure
-        transitions = report.artifacts.transitions
+    def _finish(self, job: Job, transitions: Any) -> None:
+        """Keep the transitions of an episode until it is its turn; None if it is lost."""
         episode = self._episodes[job.key]
-        if failure is not None and failure.cause == "user":
-            raise from_code(failure.code, failure.message)
-        if failure is not None and self._attempts.repeats(job, failure):
-            self.stats.retries += 1
-            self._queue.put_back(job.again())
-            return
-        if transitions is not None:
-            transitions = self._with_start_state(
-                transitions, episode.number // self._settings.groups
-            )
         episode.over = True
-        episode.transitions = transitions
         if transitions is None:
+            episode.transitions = None
             self.stats.lost += 1
-            if failure is None:
-                error = report.result.error if report.result is not None else None
-                failure = Failure("policy", PolicyFailed.code, f"{job.key}: {error}")
-            self._attempts.note_lost(failure, _CURE)
             return
-        self._attempts.note_played()
+
+        transitions = self._with_start_state(transitions, episode.number // self._settings.groups)
+        episode.transitions = transitions
         versions = transitions.column("version").to_numpy()
         episode.oldest = int(versions.min())
         self._saw(int(versions.max()))
@@ -641,4 +622,25 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 self.stats.stale += 1
             if episode.held and episode.number < self._allowed:
                 episode.held = False
-                self._queue.put_back(episode.job)
+                self._driver.queue.put_back(episode.job)
+
+
+class _Consumer(Consumer):
+    """Passes the episodes of the driver to the rollouts."""
+
+    policy_cure = loss_cure = "mend this, and go on with `first=rollouts.position`"
+
+    def __init__(self, rollouts: Rollouts) -> None:
+        self._rollouts = rollouts
+
+    def began(self, jobs: tuple[Job, ...]) -> None:
+        self._rollouts._begin(jobs)
+
+    def described(self, job: Job, report: Report) -> None:
+        pass  # the results of a rollout do not describe who played it
+
+    def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
+        self._rollouts.stats.retries += repeated
+
+    def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        self._rollouts._finish(job, artifacts.transitions)

@@ -11,7 +11,7 @@ from typing import Any
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, WeightsLost
-from vlagents_ray.evaluate.plan.cases import require_envs
+from vlagents_ray.evaluate.plan.cases import plan_cases, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig, PushedWeights
 from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.database import FILE
@@ -80,7 +80,7 @@ class TrainingEvaluation:
                 f"{plan.out} already has results: set resume=True in the plan, or choose another "
                 "folder"
             )
-        require_envs(plan)
+        require_envs(plan_cases(plan))
         self._policy = policy
         self._plan = plan.model_copy(update={"resume": True})
         self._share = share

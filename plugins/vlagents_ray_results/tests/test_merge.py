@@ -22,6 +22,7 @@ from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.storage import require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.combination import combined
@@ -135,8 +136,8 @@ def test_a_lost_episode_gives_way_to_one_that_was_played(
     part: Callable[..., Path], config: Config, tmp_path: Path
 ) -> None:
     a, b = part("a", 5), part("b")
-    with Store(config(out=a, resume=True)) as store:
-        store.begin_run(config(out=a), {})
+    with Store(resolve(config(out=a, resume=True))) as store:
+        store.begin_run({})
         lost = EpisodeResult(plan(store.cases)[5].key, "infra_failed", error="it hung")
         store.record(lost, attempts=4)
     for order in ([a, b], [b, a]):
@@ -160,8 +161,8 @@ def test_a_policy_with_another_checkpoint_or_other_weights_is_named(
 ) -> None:
     folders = [tmp_path / name for name in ("x", "y")]
     for folder in folders:
-        with Store(config(out=folder)) as store:
-            store.begin_run(config(out=folder), {})
+        with Store(resolve(config(out=folder))) as store:
+            store.begin_run({})
             store.note_policy("policy", {"policy": "act", **said(folder.name)})
     with pytest.raises(ConfigError, match=told):
         merge(tmp_path / "out", folders)

@@ -17,6 +17,7 @@ from eval_fakes import LINE, wait_for
 from in_process_evaluation import play
 
 from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.trackers import TrackerFeed
 
 pytestmark = pytest.mark.torch
@@ -35,7 +36,7 @@ def told(config: Config) -> Callable[..., Results]:
         settings = config(track=[tracker], tracking={"project": "tests"}, **options)
         results = play(settings)
         for _ in range(2):
-            with TrackerFeed(settings) as tracking:
+            with TrackerFeed(resolve(settings)) as tracking:
                 tracking.update()
         return results
 

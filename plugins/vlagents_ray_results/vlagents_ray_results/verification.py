@@ -27,9 +27,8 @@ from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.recorder import NO_VERSION, Trajectory
-from vlagents_ray.evaluate.episode.episode import options_of_reset
-from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
-from vlagents_ray.evaluate.episode.records import Ending, Status
+from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, Status
 from vlagents_ray.evaluate.episode.second_pass import play_actions
 from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
@@ -529,11 +528,48 @@ class Replayed:
     described: Mapping[str, Any]  # by the environment here
 
 
-def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | None) -> float | None:
+class _Comparison(EpisodeObserver):
+    """Compares an episode with its recording, step by step."""
+
+    def __init__(self, recorded: Trajectory) -> None:
+        self.success: list[bool] = []  # after each step
+        # The largest difference of a number, by the step that differs; 0 is the reset.
+        self.differences: dict[int, float] = {}
+        self._recorded = recorded
+        self._obs: Obs | None = None  # the newest
+
+    def add_observation(self, obs: Obs) -> None:
+        """Compare the observation of the reset; that of a step waits for the step's outcome."""
+        if self._obs is None:
+            self._note(0, _difference(self._recorded, 0, obs, None))
+        self._obs = obs
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Compare a step: its observation and its outcome."""
+        self.success.append(success)
+        number = len(self.success)
+        if self._obs is not None:
+            outcome = (reward, success)
+            self._note(number, _difference(self._recorded, number, self._obs, outcome))
+
+    def _note(self, number: int, difference: float | None) -> None:
+        if difference is not None:
+            self.differences[number] = difference
+
+
+def _difference(
+    recorded: Trajectory, number: int, obs: Obs, outcome: tuple[float, bool] | None
+) -> float | None:
     """Return the largest difference of a step's numbers, or of those of the reset; None if they are
     equal to the bit.
 
     It is infinite if there are other numbers, and 0 if only the success differs.
+
+    Args:
+        recorded: The recording.
+        number: The number of steps so far; 0 for the reset.
+        obs: The observation after them.
+        outcome: Reward and success of the last step; None for the reset.
     """
     if obs.state.keys() != recorded.state.keys():
         return float("inf")
@@ -545,8 +581,8 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
         pairs.append((recorded.state[name][number], np.asarray(values, np.float32)))
     if recorded.gripper is not None:
         pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
-    if step is not None:
-        pairs.append((recorded.rewards[number - 1], np.asarray(step.reward, np.float64)))
+    if outcome is not None:
+        pairs.append((recorded.rewards[number - 1], np.asarray(outcome[0], np.float64)))
 
     differences = []
     for recorded_values, replayed_values in pairs:
@@ -557,7 +593,7 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
                 recorded_values, np.float64
             )
             differences.append(float(np.max(np.abs(change))))
-    if step is not None and bool(recorded.success[number - 1]) != step.success:
+    if outcome is not None and bool(recorded.success[number - 1]) != outcome[1]:
         differences.append(0.0)
     return max(differences, default=None)
 
@@ -599,45 +635,27 @@ def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) 
     with env_side("make"):
         env = make_batch(case.env, 1, **(case.settings.get("env_options") or {}))
     try:
-        with env_side("reset"):
-            begin = options_of_reset(env, key.episode, case.settings.get("reset_options"))
-
-        success: list[bool] = []
-        instructions: list[str] = []
-        differences: dict[int, float] = {}
-        last: EnvStep | None = None
-        played = play_actions(env, key.seed, begin, trajectory.actions, images=False)
-        for number, (obs, step) in enumerate(played):
-            difference = _difference(trajectory, number, obs, step)
-            if difference is not None:
-                differences[number] = difference
-            last = step
-            if step is not None:
-                success.append(step.success)
-
-            with env_side("step"):
-                [instruction] = env.instructions
-            is_over = number == len(trajectory.actions)
-            if not instructions or (
-                env.several_tasks and not is_over and instruction != instructions[-1]
-            ):
-                instructions.append(instruction)
-
-        ending = _ending(last, len(success), env.max_steps)
+        comparison = _Comparison(trajectory)
+        result = play_actions(
+            env,
+            key,
+            list(trajectory.actions),
+            comparison,
+            reset_options=case.settings.get("reset_options"),
+            images="none",
+        )
         with env_side("describe"):
-            return Replayed(success, ending, "; ".join(instructions), differences, env.describe())
+            described = env.describe()
+        return Replayed(
+            comparison.success,
+            result.ending,
+            result.instruction,
+            comparison.differences,
+            described,
+        )
     finally:
         with env_side("close"):
             env.close()
-
-
-def _ending(last: EnvStep | None, steps: int, limit: int) -> Ending:
-    """Return how an episode ended whose last step is `last`, as the episode's loop does."""
-    if last is not None and last.terminated:
-        return "terminated"
-    if steps >= limit or (last is not None and last.truncated):
-        return "truncated"
-    return "policy_done"
 
 
 def _is_plain(value: object) -> bool:

@@ -143,7 +143,7 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
     monkeypatch.setattr(VideoRecorder, "add_observation", fail)
     monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
     monkeypatch.setattr(PlayedEpisode, "add_observation", fail)
-    with closing(Recording(config(video="none", record="none"), 10.0)) as recording:
+    with closing(Recording("none", "none", 10.0)) as recording:
         recording.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
         recording.add_action(np.zeros(1, np.float32), 0.0, False)
         assert recording.wants_images == "none"

@@ -21,6 +21,7 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, S
 from vlagents_ray.evaluate import EvalConfig, evaluate, run
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.storage import policy_code, save_diffs, storing, whole
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.ray_tools.git_state import GitState
 
@@ -156,7 +157,7 @@ def test_a_folder_that_is_a_file_is_one_sentence(config: Config, tmp_path: Path)
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(StorageFailed, match="choose another folder"):
-            Store(config(out=out))
+            Store(resolve(config(out=out)))
 
 
 def test_a_file_system_without_locks_is_named(
@@ -167,7 +168,7 @@ def test_a_file_system_without_locks_is_named(
 
     monkeypatch.setattr("fcntl.flock", no_locks)
     with pytest.raises(ConfigError, match=r"its file system knows no locks .*--out .*-o flock"):
-        Store(config())
+        Store(resolve(config()))
 
 
 def one_sentence(done: subprocess.CompletedProcess[str]) -> str:

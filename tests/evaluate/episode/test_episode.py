@@ -19,6 +19,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     UnknownSession,
 )
+from vlagents_ray.evaluate.episode.episode import Images
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 
@@ -349,9 +350,13 @@ def test_a_number_that_is_a_bool_is_one(success: Any) -> None:
 
 @pytest.mark.parametrize(
     ("images", "looked_at"),
-    [(True, [True] * 6), (False, [False, False, True, False, False, False])],
+    [
+        ("all", [True] * 6),
+        ("requested", [False, False, True, False, False, False]),
+        ("none", [False] * 6),
+    ],
 )
-def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list[bool]) -> None:
+def test_images_may_be_left_out_where_nobody_looks(images: Images, looked_at: list[bool]) -> None:
     told: list[bool] = []
 
     class Sparing(Stated):

@@ -17,7 +17,7 @@ from in_process_replicas import Replicas
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, VLAgentsError
-from vlagents_ray.evaluate.episode.episode import run_episodes
+from vlagents_ray.evaluate.episode.episode import Images, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -56,7 +56,7 @@ def together(
     agent: Agent,
     wanted: Sequence[EpisodeKey],
     *,
-    images: bool = True,
+    images: Images = "all",
     **settings: Any,
 ) -> Any:
     sessions = [copy.deepcopy(agent) for _ in wanted]

@@ -12,6 +12,7 @@ from eval_fakes import Line
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs
 
 STEPS = 4
@@ -63,7 +64,8 @@ def once(env: EvalEnv, left_out: int | None = None) -> PlayedEpisode:
 
 def again(played: PlayedEpisode, env: EvalEnv) -> tuple[str | None, list[Obs]]:
     shown: list[Obs] = []
-    return played.play_again(SequentialBatch([env]), 3, None, lambda *_: None, shown.append), shown
+    key, batch = EpisodeKey("line", 0, 3, "0"), SequentialBatch([env])
+    return played.play_again(batch, key, None, lambda *_: None, shown.append), shown
 
 
 def test_the_same_episode_is_shown_wholly() -> None:

@@ -22,6 +22,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report import results_document, terminal
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress, LiveProgress, Progress
@@ -49,9 +50,9 @@ class Played:
     def __init__(self, out: Path, document: ProgressDocument, **changes: Any) -> None:
         self.config = runs(out, episodes=4, **changes)
         self.document = document
-        self.store = Store(self.config)
+        self.store = Store(resolve(self.config))
         self.jobs = plan(self.store.cases)
-        self.store.begin_run(self.config, {})
+        self.store.begin_run({})
         document.begin(self.store.cases, {}, len(self.jobs))
 
     def play(self, job: Job, solved: bool | None, status: Status = "done") -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report import success
 from vlagents_ray.evaluate.report.charts import (
     MINUS,
@@ -237,8 +238,8 @@ def test_the_headline_of_two_policies_is_their_difference(
 
 def test_a_run_without_an_episode_has_a_page(tmp_path: Path) -> None:
     config = runs(tmp_path)
-    with Store(config) as store:
-        store.begin_run(config, {"vlagents-ray": "0"})
+    with Store(resolve(config)) as store:
+        store.begin_run({"vlagents-ray": "0"})
         store.end_run("interrupted")
     page = page_of(Results.load(tmp_path))
     assert "Not complete: interrupted" in page.words
@@ -281,7 +282,7 @@ def test_solved_episodes_have_players_too(tmp_path: Path) -> None:
 def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     record(runs(tmp_path, episodes=6), lambda _case, _seed: 9)
     fewer = runs(tmp_path, episodes=4, resume=True, accept_changes=True)
-    with Store(fewer):
+    with Store(resolve(fewer)):
         page = page_of(Results.load(tmp_path))
     assert page.text.count("(solved)") == 3 * 3 * 2  # contenders, tasks, episodes
     assert "In brackets: beyond the point" in page.words

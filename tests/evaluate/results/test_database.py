@@ -20,6 +20,7 @@ from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
 
@@ -36,10 +37,11 @@ from pathlib import Path
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 config = EvalConfig.model_validate_json(sys.argv[1])
-store = Store(config)
-store.begin_run(config, {})
+store = Store(resolve(config))
+store.begin_run({})
 store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True), 1)
 os._exit(9)
 """
@@ -52,8 +54,8 @@ def commits_reach_the_disk() -> None:
 
 def begun(config: EvalConfig) -> Store:
     """A store with an episode in it."""
-    store = Store(config)
-    store.begin_run(config, {})
+    store = Store(resolve(config))
+    store.begin_run({})
     store.record(EpisodeResult(plan(plan_cases(config))[0].key, "done", True, True), 1)
     return store
 
@@ -101,8 +103,8 @@ def test_what_a_killed_evaluation_left_is_read_and_only_the_run_that_holds_the_l
         return [run.state for run in Results.load(config().out).runs]
 
     assert states() == ["killed"]
-    with Store(config(resume=True)) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config(resume=True))) as store:
+        store.begin_run({})
         assert states() == ["killed", "running"]
         store.end_run("complete")
     assert states() == ["killed", "complete"]
@@ -124,7 +126,7 @@ def test_readers_that_look_at_the_lock_stop_no_evaluation(config: Config) -> Non
     assert looked.wait(10)
     try:
         for _ in range(20):
-            Store(config(resume=True)).close()
+            Store(resolve(config(resume=True))).close()
     finally:
         over.set()
         for reader in readers:
@@ -166,7 +168,7 @@ def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
         before = list(db.iterdump())
     opened: list[Callable[[], object]] = [
         lambda: Results.load(config().out),
-        lambda: Store(config(resume=True)),
+        lambda: Store(resolve(config(resume=True))),
     ]
     for read in opened:
         with pytest.raises(

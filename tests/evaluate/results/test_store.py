@@ -14,6 +14,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -37,8 +38,8 @@ def done(key: EpisodeKey, success: bool = True) -> EpisodeResult:
 
 def test_recorded_episodes_are_finished_and_lost_ones_are_not(config: Config) -> None:
     keys = [job.key for job in planned(config())]
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record(done(keys[0]), attempts=1)
         store.record(EpisodeResult(keys[1], "policy_error", False, False, error="NaN"), attempts=1)
         store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), attempts=4)
@@ -47,8 +48,8 @@ def test_recorded_episodes_are_finished_and_lost_ones_are_not(config: Config) ->
 
 def test_an_episode_is_recorded_once(config: Config) -> None:
     key = planned(config())[0].key
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record(done(key), attempts=1)
         with pytest.raises(sqlite3.IntegrityError):
             store.record(done(key, success=False), attempts=1)
@@ -57,8 +58,8 @@ def test_an_episode_is_recorded_once(config: Config) -> None:
 
 def test_a_lost_episode_gives_way_to_its_repetition(config: Config) -> None:
     key = planned(config())[0].key
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record(EpisodeResult(key, "infra_failed", error="hung"), attempts=4)
         assert [one.success_once for one in recorded(config())] == [None]
         store.record(done(key), attempts=1)
@@ -67,8 +68,8 @@ def test_a_lost_episode_gives_way_to_its_repetition(config: Config) -> None:
 
 def test_every_failed_attempt_is_kept_with_its_error(config: Config) -> None:
     job = planned(config())[0]
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record_attempt(job, FAILURE, retried=True)
         store.record_attempt(job.again(), FAILURE, retried=False)
         [case] = Results.load(config().out).cases
@@ -79,25 +80,25 @@ def test_every_failed_attempt_is_kept_with_its_error(config: Config) -> None:
 
 
 def test_results_are_not_touched_without_resume(config: Config) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record(done(planned(config())[0].key), attempts=1)
     with pytest.raises(ConfigError, match=r"already has results \(1 episodes\).*--resume"):
-        Store(config())
-    with Store(config(resume=True)) as store:
+        Store(resolve(config()))
+    with Store(resolve(config(resume=True))) as store:
         assert len(store.finished()) == 1
 
 
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun: bool) -> None:
-    with Store(config()) as store:
+    with Store(resolve(config())) as store:
         if begun:  # and ended by a wrong setting
-            store.begin_run(config(), {})
+            store.begin_run({})
             store.record_attempt(
                 planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False
             )
-    with Store(config(seed=5)) as store:
-        store.begin_run(config(seed=5), {})
+    with Store(resolve(config(seed=5))) as store:
+        store.begin_run({})
         found = Results.load(config().out)
     assert [run.config["suites"][0]["seeds"] for run in found.runs] == [[5]]
     assert [(case.case_id, case.attempts) for case in found.cases] == [
@@ -116,10 +117,10 @@ def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun
 def test_results_of_other_settings_are_not_resumed(
     config: Config, change: dict[str, object], differing: str
 ) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
     with pytest.raises(ConfigError, match=f"{differing}: the results have .*, now it is"):
-        Store(config(resume=True, **change))
+        Store(resolve(config(resume=True, **change)))
 
 
 @pytest.mark.parametrize(
@@ -135,15 +136,15 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
     config: Config, changes: dict[str, object], told: str
 ) -> None:
     planned_first = {"envs": [LINE, OTHER_LINE], "seeds": [0, 100]}
-    with Store(config(**planned_first)) as store:
-        store.begin_run(config(**planned_first), {})
+    with Store(resolve(config(**planned_first))) as store:
+        store.begin_run({})
         for job in plan(store.cases):
             store.record(done(job.key), attempts=1)
     with pytest.raises(ConfigError, match=f"plan: .*{told}"):
-        Store(config(**planned_first | changes, resume=True))
+        Store(resolve(config(**planned_first | changes, resume=True)))
     accepted = config(**planned_first | changes, resume=True, accept_changes=True)
-    with Store(accepted) as store:
-        store.begin_run(accepted, {})
+    with Store(resolve(accepted)) as store:
+        store.begin_run({})
         found = Results.load(accepted.out)
     assert {change.subject for change in found.accepted_changes} == {"plan"}
 
@@ -151,11 +152,11 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
 def test_resuming_a_folder_without_results_says_so(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
-    Store(config(resume=True)).close()
+    Store(resolve(config(resume=True))).close()
     assert "has no results to resume" in caplog.text
     assert "did you mean" not in caplog.text
     mistyped = config(resume=True).out.with_name("ouut")
-    Store(config(resume=True, out=mistyped)).close()
+    Store(resolve(config(resume=True, out=mistyped))).close()
     assert "did you mean 'out'?" in caplog.text
 
 
@@ -164,9 +165,9 @@ def test_resuming_a_folder_without_results_says_so(
     [{"episodes": 50}, {"seeds": [0, 100]}, {"video": "all"}, {"envs": [LINE, OTHER_LINE]}],
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
-    Store(config(resume=True, **change)).close()
+    with Store(resolve(config())) as store:
+        store.begin_run({})
+    Store(resolve(config(resume=True, **change))).close()
     known = {case.case_id for case in Results.load(config().out).cases}
     assert known >= {
         case.fingerprint for one in (config(), config(**change)) for case in plan_cases(one)
@@ -174,14 +175,17 @@ def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) 
 
 
 def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:
-    with Store(config()), pytest.raises(ConfigError, match="another evaluation is writing there"):
-        Store(config(resume=True))
-    Store(config()).close()
+    with (
+        Store(resolve(config())),
+        pytest.raises(ConfigError, match="another evaluation is writing there"),
+    ):
+        Store(resolve(config(resume=True)))
+    Store(resolve(config())).close()
 
 
 def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 3})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
         with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
@@ -193,8 +197,8 @@ def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
 
 def test_where_workers_ran_is_kept(config: Config) -> None:
     near = WorkerInfo("gpu1", "ab12", 7, "pi0", "shm", "llvmpipe")
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.note_worker(near)
         store.note_worker(replace(near, host="cpu1", transport="handle", renderer=None))
     found = Results.load(config().out).workers
@@ -208,21 +212,21 @@ def test_where_workers_ran_is_kept(config: Config) -> None:
 
 
 def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
-    Store(config()).close()
+    Store(resolve(config())).close()
     with closing(sqlite3.connect(config().out / "results.db")) as db:
         db.execute("PRAGMA user_version = 99")
     with pytest.raises(ConfigError, match="got version 99"):
-        Store(config(resume=True))
+        Store(resolve(config(resume=True)))
 
 
 def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None:
     [case] = plan_cases(config())
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.note_env(case.place, EnvInfo({"simulator": "line", "version": 1}, {}))
         store.note_env(case.place, EnvInfo({"simulator": "line", "version": 1, "node": "b"}, {}))
         store.record(done(planned(config())[0].key), attempts=1)
-    with Store(config(resume=True)) as store:
+    with Store(resolve(config(resume=True))) as store:
         assert store.cases == [case]
         with pytest.raises(
             ConfigError, match=r"its description 'version' was 1, is 2\n.*--accept-changes"
@@ -234,14 +238,14 @@ def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None
 
 
 def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         for job in planned(config())[::2]:  # those that happened to come back first
             store.record(done(job.key), attempts=1)
     with pytest.raises(ConfigError, match=r"plan: .*episodes was 6, is 3"):
-        Store(config(episodes=3, resume=True))
-    with Store(config(episodes=3, resume=True, accept_changes=True)) as store:
-        store.begin_run(config(episodes=3), {})
+        Store(resolve(config(episodes=3, resume=True)))
+    with Store(resolve(config(episodes=3, resume=True, accept_changes=True))) as store:
+        store.begin_run({})
         [case] = Results.load(config().out).cases
         assert [(one.result.key.episode, one.counts) for one in case.episodes] == [
             (0, True),
@@ -250,7 +254,7 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
         ]
         [group] = summarize(Results.load(config().out)).cases
         assert (group.episodes, group.planned) == (2, 3)
-    with Store(config(resume=True)):
+    with Store(resolve(config(resume=True))):
         assert [one.counts for one in Results.load(config().out).cases[0].episodes] == [True] * 3
 
 
@@ -273,12 +277,12 @@ def test_an_episode_of_another_checkpoint_or_of_other_weights_is_not_added(
     config: Config, known: dict[str, str], other: dict[str, str], said: str
 ) -> None:
     first, second, third = (job.key for job in planned(config())[:3])
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.record(replace(done(first), **known), attempts=1)
         store.record(replace(done(second), **known), attempts=1)
-    with Store(config(resume=True)) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config(resume=True))) as store:
+        store.begin_run({})
         with pytest.raises(ConfigError, match=said):
             store.record(replace(done(third), **other), attempts=1)
         store.record(done(third), attempts=1)  # of a server that does not tell
@@ -291,21 +295,21 @@ def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
     first, second = (job.key for job in planned(settings))
     other = replace(done(second), checkpoint="runs/last", weights="b")
     for again in (settings, settings.model_copy(update={"resume": True})):
-        with Store(again) as store:
-            store.begin_run(again, {})
+        with Store(resolve(again)) as store:
+            store.begin_run({})
             if not store.finished():
                 store.record(replace(done(first), checkpoint="runs/last", weights="a"), attempts=1)
             with pytest.raises(ConfigError, match=r"runs/last was a, is b"):
                 store.record(other, attempts=1)
-    with Store(again) as store:
-        store.begin_run(again, {})
+    with Store(resolve(again)) as store:
+        store.begin_run({})
         store.record(replace(other, checkpoint="runs/other"), attempts=1)  # chosen by its task
 
 
 def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config: Config) -> None:
     said = {"policy": "act", "checkpoint": "a"}
-    with Store(config()) as store:
-        store.begin_run(config(), {})
+    with Store(resolve(config())) as store:
+        store.begin_run({})
         store.note_policy("policy", said)  # of a server that tells no weights
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": None}})
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": "c0ffee"}})

@@ -16,6 +16,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
@@ -32,8 +33,8 @@ def summary(config: Config) -> Summary:
     )
     jobs = plan(plan_cases(settings))
     keys = [job.key for job in jobs]
-    with Store(settings) as store:
-        store.begin_run(settings, versions())
+    with Store(resolve(settings)) as store:
+        store.begin_run(versions())
         store.note_env(jobs[0].case.place, EnvInfo({"simulator": "line"}, {}))
         store.note_policy("act", {"policy": "act", "checkpoint": "a"})
         store.record(
@@ -135,8 +136,8 @@ def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summ
 
 def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     settings = config(envs=[LINE], episodes=2, policy="act", policy_url="http://localhost:1")
-    with Store(settings) as store:
-        store.begin_run(settings, versions())
+    with Store(resolve(settings)) as store:
+        store.begin_run(versions())
         for job in plan(store.cases):
             done = EpisodeResult(
                 job.key,
@@ -163,8 +164,8 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
 
 def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
     """The summary of an evaluation whose suites had these outcomes."""
-    with Store(settings) as store:
-        store.begin_run(settings, versions())
+    with Store(resolve(settings)) as store:
+        store.begin_run(versions())
         for job in plan(store.cases):
             if job.key.episode < len(outcomes[job.case.suite.name]):
                 success = outcomes[job.case.suite.name][job.key.episode]
@@ -255,8 +256,8 @@ def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     alike = recorded(settings.model_copy(update={"out": tmp_path / "alike"}), {"": [True] * 12})
     assert {case.stopped_at for case in alike.results.cases} != {None}
     assert alike.totals[0].success_once.rate == 1.0
-    with Store(settings) as store:
-        store.begin_run(settings, {})
+    with Store(resolve(settings)) as store:
+        store.begin_run({})
         for job in plan(store.cases):  # one task is solved at once, the other every second time
             success = job.case.env == LINE or bool(job.key.episode % 2)
             if job.case.env == OTHER_LINE or job.key.episode < 12:
@@ -306,8 +307,8 @@ def test_pushed_weights_are_named_with_the_checkpoint(
     config: Config, versions: list[tuple[int | None, int | None]], says: str | None
 ) -> None:
     settings = config(envs=[LINE], episodes=2, policy="act")
-    with Store(settings) as store:
-        store.begin_run(settings, {})
+    with Store(resolve(settings)) as store:
+        store.begin_run({})
         for job, (first, last) in zip(plan(plan_cases(settings)), versions, strict=True):
             done = EpisodeResult(
                 job.key, "done", True, True, first_policy_version=first, policy_version=last

@@ -13,7 +13,7 @@ from robot_trials import plan
 
 from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.robot import Trial, plan_robot_cases, schedule
+from vlagents_ray.evaluate.robot import Trial, require_trials, schedule
 
 keys = st.binary(min_size=8, max_size=40)
 TASKS = ("cups", "drawer")
@@ -149,17 +149,17 @@ def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> 
     with pytest.raises(UnknownEnv, match="none of the plan's"):
         plan_cases(plan(tmp_path, suite={"envs": ["kettle"]}))
     with pytest.raises(ConfigError, match="got no robot"):
-        plan_robot_cases(plan(tmp_path, robot={"arm": None}))
+        require_trials(plan(tmp_path, robot={"arm": None}))
     pushed = [
         {"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}
     ]
     with pytest.raises(ConfigError, match="want checkpoints"):
-        plan_robot_cases(plan(tmp_path, policies=pushed))
+        require_trials(plan(tmp_path, policies=pushed))
 
 
 def test_what_would_show_rates_before_the_end_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"track.*before the end"):
-        plan_robot_cases(plan(tmp_path, track=["wandb"]))
+        require_trials(plan(tmp_path, track=["wandb"]))
 
 
 def test_results_of_the_robot_are_not_those_of_its_simulation(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.workers import pool
 from vlagents_ray.evaluate.workers.base import WorkerHandle
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
@@ -56,7 +57,7 @@ def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(
         while started.kinds():
             assert list(started.wait(1)) == []
 
-    with WorkerPool(settings, ToZero) as started:
+    with WorkerPool(resolve(settings), ToZero) as started:
         lose(5)
         lose(5)
         with pytest.raises(EnvFailed, match="workers do not start, 3 in a row"):
@@ -72,7 +73,7 @@ def test_workers_play_on_while_there_is_no_room_for_all(
     # Nobody asks how it gets on.
     playing = worker(settings, jobs=(job,), heartbeat_at=math.inf, queried_at=math.inf)
     reports: list[tuple[Job, Report]] = []
-    with WorkerPool(settings, ToZero) as short:
+    with WorkerPool(resolve(settings), ToZero) as short:
         short._workers = [waiting, playing]
         wait_for(
             lambda: (
@@ -95,7 +96,7 @@ def test_a_host_that_does_not_answer_is_waited_for_once(
 
     monkeypatch.setattr(pool, "tail_at", silent)
     failure = Failure("worker", EnvFailed.code, "the worker died")
-    with WorkerPool(config(), ToZero) as watched:
+    with WorkerPool(resolve(config()), ToZero) as watched:
         for host in ("host1", "host1", "host2"):
             process = {"host": host, "logs": ["/log"]}
             assert watched._with_log(failure, worker(config(), process=process)) == failure
@@ -111,7 +112,7 @@ def test_no_log_is_looked_for_once_the_head_is_gone_too(
     monkeypatch.setattr(pool, "tail_at", lambda *_: pytest.fail("asked a cluster that is gone"))
     monkeypatch.setattr(pool, "head_is_gone", lambda: True)
     failure = Failure("worker", EnvFailed.code, "the worker died")
-    with WorkerPool(config(), ToZero) as watched:
+    with WorkerPool(resolve(config()), ToZero) as watched:
         assert (
             watched._with_log(
                 failure, worker(config(), process={"host": "host1", "logs": ["/log"]})
@@ -152,7 +153,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def capacity(config: Config, clock: Clock) -> CapacityMonitor:
-    return CapacityMonitor(config(workers=3, place_timeout_s=100), clock)
+    return CapacityMonitor(3, 100.0, clock)
 
 
 def test_a_worker_may_wait_for_as_long_as_the_settings_say(
@@ -193,7 +194,7 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
 def test_reports_that_have_come_are_taken_in_one_turn(config: Config) -> None:
     settings = config(workers=2)
     jobs = plan(plan_cases(settings))
-    with WorkerPool(settings, lambda _: ToZero()) as pool:
+    with WorkerPool(resolve(settings), lambda _: ToZero()) as pool:
         for job in jobs[:2]:
             pool.start(job.case)
         wait_for(lambda: not list(pool.wait(0.1)) and len(pool.idle()) == 2)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, SPARING_LINE, Line, SparingLine, ToZero
-from in_process_evaluation import flat_config
+from in_process_evaluation import flat_config, rollout_by
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -38,7 +38,7 @@ def job(seed: int = 0, env: str = LINE, **settings: Any) -> Job:
 
 
 def rollout_of(config: Config, make: Callable[[], Agent], **changes: Any) -> Rollout:
-    return Rollout(config(**changes), lambda _policy: make())
+    return rollout_by(config(**changes), lambda _policy: make())
 
 
 def played(worker: Rollout, job: Job) -> Report:
@@ -73,7 +73,7 @@ def test_after_a_lost_connection_the_next_attempt_has_a_new_agent(
         )
         return agents[-1]
 
-    worker = Rollout(config(), connect)
+    worker = rollout_by(config(), connect)
     failure = played(worker, job(3)).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("policy", "connection_lost")

@@ -23,7 +23,7 @@ from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
+from vlagents_ray.evaluate.plan.config import EpisodeChoice
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import distinct, plain
@@ -288,16 +288,22 @@ class EpisodeRecorder(EpisodeObserver):
         """Free the recorder's resources."""
 
 
-# Called with the settings and with the env's control_hz.
-RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]
+RecorderFactory = Callable[[float | None], EpisodeRecorder]  # called with the env's control_hz
 
 
 class Recording(EpisodeRecorder):
-    """Records one episode by the settings `video` and `record`."""
+    """Records a video and a trajectory of one episode, if it is among the chosen ones."""
 
-    def __init__(self, config: EvalConfig, fps: float | None) -> None:
-        self._wants_video = config.video
-        self._wants_trajectory = config.record
+    def __init__(self, video: EpisodeChoice, trajectory: EpisodeChoice, fps: float | None) -> None:
+        """Begin to record.
+
+        Args:
+            video: The episodes of which there are videos.
+            trajectory: The episodes of which there are trajectories.
+            fps: The frames per second of the videos; None: `DEFAULT_FPS`.
+        """
+        self._wants_video = video
+        self._wants_trajectory = trajectory
         self._video = VideoRecorder(fps)
         self._trajectory = TrajectoryRecorder()
         self._played = PlayedEpisode()

@@ -176,6 +176,9 @@ class Diverged:
 
 
 Outcome = EpisodeResult | VLAgentsError | Diverged
+# The observations whose images are used: all; those for which an action is requested; or none, as
+# the agent repeats recorded actions.
+Images = Literal["all", "requested", "none"]
 # Called with the phase that begins and the number of steps so far.
 Watch = Callable[[Phase, int], None]
 
@@ -194,7 +197,7 @@ def run_episodes(
     policy_options: Mapping[str, Any] | None = None,
     observers: Sequence[EpisodeObserver] = (),
     watch: Watch = lambda _phase, _steps: None,
-    images: bool = True,
+    images: Images = "all",
 ) -> list[Outcome]:
     """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
 
@@ -214,8 +217,7 @@ def run_episodes(
         policy_options: The options of each reset of the policy.
         observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
-        images: Whether the observers need the images of every step. If not, the environments may
-            leave out those between two requests to the policy, and after the last step.
+        images: The observations whose images are used; the environments may leave out others.
 
     Returns:
         An outcome for each key. A policy error ends only its own episode, with status
@@ -244,7 +246,9 @@ def run_episodes(
         observations = []
         instructions = []
         for obs, text in zip(returned, env.instructions, strict=True):
-            observations.append(failures.checked_obs(obs, contract, "reset"))
+            observations.append(
+                failures.checked_obs(obs, contract, "reset", images=images != "none")
+            )
             instructions.append(failures.checked_instruction(text, "reset"))
     reset_ms = 1e3 * (perf_counter() - start)
 
@@ -277,8 +281,8 @@ def run_episodes(
 
         watch("env step", steps)
         some_request_next = any(len(episode.ticks) == 1 for episode in playing)
-        is_last_step = steps + 1 >= env.max_steps
-        env.looked_at = images or (some_request_next and not is_last_step)
+        is_requested = some_request_next and steps + 1 < env.max_steps
+        env.looked_at = images == "all" or (images == "requested" and is_requested)
         _step(env, episodes, playing, contract)
         steps += 1
         playing = _unfinished(playing)

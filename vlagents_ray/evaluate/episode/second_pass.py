@@ -5,51 +5,90 @@ left out.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.envs.base import BatchEnv, Options
-from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import Watch
-from vlagents_ray.evaluate.episode.failures import EnvStep, checked_obs, checked_step, env_side
-from vlagents_ray.evaluate.episode.records import EpisodeObserver
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.base import BatchEnv
+from vlagents_ray.errors import EnvFailed, VLAgentsError
+from vlagents_ray.evaluate.episode.episode import Diverged, Images, Watch, run_episodes
+from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import Act, Agent, Obs
+
+
+class RecordedActions(Agent):
+    """Acts as in an earlier episode, whatever it observes."""
+
+    def __init__(self, actions: Sequence[np.ndarray]) -> None:
+        """Begin with the first action.
+
+        Args:
+            actions: The actions of the episode, (D,) each; at least one.
+        """
+        self._actions = actions
+        self._acts = 0
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Continue with the next action: a further task of an episode resets its policy."""
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        """Return the next action."""
+        action = self._actions[self._acts]
+        self._acts += 1
+        return Act(action, done=self._acts == len(self._actions))
 
 
 def play_actions(
     env: BatchEnv,
-    seed: int,
-    options: Options | None,
-    actions: Iterable[np.ndarray],
+    key: EpisodeKey,
+    actions: Sequence[np.ndarray],
+    observer: EpisodeObserver,
     *,
-    images: bool,
+    reset_options: Mapping[str, Any] | None,
+    images: Images,
     watch: Watch = lambda _phase, _steps: None,
-) -> Iterator[tuple[Obs, EnvStep | None]]:
-    """Begin an episode in the first of these environments, and execute actions, each (D,).
+) -> EpisodeResult:
+    """Begin an episode again in the first of these environments, and execute its actions.
 
-    Yields:
-        The observation of the reset with None, then that of each step with all its outputs.
+    Args:
+        env: The environments.
+        key: The key of the episode.
+        actions: Its actions, (D,) each; at least one.
+        observer: Gets the observations and the outcome of each action.
+        reset_options: The options of each reset of its suite.
+        images: The observations whose images are used: "all" or "none".
+        watch: As for `run_episodes`.
+
+    Returns:
+        The result of the episode, in which all actions were executed.
 
     Raises:
-        EnvFailed: The simulator failed, or its episode ended earlier.
+        EnvFailed: The simulator failed or diverged, or its episode ended earlier.
     """
-    env.looked_at = images
-    watch("env reset", 0)
-    with env_side("reset"):
-        contract = env.contract
-        [first] = env.reset(seeds=[seed], options=[options])
-        obs = checked_obs(first, contract, "reset", images=images)
-    yield obs, None
-
-    for number, action in enumerate(actions):
-        watch("env step", number)
-        with env_side("step"):
-            [obs], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
-            step = checked_step(obs, reward, terminated, truncated, info, contract, images=images)
-        yield step.obs, step
+    agent = RecordedActions(actions)
+    [outcome] = run_episodes(
+        env,
+        agent,
+        [agent],
+        [key],
+        reset_options=reset_options,
+        observers=[observer],
+        watch=watch,
+        images=images,
+    )
+    if isinstance(outcome, Diverged):
+        raise outcome.error
+    if isinstance(outcome, VLAgentsError):
+        raise outcome
+    if outcome.status != "done":
+        raise EnvFailed(f"the actions cannot be executed again: {outcome.error}")
+    if outcome.steps != len(actions):
+        raise EnvFailed(f"the episode ended after {outcome.steps} of {len(actions)} actions")
+    return outcome
 
 
 class PlayedEpisode(EpisodeObserver):
@@ -80,8 +119,8 @@ class PlayedEpisode(EpisodeObserver):
     def play_again(
         self,
         env: BatchEnv,
-        seed: int,
-        options: Options | None,
+        key: EpisodeKey,
+        reset_options: Mapping[str, Any] | None,
         watch: Watch,
         record: Callable[[Obs], None],
     ) -> str | None:
@@ -91,26 +130,67 @@ class PlayedEpisode(EpisodeObserver):
         State, gripper, reward and success of every step, and the images of the first pass, must be
         equal to the bit, so that the new images show this episode.
 
+        Args:
+            env: The environments.
+            key: The key of the episode.
+            reset_options: The options of each reset of its suite.
+            watch: As for `run_episodes`.
+            record: Called with each observation.
+
         Returns:
             The first difference, which ends the pass; None if there is none.
         """
-        played = play_actions(env, seed, options, self._actions, images=True, watch=watch)
+        comparison = _Comparison(self._observations, self._outcomes, record)
         try:
-            for number, (obs, step) in enumerate(played):
-                record(obs)
-                difference = self._observations[number].difference(_Digests.from_obs(obs))
-                if step is not None:
-                    outcome = (step.reward, step.success)
-                    if outcome != self._outcomes[number - 1]:
-                        difference = "reward or success"
-
-                if difference is not None:
-                    is_last = number == len(self._actions)
-                    steps = "the last step" if is_last else f"{number} steps"
-                    return f"after {steps}, {difference} differs"
-        except VLAgentsError as error:  # such as an earlier end of the episode
+            play_actions(
+                env,
+                key,
+                self._actions,
+                comparison,
+                reset_options=reset_options,
+                images="all",
+                watch=watch,
+            )
+        except (VLAgentsError, _DifferenceFound) as error:
             return str(error)
         return None
+
+
+class _DifferenceFound(Exception):
+    """Ends a second pass; the message is the first difference."""
+
+
+class _Comparison(EpisodeObserver):
+    """Compares an episode with its first pass, step by step."""
+
+    def __init__(
+        self,
+        observations: Sequence[_Digests],
+        outcomes: Sequence[tuple[float, bool]],
+        record: Callable[[Obs], None],
+    ) -> None:
+        self._observations = observations
+        self._outcomes = outcomes
+        self._record = record
+        self._steps = -1  # before the reset
+
+    def add_observation(self, obs: Obs) -> None:
+        """Record an observation; raise `_DifferenceFound` if it is not that of the first pass."""
+        self._steps += 1
+        self._record(obs)
+        difference = self._observations[self._steps].difference(_Digests.from_obs(obs))
+        if difference is not None:
+            self._report(difference)
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Raise `_DifferenceFound` if the outcome of an action is not that of the first pass."""
+        if (reward, success) != self._outcomes[self._steps - 1]:
+            self._report("reward or success")
+
+    def _report(self, difference: str) -> None:
+        is_last = self._steps == len(self._outcomes)
+        steps = "the last step" if is_last else f"{self._steps} steps"
+        raise _DifferenceFound(f"after {steps}, {difference} differs")
 
 
 # `play_again` with the environment.

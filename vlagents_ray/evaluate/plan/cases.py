@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -208,9 +208,9 @@ def _require_distinct(cases: list[EvalCase]) -> None:
         )
 
 
-def require_envs(config: EvalConfig) -> None:
+def require_envs(cases: Iterable[EvalCase]) -> None:
     """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env refuses."""
-    for case in plan_cases(config):
+    for case in cases:
         if case.robot is None:
             env_arguments(case.env, case.suite.env_options)
 

@@ -20,9 +20,10 @@ from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
-from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.results.changes import (
     MIX,
     Change,
@@ -52,25 +53,25 @@ log = logging.getLogger(__name__)
 class Store(AbstractContextManager["Store"]):
     """The results of one `out` folder, open for one evaluation at a time."""
 
-    def __init__(self, config: EvalConfig) -> None:
-        """Open or begin the results in `config.out`.
+    def __init__(self, plan: ResolvedPlan) -> None:
+        """Open or begin the results in `plan.out`.
 
         Raises:
-            ConfigError: There are results and `config.resume` is off, they have other settings or
-                another program and `config.accept_changes` is off, or another evaluation is writing
+            ConfigError: There are results and `plan.resume` is off, they have other settings or
+                another program and `plan.accept_changes` is off, or another evaluation is writing
                 to them.
             StorageFailed: The folder cannot be written to.
         """
-        self.cases = plan_cases(config)
+        self.cases = plan.cases
+        self.out = plan.out
+        self._plan = plan
         self._cases_by_id = {case.fingerprint: case for case in self.cases}
-        self._out = config.out
-        with storing(config.out):
-            self._out.mkdir(parents=True, exist_ok=True)
-            self._lock = lock(self._out)
+        with storing(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+            self._lock = lock(self.out)
 
         # The state of this run.
         self._run = 0
-        self._accepts = config.accept_changes
         self._changes: list[Change] = []  # those that were accepted
         self._accepted: set[Hashable] = set()  # policies, cases and places with accepted changes
         self._policy_programs: dict[str, str | None] = {}  # by policy
@@ -81,8 +82,8 @@ class Store(AbstractContextManager["Store"]):
         self._weights: dict[Hashable, str] = {}
 
         try:
-            with storing(config.out):
-                self._db = self._open(config)
+            with storing(self.out):
+                self._db = self._open()
         except BaseException:
             os.close(self._lock)
             raise
@@ -95,14 +96,12 @@ class Store(AbstractContextManager["Store"]):
         self._db.close()
         os.close(self._lock)
 
-    def begin_run(
-        self, config: EvalConfig, versions: dict[str, Any], started: float | None = None
-    ) -> None:
+    def begin_run(self, versions: dict[str, Any], started: float | None = None) -> None:
         """Record that a run over the plan begins, or began at `started`, s since 1970."""
         row = (
             time.time() if started is None else started,
             RUNNING,
-            config.model_dump_json(),
+            self._plan.settings.model_dump_json(),
             canonical(versions),
         )
         programs = [(canonical(case.program), case.fingerprint) for case in self.cases]
@@ -182,7 +181,7 @@ class Store(AbstractContextManager["Store"]):
         if result.checkpoint != known:
             raise ConfigError(
                 f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results "
-                f"in {self._out} are of {known!r}; serve that one again, or choose another out "
+                f"in {self.out} are of {known!r}; serve that one again, or choose another out "
                 "folder"
             )
 
@@ -227,9 +226,10 @@ class Store(AbstractContextManager["Store"]):
         """
         if not changes:
             return
-        if not self._accepts or subject in self._accepted:
-            cure = "all processes of a run need the same files" if self._accepts else cure
-            raise ConfigError(f"{where} {self._out}:\n{listed(changes)}\n{cure}")
+        accepts = self._plan.accept_changes
+        if not accepts or subject in self._accepted:
+            cure = "all processes of a run need the same files" if accepts else cure
+            raise ConfigError(f"{where} {self.out}:\n{listed(changes)}\n{cure}")
 
         self._accepted.add(subject)
         self._changes += [change for change in changes if change not in self._changes]
@@ -331,7 +331,7 @@ class Store(AbstractContextManager["Store"]):
             if field in ("policy", "checkpoint"):
                 raise ConfigError(
                     f"policy {name!r}: the server has {field} {metadata.get(field)!r}, the results "
-                    f"in {self._out} are of {known.get(field)!r}; serve that one again, or choose "
+                    f"in {self.out} are of {known.get(field)!r}; serve that one again, or choose "
                     "another out folder"
                 )
             changes = policy_changes(f"policy {name}", known, metadata, swept=swept)
@@ -344,16 +344,16 @@ class Store(AbstractContextManager["Store"]):
             value = json.dumps(metadata, default=str)
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
-    def _open(self, config: EvalConfig) -> sqlite3.Connection:
+    def _open(self) -> sqlite3.Connection:
         # By SQLite's default, each commit reaches the disk.
-        db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)
+        db = sqlite3.connect(self.out / FILE, timeout=WAIT_S)
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 create(db)
-            require_readable(self._out, db)
-            self._require_resumable(db, config)
+            require_readable(self.out, db)
+            self._require_resumable(db)
 
-            stop = _rule(config)
+            stop = self._stopping_rule()
             with db:
                 for case in self.cases:
                     row = {
@@ -380,7 +380,7 @@ class Store(AbstractContextManager["Store"]):
             raise
         return db
 
-    def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
+    def _require_resumable(self, db: sqlite3.Connection) -> None:
         """Require that the results in the folder, if any, may be continued by this plan.
 
         The remains of a plan that could not begin are deleted.
@@ -388,12 +388,12 @@ class Store(AbstractContextManager["Store"]):
         (runs,) = db.execute("SELECT COUNT(*) FROM runs").fetchone()
         (episodes,) = db.execute("SELECT COUNT(*) FROM episodes").fetchone()
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
-        if not runs and config.resume:
-            folders = {file.parent.name for file in self._out.parent.glob(f"*/{FILE}")}
+        if not runs and self._plan.resume:
+            folders = {file.parent.name for file in self.out.parent.glob(f"*/{FILE}")}
             log.warning(
                 "%s: has no results to resume (--resume), so that the evaluation begins there%s",
-                self._out,
-                did_you_mean(self._out.name, folders - {self._out.name}),
+                self.out,
+                did_you_mean(self.out.name, folders - {self.out.name}),
             )
 
         could_not_begin = not episodes and causes == {"user"}
@@ -403,9 +403,9 @@ class Store(AbstractContextManager["Store"]):
                     db.execute(f"DELETE FROM {table}")  # noqa: S608 - one of these names
             return
 
-        if not config.resume:
+        if not self._plan.resume:
             raise ConfigError(
-                f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
+                f"{self.out} already has results ({episodes} episodes): resume them (--resume), "
                 "or choose another out folder"
             )
 
@@ -415,13 +415,13 @@ class Store(AbstractContextManager["Store"]):
         if differences:
             listing = "\n".join(differences)
             raise ConfigError(
-                f"{self._out} has results of other settings:\n{listing}\n"
+                f"{self.out} has results of other settings:\n{listing}\n"
                 "take the old settings, or choose another out folder"
             )
 
         self._accept_or_raise(
             "plan",
-            self._other_plan(db, config),
+            self._other_plan(db),
             "this plan is not that of the results in",
             "plan all of it; give a new folder (--out); or go on with this plan and have the "
             "report say so (--accept-changes)",
@@ -429,6 +429,10 @@ class Store(AbstractContextManager["Store"]):
         self._accept_or_raise(
             "program", self._other_programs(db), "the environment is not that of the results in"
         )
+
+    def _stopping_rule(self) -> str | None:
+        """Return the rule of early stopping as the table of cases has it."""
+        return None if self._plan.stop is None else self._plan.stop.model_dump_json()
 
     def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
         """Return the changes of the environments' files since earlier runs."""
@@ -441,7 +445,7 @@ class Store(AbstractContextManager["Store"]):
                 changes |= dict.fromkeys(program_changes(f"env {case.env}", was, case.program))
         return list(changes)
 
-    def _other_plan(self, db: sqlite3.Connection, config: EvalConfig) -> list[Change]:
+    def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
         """Return the cases and episodes of the results that this plan lacks, and other rules of
         early stopping.
 
@@ -463,7 +467,7 @@ class Store(AbstractContextManager["Store"]):
                 name = " ".join(filter(None, (policy, suite, env)))
                 changes.append(Change("plan", name, "in it", None))
 
-        rule = _rule(config)
+        rule = self._stopping_rule()
         query = "SELECT planned, seeds, stop FROM cases WHERE case_id = ?"
         for case in self.cases:
             row = db.execute(query, (case.fingerprint,)).fetchone()
@@ -485,11 +489,6 @@ def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
             f"({result.policy_fingerprint}), want {pushed.version} ({pushed.fingerprint}); push "
             "nothing while a version is evaluated, and let the policy's `options` ask for no other"
         )
-
-
-def _rule(config: EvalConfig) -> str | None:
-    """Return the rule of early stopping as the table of cases has it."""
-    return config.stop.model_dump_json() if config.stop else None
 
 
 def _plan_changes(

@@ -16,7 +16,8 @@ from vlagents_ray.evaluate.robot.operator import (
 from vlagents_ray.evaluate.robot.run import (
     TrialsInterrupted,
     evaluate_on_robot,
-    plan_robot_cases,
+    play_trials,
+    require_trials,
     unblind,
 )
 from vlagents_ray.evaluate.robot.trial import Trial, schedule
@@ -30,7 +31,8 @@ __all__ = [
     "Verdict",
     "VisibleTrial",
     "evaluate_on_robot",
-    "plan_robot_cases",
+    "play_trials",
+    "require_trials",
     "schedule",
     "unblind",
 ]

@@ -26,14 +26,14 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, ContractMismatch, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.storage import driver_code, save_diffs, storing, versions
+from vlagents_ray.evaluate.driver import EarlyStopping
 from vlagents_ray.evaluate.episode.failures import Failure, explain
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
-from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.changes import changed
 from vlagents_ray.evaluate.results.database import FILE as RESULTS
-from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.robot.operator import (
@@ -86,40 +86,40 @@ class LoggedTrial:
 class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     """The log in one folder, open for one evaluation at a time."""
 
-    def __init__(self, config: EvalConfig, cases: Sequence[EvalCase]) -> None:
-        """Open or begin the log in `config.out`.
+    def __init__(self, plan: ResolvedPlan) -> None:
+        """Open or begin the log in `plan.out`.
 
         Raises:
-            ConfigError: There is a log and `config.resume` is off, or it has another plan or key;
+            ConfigError: There is a log and `plan.resume` is off, or it has another plan or key;
                 there are results of a simulation; or another evaluation writes to the folder.
             StorageFailed: The folder cannot be written to.
         """
-        self._path = config.out / LOG
+        self._path = plan.out / LOG
         self.attempts: list[LoggedTrial] = []
-        with storing(config.out):
-            config.out.mkdir(parents=True, exist_ok=True)
+        with storing(plan.out):
+            plan.out.mkdir(parents=True, exist_ok=True)
             resumed = self._path.exists() and self._path.stat().st_size > 0
-            if not resumed and (config.out / RESULTS).exists():
+            if not resumed and (plan.out / RESULTS).exists():
                 raise ConfigError(
-                    f"{config.out}: has results of another evaluation; choose another out folder"
+                    f"{plan.out}: has results of another evaluation; choose another out folder"
                 )
-            if resumed and not config.resume:
+            if resumed and not plan.resume:
                 raise ConfigError(
-                    f"{config.out}: already has trials; resume them (--resume), or choose another "
+                    f"{plan.out}: already has trials; resume them (--resume), or choose another "
                     "folder"
                 )
-            self.key = _key(config)
+            self.key = _key(plan)
 
         with contextlib.ExitStack() as files:
-            with storing(config.out):
+            with storing(plan.out):
                 self._log = files.enter_context(_JsonLines(self._path))
-                self._hidden = files.enter_context(_JsonLines(config.out / HIDDEN, mode=0o600))
+                self._hidden = files.enter_context(_JsonLines(plan.out / HIDDEN, mode=0o600))
             self._log.lock()
 
-            plan = []
-            for case in cases:
-                plan.append([case.fingerprint, *case.name, case.planned, case.suite.seeds])
-            self._read(config, _hash(self.key, canonical(plan).encode()))
+            cases = []
+            for case in plan.cases:
+                cases.append([case.fingerprint, *case.name, case.planned, case.suite.seeds])
+            self._read(plan, _hash(self.key, canonical(cases).encode()))
             self._files = files.pop_all()
 
     def __exit__(self, *exc: object) -> None:
@@ -150,14 +150,14 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         """Record that the results were written before all trials were played."""
         self._write({"unblinded": time.time()})
 
-    def _read(self, config: EvalConfig, identity: str) -> None:
-        """Read the attempts, or begin the log; `identity` is the hash of the plan."""
+    def _read(self, plan: ResolvedPlan, identity: str) -> None:
+        """Read the attempts, or begin the log; `identity` is the hash of the plan's cases."""
         lines = [json.loads(line) for line in self._log.read()]
         hidden_lines = _by_hash(self.key, self._hidden.read())
         if not lines:
             self.started = time.time()
-            plan = {"config": json.loads(config.model_dump_json(exclude_unset=True))}
-            self._write({"plan": identity, "at": self.started}, plan)
+            settings = json.loads(plan.settings.model_dump_json(exclude_unset=True))
+            self._write({"plan": identity, "at": self.started}, {"config": settings})
             return
 
         if not hmac.compare_digest(lines[0]["plan"], identity):
@@ -273,12 +273,13 @@ def _by_hash(key: bytes, lines: Iterable[bytes]) -> dict[str, bytes]:
     return {_hash(key, line): line for line in lines}
 
 
-def _key(config: EvalConfig) -> bytes:
+def _key(plan: ResolvedPlan) -> bytes:
     """Return the plan's key, or the one drawn for this folder."""
-    if config.real_robot is not None and config.real_robot.key is not None:
-        return config.real_robot.key.encode()
+    robot, _ = plan.cases[0].on_robot
+    if robot.key is not None:
+        return robot.key.encode()
 
-    path = config.out / KEY
+    path = plan.out / KEY
     if not path.exists() or not path.stat().st_size:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(descriptor, "w") as file:
@@ -331,28 +332,39 @@ def evaluate_on_robot(
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
         VLAgentsError: A policy cannot be reached, or fails, before the first trial.
     """
-    planned = plan_robot_cases(config)
-    if config.record != "none":
+    require_trials(config)
+    return play_trials(resolve(config), operator, robot=robot, agent_factory=agent_factory)
+
+
+def play_trials(
+    plan: ResolvedPlan,
+    operator: Operator,
+    *,
+    robot: Robot | None = None,
+    agent_factory: AgentFactory | None = None,
+) -> Summary:
+    """Evaluate as `evaluate_on_robot` does, by a plan that is already resolved."""
+    if plan.record != "none":
         for module in ("av", "pyarrow"):
             require(module)
 
-    factory = agent_factory or agents(config, None, "robot")
+    factory = agent_factory or agents(plan, None, "robot")
     with contextlib.ExitStack() as stack:
         if robot is None:
-            settings, _ = planned[0].on_robot
+            settings, _ = plan.cases[0].on_robot
             robot = stack.enter_context(opened(robot_factory("--robot", str(settings.arm))))
-        log = stack.enter_context(TrialLog(config, planned))
-        trials = schedule(planned, log.key)
-        run = _RemainingTrials(config, operator, WatchedRobot(robot), factory, log, trials)
+        log = stack.enter_context(TrialLog(plan))
+        trials = schedule(plan.cases, log.key)
+        run = _RemainingTrials(plan, operator, WatchedRobot(robot), factory, log, trials)
         try:
             with _quiet():
                 run.play()
         except KeyboardInterrupt:
             raise TrialsInterrupted(
                 f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with "
-                f"--resume --out {config.out}"
+                f"--resume --out {plan.out}"
             ) from None
-    return _write_results(config, planned, log, "complete")
+    return _write_results(plan, log, "complete")
 
 
 def unblind(out: Path, key: str | None = None) -> Summary:
@@ -369,18 +381,15 @@ def unblind(out: Path, key: str | None = None) -> Summary:
         ConfigError: The folder has no trials, or they are of another key.
     """
     config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
-    planned = plan_robot_cases(config)
-    with TrialLog(config, planned) as log:
+    require_trials(config)
+    plan = resolve(config)
+    with TrialLog(plan) as log:
         log.note_unblinded()
-    return _write_results(config, planned, log, "interrupted")
+    return _write_results(plan, log, "interrupted")
 
 
-def plan_robot_cases(config: EvalConfig) -> list[EvalCase]:
-    """Return the cases of a plan on a robot.
-
-    Raises:
-        ConfigError: The plan has no robot, or settings without meaning on one.
-    """
+def require_trials(config: EvalConfig) -> None:
+    """Raise `ConfigError` if a configuration has no robot, or settings without meaning on one."""
     if config.real_robot is None:
         raise ConfigError(
             "robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one "
@@ -392,35 +401,30 @@ def plan_robot_cases(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError(
             f"track: got {config.track} with a robot, want none: rates tell policies before the end"
         )
-    return plan_cases(config)
 
 
 @dataclasses.dataclass(slots=True)
 class _RemainingTrials:
     """The remaining trials, one after the other."""
 
-    _config: EvalConfig
+    _plan: ResolvedPlan
     _operator: Operator
     _robot: WatchedRobot
     _factory: AgentFactory
     _log: TrialLog
     _trials: Sequence[Trial]
     _message: str = ""  # for the operator, about the last trial
-    # The state of early stopping, by task and by the fingerprint of the case.
-    _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)
+    _stopping: EarlyStopping = dataclasses.field(init=False)
+    # The fingerprints of the cases of each task.
+    _cases_of_task: dict[tuple[str, str], set[str]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        stop = self._config.stop
-        if stop is not None:
-            for trial in self._trials:
-                case = trial.job.case
-                stopping = Stopping(stop, case.suite.seeds, case.planned)
-                stopping_by_case = self._stopping.setdefault(trial.task, {})
-                stopping_by_case.setdefault(case.fingerprint, stopping)
-
+        self._stopping = EarlyStopping(self._plan)
+        for trial in self._trials:
+            case_id = trial.job.case.fingerprint
+            self._cases_of_task.setdefault(trial.task, set()).add(case_id)
         for number, logged in self._log.finished.items():
-            trial = self._trials[number - 1]
-            self._count(trial, result_of(trial, logged))
+            self._stopping.add(result_of(self._trials[number - 1], logged))
 
     def play(self) -> None:
         """Rehearse the policies, then play each trial until it has a result."""
@@ -462,15 +466,15 @@ class _RemainingTrials:
 
         finished_scenes = {self._trials[number - 1].place for number in self._log.finished}
         if trial.place not in finished_scenes:
-            with storing(self._config.out):
-                save_start(self._config.out, trial.place, self._robot.observe())
+            with storing(self._plan.out):
+                save_start(self._plan.out, trial.place, self._robot.observe())
 
         self._log.begin(trial.number, attempt)
         try:
             recording = None
-            if self._config.record != "none":
+            if self._plan.record != "none":
                 name = f"trial{trial.number:04d}-{attempt}"
-                recording = self._config.out / RECORDINGS / name
+                recording = self._plan.out / RECORDINGS / name
             played = play(trial, self._robot, self._factory, self._operator, recording)
         except VLAgentsError as error:
             failure = explain(error)
@@ -523,18 +527,11 @@ class _RemainingTrials:
         }
         hidden = {"result": dataclasses.asdict(result), "metadata": played.metadata}
         self._log.end(trial.number, attempt, visible, hidden)
-        self._count(trial, result)
-
-    def _count(self, trial: Trial, result: EpisodeResult) -> None:
-        if self._config.stop is not None:
-            self._stopping[trial.task][trial.job.case.fingerprint].add(result)
+        self._stopping.add(result)
 
     def _is_over(self, trial: Trial) -> bool:
         """Return whether all cases of the trial's task have stopped early."""
-        stopping_by_case = self._stopping.get(trial.task)
-        if stopping_by_case is None:
-            return False
-        return all(stopping.at is not None for stopping in stopping_by_case.values())
+        return all(map(self._stopping.has_stopped, self._cases_of_task[trial.task]))
 
     def _visible(self, trial: Trial) -> VisibleTrial:
         robot, task = trial.job.case.on_robot
@@ -553,7 +550,7 @@ class _RemainingTrials:
             setup=task.setup,
             seconds=task.max_steps / robot.hz,
             rubric=task.rubric,
-            start=start_pictures(self._config.out, trial.place),
+            start=start_pictures(self._plan.out, trial.place),
             message=message,
         )
 
@@ -623,21 +620,19 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(levels[name])
 
 
-def _write_results(
-    config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str
-) -> Summary:
+def _write_results(plan: ResolvedPlan, log: TrialLog, state: str) -> Summary:
     """Write results.db from the whole log, as an evaluation in simulation does, in place of an
     earlier one.
     """
-    trials = schedule(planned, log.key)
-    with storing(config.out):
-        (config.out / RESULTS).unlink(missing_ok=True)
+    trials = schedule(plan.cases, log.key)
+    with storing(plan.out):
+        (plan.out / RESULTS).unlink(missing_ok=True)
 
-    with Store(config.model_copy(update={"resume": True})) as store, storing(config.out):
-        store.begin_run(config, versions(), log.started)
-        save_diffs(config.out, driver_code().values())
+    with Store(dataclasses.replace(plan, resume=True)) as store, storing(plan.out):
+        store.begin_run(versions(), log.started)
+        save_diffs(plan.out, driver_code().values())
 
-        case_of_place = {case.place: case for case in planned}
+        case_of_place = {case.place: case for case in plan.cases}
         for case in case_of_place.values():
             settings, _ = case.on_robot
             store.note_env(case.place, EnvInfo({"robot": settings.arm}, {}))
@@ -657,4 +652,4 @@ def _write_results(
                 store.note_policy(trial.job.case.policy.name, logged.hidden["metadata"])
             store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
 
-        return conclude(config, store, state)
+        return conclude(store, state)

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from math import ceil
 from pathlib import Path
@@ -24,7 +24,8 @@ from vlagents_ray.envs.graphics import GPUS, SHARE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
+from vlagents_ray.evaluate.plan.config import WorkerConfig
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.ray_tools.session import joined
 
@@ -34,7 +35,7 @@ TIMEOUT_S = 5.0  # s for another node to read it
 
 
 @contextmanager
-def ray_cluster(config: EvalConfig) -> Iterator[None]:
+def ray_cluster(plan: ResolvedPlan) -> Iterator[None]:
     """Join the cluster that `RAY_ADDRESS` names or start a local one, unless this process is in
     one; leave it after.
     """
@@ -43,24 +44,25 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
             stack.enter_context(joined())
         else:
             # CPUs are logical: the user's number of workers must fit.
-            cpus = max(os.cpu_count() or 1, ceil((config.workers or 1) * most_cpus(config)))
+            needed_cpus = ceil(max(1, plan.workers) * most_cpus(plan.cases))
+            cpus = max(os.cpu_count() or 1, needed_cpus)
             with withheld():  # workers get the key when they are ready; Ray's daemons need none
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
 
 
-def most_cpus(config: EvalConfig) -> float:
-    """Return the largest number of CPUs that any worker of the evaluation requests; a share of
-    one may be requested.
+def most_cpus(cases: Iterable[EvalCase]) -> float:
+    """Return the largest number of CPUs that the worker of any case requests; a share of one may
+    be requested.
     """
-    return max(worker.cpus for worker in _kinds(config))
+    return max(case.worker.cpus for case in cases)
 
 
-def most_gpus(config: EvalConfig) -> float:
-    """Return the largest number of GPUs that any worker of the evaluation requests; a share of
-    one may be requested.
+def most_gpus(cases: Iterable[EvalCase]) -> float:
+    """Return the largest number of GPUs that the worker of any case requests; a share of one may
+    be requested.
     """
-    return max(worker.gpus for worker in _kinds(config))
+    return max(case.worker.gpus for case in cases)
 
 
 def runtime_env(case: EvalCase) -> dict[str, Any]:
@@ -90,10 +92,6 @@ def unused_gpus(case: EvalCase, worker: WorkerInfo) -> str | None:
         f"{case.env} draws on {worker.renderer}, as its workers have no GPU; the cluster has "
         f"{gpus:g}: {SHARE}, see docs/cluster/scaling.md"
     )
-
-
-def _kinds(config: EvalConfig) -> list[WorkerConfig]:
-    return [config.worker, *(suite.worker for suite in config.suites if suite.worker is not None)]
 
 
 class Placement:
@@ -141,8 +139,17 @@ class CapacityMonitor:
     It continues as long as other workers play: a worker's node may have been lost, and may return.
     """
 
-    def __init__(self, config: EvalConfig, now: Callable[[], float] = monotonic) -> None:
-        self._config, self._now = config, now
+    def __init__(self, workers: int, place_s: float, now: Callable[[], float] = monotonic) -> None:
+        """Begin to watch.
+
+        Args:
+            workers: The number of workers of the plan.
+            place_s: The time until the cluster has resources for a worker, s.
+            now: A clock, in s.
+        """
+        self._workers = workers
+        self._place_s = place_s
+        self._now = now
         self._last_played = now()  # time at which an episode was last being played
         self._warned = False  # whether the user was warned that there is no room for all
 
@@ -156,7 +163,7 @@ class CapacityMonitor:
 
     def timed_out(self, since: float) -> bool:
         """Return whether a worker that was requested at `since` has waited for too long."""
-        return self._now() - since > self._config.place_timeout_s
+        return self._now() - since > self._place_s
 
     def report_shortage(self, worker: WorkerConfig, running: int) -> None:
         """Warn that a worker has waited too long while `running` run.
@@ -169,14 +176,14 @@ class CapacityMonitor:
         self._warned = True
         needed = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
-            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each "
+            f"the cluster found no room for a worker in {self._place_s:g} s: each "
             f"needs {needed}, free are {ray.available_resources()} of {ray.cluster_resources()}; "
             "lower `workers` or `worker.cpus`, or raise `place_timeout_s` if the cluster is still "
             "growing"
         )
         if idle_too_long:
             raise ConfigError(message)
-        log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
+        log.warning("going on with %d of %d workers: %s", running, self._workers, message)
 
 
 def tail(paths: Sequence[str]) -> str:

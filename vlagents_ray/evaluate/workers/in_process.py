@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import os
 import sys
@@ -12,11 +11,11 @@ from collections.abc import Callable, Iterator
 from typing import NoReturn
 
 from vlagents_ray.errors import PolicyFailed, VLAgentsError
-from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
+from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.base import VARIABLES, WorkerHandle, Workers, phase_limits_s
+from vlagents_ray.evaluate.plan.resolved import VARIABLES, ResolvedPlan, TimeLimits
+from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.session import variables
 from vlagents_ray.ray_tools.signals import raised_at_once
@@ -38,14 +37,12 @@ class InProcessWorkers(Workers):
 
     def __init__(
         self,
-        config: EvalConfig,
+        plan: ResolvedPlan,
         agent_factory: AgentFactory,
-        recorders: RecorderFactory = Recording,
+        recorders: RecorderFactory | None = None,
     ) -> None:
-        super().__init__()
-        self._config = config
-        self._make = functools.partial(Rollout, config, agent_factory, recorders)
-        self._rollout = self._make()
+        super().__init__(plan, agent_factory, recorders)
+        self._rollout = Rollout(self._agent_factory, self._recorders)
         self._variables = contextlib.ExitStack()
 
     def __exit__(self, *_: object) -> None:
@@ -76,7 +73,8 @@ class InProcessWorkers(Workers):
             if not jobs:
                 continue
 
-            with raised_at_once(), _exits_raised(), _hangs_reported(self._rollout, self._config):
+            hangs = _hangs_reported(self._rollout, self._plan.limits)
+            with raised_at_once(), _exits_raised(), hangs:
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].case.place
@@ -89,7 +87,7 @@ class InProcessWorkers(Workers):
     def close(self) -> None:
         """Close the agent and the environment; the next jobs begin with new ones."""
         rollout = self._rollout
-        self._rollout = self._make()
+        self._rollout = Rollout(self._agent_factory, self._recorders)
         try:
             with raised_at_once():
                 rollout.close()
@@ -123,19 +121,18 @@ def _exits_raised() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
+def _hangs_reported(rollout: Rollout, limits: TimeLimits) -> Iterator[None]:
     """Log the line at which a phase of an episode has exceeded its time limit, once for each
     such phase.
     """
     ended = threading.Event()
-    limits_s = phase_limits_s(config)
 
     def watch() -> None:
         """Query the phase until the episode has ended."""
         reported = ("", -1)
         while not ended.wait(_LOOK_S):
             heartbeat = rollout.progress()
-            limit_s = limits_s.get(heartbeat.phase, config.env_timeout_s)
+            limit_s = limits.of_phase(heartbeat.phase)
             phase = (heartbeat.phase, heartbeat.steps)
             if heartbeat.phase != "idle" and heartbeat.age_s > limit_s and phase != reported:
                 reported = phase
@@ -155,13 +152,13 @@ def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
         ended.set()
 
 
-def workers_class(config: EvalConfig, stack: contextlib.ExitStack) -> Callable[..., Workers]:
-    """Return the class of the workers: without Ray if `config.workers` is 0, else in a cluster
-    that `stack` leaves.
+def workers_class(plan: ResolvedPlan, stack: contextlib.ExitStack) -> Callable[..., Workers]:
+    """Return the class of the workers: without Ray if the plan has none, else in a cluster that
+    `stack` leaves.
     """
-    if config.workers == 0:
+    if plan.workers == 0:
         return InProcessWorkers
     from vlagents_ray.evaluate.workers import cluster, pool
 
-    stack.enter_context(cluster.ray_cluster(config))
+    stack.enter_context(cluster.ray_cluster(plan))
     return pool.WorkerPool

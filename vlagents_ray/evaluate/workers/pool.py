@@ -16,13 +16,13 @@ from ray.exceptions import RayActorError, RayError
 
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.errors import ClusterLost, EnvFailed
-from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
+from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory
 from vlagents_ray.evaluate.episode.episode import Phase
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers, phase_limits_s
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
+from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.cluster import (
     CapacityMonitor,
     Placement,
@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 
 class WorkerPool(Workers):
-    """Up to `config.workers` workers. Use it as a context manager: its end kills every worker.
+    """As many workers as the plan has. Use it as a context manager: its end kills every worker.
 
     While the head of the cluster does not answer, the existing workers continue, and no others are
     started.
@@ -54,14 +54,11 @@ class WorkerPool(Workers):
 
     def __init__(
         self,
-        config: EvalConfig,
+        plan: ResolvedPlan,
         agent_factory: AgentFactory,
-        recorders: RecorderFactory = Recording,
+        recorders: RecorderFactory | None = None,
     ) -> None:
-        super().__init__()
-        self._config = config
-        self._agent_factory = agent_factory
-        self._recorders = recorders
+        super().__init__(plan, agent_factory, recorders)
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         # The API key of this process's environment, which workers on other nodes do not inherit.
         self._credentials = Credentials()
@@ -73,8 +70,8 @@ class WorkerPool(Workers):
         self._last_failed_start = 0.0  # its time
         # The time until which no request is sent to a host that did not answer.
         self._unreachable: dict[str, float] = {}
-        self._capacity = CapacityMonitor(config)
-        self._limits_s = phase_limits_s(config)
+        self._limits = plan.limits
+        self._capacity = CapacityMonitor(plan.workers, plan.limits.place_s)
         self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -94,7 +91,7 @@ class WorkerPool(Workers):
         """Return whether a worker can be started, after ending an idle one if that is needed."""
         if not self._head.answers():
             return False
-        if len(self._workers) < (self._config.workers or 1):
+        if len(self._workers) < max(1, self._plan.workers):
             return True
         idle = self.idle()
         if not idle:
@@ -118,9 +115,7 @@ class WorkerPool(Workers):
             "scheduling_strategy": strategy(node),
             "runtime_env": runtime_env(case),
         }
-        actor = self._actor_class.options(**options).remote(
-            self._config, self._agent_factory, self._recorders
-        )
+        actor = self._actor_class.options(**options).remote(self._agent_factory, self._recorders)
         worker = WorkerHandle(
             case.worker,
             case.kind,
@@ -271,8 +266,7 @@ class WorkerPool(Workers):
     def _overdue(self, worker: WorkerHandle, now: float) -> str | None:
         """Return why the busy `worker` must be replaced; None if it need not be."""
         heartbeat = worker.heartbeat
-        env_s = self._config.env_timeout_s
-        limit_s = self._limits_s.get(heartbeat.phase, env_s)
+        limit_s = self._limits.of_phase(heartbeat.phase)
         if heartbeat.age_s > limit_s + GRACE_S:
             return (
                 f"{heartbeat.phase} after {heartbeat.steps} steps took longer than {limit_s:g} "
@@ -281,7 +275,7 @@ class WorkerPool(Workers):
         # A simulator that hangs in C code holds the interpreter's lock, so that no call is
         # answered.
         silent_s = now - worker.heartbeat_at
-        if silent_s > max(limit_s, env_s) + GRACE_S + watch_s(len(self._workers)):
+        if silent_s > max(limit_s, self._limits.env_s) + GRACE_S + watch_s(len(self._workers)):
             return (
                 f"no sign of life for {silent_s:.0f} s, last seen in {heartbeat.phase}; the "
                 "worker was killed"

@@ -33,7 +33,6 @@ from vlagents_ray.evaluate.artifacts.recorder import (
     Artifacts,
     EpisodeRecorder,
     RecorderFactory,
-    Recording,
 )
 from vlagents_ray.evaluate.episode import episode
 from vlagents_ray.evaluate.episode.failures import (
@@ -45,8 +44,9 @@ from vlagents_ray.evaluate.episode.failures import (
 )
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
-from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.plan.config import PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, TimeLimits
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
@@ -100,13 +100,7 @@ class Heartbeat:
 class Rollout:
     """Plays jobs. Keeps its agent and its environment until a job needs another."""
 
-    def __init__(
-        self,
-        config: EvalConfig,
-        agent_factory: AgentFactory,
-        recorders: RecorderFactory = Recording,
-    ) -> None:
-        self._config = config
+    def __init__(self, agent_factory: AgentFactory, recorders: RecorderFactory) -> None:
         self._agent_factory = agent_factory
         self._recorders = recorders
         self._agent: Agent | None = None
@@ -208,7 +202,7 @@ class Rollout:
         with contextlib.ExitStack() as stack:
             recordings = []
             for _ in jobs:
-                recorder = self._recorders(self._config, env.contract.control_hz)
+                recorder = self._recorders(env.contract.control_hz)
                 recordings.append(stack.enter_context(contextlib.closing(recorder)))
 
             choice = recordings[0].wants_images
@@ -226,7 +220,7 @@ class Rollout:
                 policy_options=case.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
-                images=renders,
+                images="all" if renders else "requested",
             )
 
             reports = []
@@ -246,11 +240,11 @@ class Rollout:
         self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
     ) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
-        options = episode.options_of_reset(env, job.key.episode, job.case.suite.reset_options)
+        reset_options = job.case.suite.reset_options
         artifacts = recording.finish(
             result,
             lambda played, record: played.play_again(
-                env, job.key.seed, options, self._set_phase, record
+                env, job.key, reset_options, self._set_phase, record
             ),
         )
         self._repeatable = self._repeatable and artifacts.not_repeatable is None
@@ -375,12 +369,12 @@ def own_logs() -> list[str]:
 
 
 def agents(
-    config: EvalConfig, own: OwnAgents = None, priority: PriorityName = "simulation"
+    plan: ResolvedPlan, own: OwnAgents = None, priority: PriorityName = "simulation"
 ) -> AgentFactory:
     """Return the factory with which a worker makes an agent of a policy.
 
     Args:
-        config: The policies, and the timeouts of a connection.
+        plan: The policies, and the time limits of a connection.
         own: Makes the agent of every policy, or, by the name of a policy, the agent of that one.
             The agents of other policies are `RemoteAgent`s.
         priority: The priority of the `RemoteAgent`s.
@@ -392,17 +386,17 @@ def agents(
         return lambda _policy: own()
 
     factories = own or {}
-    for policy in config.policies:
+    for policy in plan.policies:
         if policy.url is None and policy.name not in factories:
             raise ConfigError(
                 f"policy {policy.name!r}: got no url, want that of its server, as "
                 "http://localhost:8000"
             )
-    return functools.partial(_agent, config, factories, priority)
+    return functools.partial(_agent, plan.limits, factories, priority)
 
 
 def _agent(
-    config: EvalConfig,
+    limits: TimeLimits,
     factories: Mapping[str, Callable[[], Agent]],
     priority: PriorityName,
     policy: PolicyConfig,
@@ -412,8 +406,8 @@ def _agent(
     return RemoteAgent(
         str(policy.url),  # `agents` has checked that there is one
         transport=policy.transport,
-        timeout_s=config.policy_timeout_s,
-        connect_timeout_s=config.connect_timeout_s,
+        timeout_s=limits.policy_s,
+        connect_timeout_s=limits.connect_s,
         codec=policy.codec,
         priority=priority,
         # An interrupted episode is played again, so that its result depends only on its key.
@@ -421,13 +415,13 @@ def _agent(
     )
 
 
-def factory_programs(config: EvalConfig, own: OwnAgents) -> dict[str, Program]:
+def factory_programs(plan: ResolvedPlan, own: OwnAgents) -> dict[str, Program]:
     """Return the files of the agents that are made in the workers, by policy; the metadata of
     served policies contains theirs.
     """
     if callable(own):
         program = factory_program(own)
-        return {policy.name: program for policy in config.policies}
+        return {policy.name: program for policy in plan.policies}
     return {name: factory_program(make) for name, make in (own or {}).items()}
 
 

@@ -20,6 +20,7 @@ from vlagents_ray_cluster.slurm.submission import Script, first_index, split, su
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig
+    from vlagents_ray.evaluate.plan.cases import EvalCase
 
 slurm = typer.Typer(
     no_args_is_help=True,
@@ -71,8 +72,8 @@ def eval_(
     with errors():
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
-        config = _evaluation([word.replace(_TASK, index) for word in words])
-        other = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
+        config, cases = _evaluation([word.replace(_TASK, index) for word in words])
+        other, _ = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
         for tracker in config.track:
             registered_class("trackers", tracker)  # raises an error for an unknown name
         if "array" in options and config.out == other.out:
@@ -85,12 +86,12 @@ def eval_(
         # known.
         fill = []
         if "workers" not in config.model_fields_set:
-            if most_gpus(config):
+            if most_gpus(cases):
                 raise ConfigError(
                     "workers have GPUs, but their number is not said; want --workers: policies get "
                     "the GPUs left over"
                 )
-            fill = [f"--fill={max(1.0, most_cpus(config)):g}"]
+            fill = [f"--fill={max(1.0, most_cpus(cases)):g}"]
 
         # The folder of an array is above the folders of its tasks.
         folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"
@@ -204,9 +205,9 @@ def _refuse(params: dict[str, Any], why: str, *names: str) -> None:
         raise ConfigError(f"{', '.join(options)}: not for a job: {why}; leave it out")
 
 
-def _evaluation(words: list[str]) -> EvalConfig:
-    """Build the configuration as `eval` does, and raise errors that would end the job at its
-    start.
+def _evaluation(words: list[str]) -> tuple[EvalConfig, list[EvalCase]]:
+    """Return the configuration that `eval` builds, and its cases; raise errors that would end the
+    job at its start.
     """
     from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import plan_cases
@@ -219,5 +220,4 @@ def _evaluation(words: list[str]) -> EvalConfig:
         "watch",
     )
     config = config_from_options(EvalOptions(**given))
-    plan_cases(resolve_policies(config, ask=False)[0])
-    return config
+    return config, plan_cases(resolve_policies(config, ask=False)[0])

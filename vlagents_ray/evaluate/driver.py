@@ -1,0 +1,186 @@
+"""Plays the jobs of a plan on its workers, for an evaluation as for rollouts: hands out jobs,
+repeats attempts that infrastructure failed, and ends when too many episodes in a row are lost.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+
+from vlagents_ray.errors import PolicyFailed, from_code
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
+from vlagents_ray.evaluate.results.statistics import Stopping
+from vlagents_ray.evaluate.workers.base import Workers
+from vlagents_ray.evaluate.workers.rollout import Report
+
+
+class Consumer(ABC):
+    """Receives the episodes of a driver: to write results, or to return them to a learner."""
+
+    # The cures in the errors that end a run, after many errors of the policy or many losses.
+    policy_cure: str
+    loss_cure: str
+
+    @abstractmethod
+    def began(self, jobs: tuple[Job, ...]) -> None:
+        """Note that a worker begins these jobs."""
+
+    @abstractmethod
+    def described(self, job: Job, report: Report) -> None:
+        """Note what a report says about the policy, the environment and the worker."""
+
+    def is_needed(self, job: Job) -> bool:
+        """Return whether a failed attempt at this episode may be repeated."""
+        return True
+
+    @abstractmethod
+    def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
+        """Note that infrastructure failed an attempt; `repeated` is whether another follows."""
+
+    @abstractmethod
+    def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        """Take the result of an episode, which is not played again. Its status is "infra_failed"
+        if it was lost.
+        """
+
+
+class Driver:
+    """The jobs of a plan that are not finished, and what is done with each report about one.
+
+    It has no thread and no loop: its owner calls `hand_out`, waits for reports of the workers, and
+    passes each to `take`.
+    """
+
+    def __init__(self, plan: ResolvedPlan, jobs: Iterable[Job], consumer: Consumer) -> None:
+        """Queue the jobs.
+
+        Args:
+            plan: The plan of the jobs.
+            jobs: The jobs, in the order in which they begin in each environment.
+            consumer: Receives the results.
+        """
+        self.queue = JobQueue(jobs)
+        self._retries = plan.retries
+        self._abort_after = plan.abort_after
+        self._consumer = consumer
+        self._lost = 0  # episodes in a row
+        self._policy_errors = 0  # episodes in a row
+        # The number of steps, and the digest of the actions, of episodes whose simulation diverged.
+        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}
+
+    def hand_out(self, pool: Workers) -> None:
+        """Hand waiting jobs to idle workers, and start workers while more are needed."""
+        for worker in pool.idle():
+            jobs = self.queue.take(worker.kind, worker.env_place, pool.busy_places())
+            if jobs:
+                self._consumer.began(jobs)
+                pool.dispatch(worker, jobs)
+
+        while True:
+            case = self.queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))
+            if case is None or not pool.free_slot():
+                return
+            pool.start(case)
+
+    def take(self, job: Job, report: Report) -> None:
+        """Pass a result to the consumer, or repeat the job.
+
+        Raises:
+            PolicyFailed: Too many episodes in a row ended by an error of the policy.
+            VLAgentsError: A failure that the user can correct; or the last one, if too many
+                episodes in a row were lost.
+        """
+        self._consumer.described(job, report)
+        if report.failure is not None:
+            self._failed(job, report.failure)
+        elif report.result is not None:
+            self._finish(job, report.result, report.artifacts)
+
+    def _failed(self, job: Job, failure: Failure) -> None:
+        """Repeat a failed attempt, or finish its episode as lost."""
+        if failure.diverged is not None and self._diverged_before(job, failure.diverged):
+            # Under the same actions: the policy is the cause, and has failed.
+            self._finish(job, failure.diverged, Artifacts())
+            return
+
+        is_needed = self._consumer.is_needed(job)
+        repeated = is_needed and failure.cause != "user" and job.attempt <= self._retries
+        self._consumer.attempt_failed(job, failure, repeated=repeated)
+        if failure.cause == "user":
+            raise from_code(failure.code, failure.message)
+        if repeated:
+            self.queue.put_back(job.again(alone=failure.names_no_episode))
+        elif is_needed:
+            error = f"{failure.code}: {failure.message}"
+            lost = EpisodeResult(job.key, "infra_failed", error=error)
+            self._consumer.finished(job, lost, Artifacts())
+            self._count_loss(failure)
+
+    def _diverged_before(self, job: Job, result: EpisodeResult) -> bool:
+        """Return whether the simulation of an episode has diverged before under the same
+        actions.
+        """
+        actions = (result.steps, result.actions_sha256)
+        earlier = self._diverged.get(job.key)
+        self._diverged[job.key] = actions
+        return earlier == actions
+
+    def _finish(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        """Pass the result of an episode that was played to the consumer."""
+        if result.status != "policy_error":
+            self._lost = self._policy_errors = 0
+        self._consumer.finished(job, result, artifacts)
+        if result.status == "policy_error":
+            self._count_policy_error(result.error or "")
+
+    def _count_policy_error(self, error: str) -> None:
+        self._policy_errors += 1
+        if self._policy_errors == self._abort_after:
+            raise PolicyFailed(
+                f"{self._policy_errors} episodes in a row ended by an error of the policy: "
+                f"{error.strip()}; {self._consumer.policy_cure}"
+            )
+
+    def _count_loss(self, failure: Failure) -> None:
+        self._lost += 1
+        if self._lost == self._abort_after:
+            raise from_code(
+                failure.code,
+                f"{self._lost} episodes in a row lost to infrastructure; "
+                f"{self._consumer.loss_cure}: {failure.message}",
+            )
+
+
+class EarlyStopping:
+    """The state of early stopping of each case of a plan; without a rule no case stops."""
+
+    def __init__(self, plan: ResolvedPlan) -> None:
+        """Begin without results."""
+        self._by_case: dict[str, Stopping] = {}
+        if plan.stop is not None:
+            for case in plan.cases:
+                self._by_case[case.fingerprint] = Stopping(
+                    plan.stop, case.suite.seeds, case.planned
+                )
+
+    def add(self, result: EpisodeResult) -> int | None:
+        """Add the result of an episode.
+
+        Returns:
+            The number of episodes after which its case stops, if this result decided that; else
+            None.
+        """
+        case_id = result.key.settings
+        if case_id not in self._by_case or self.has_stopped(case_id):
+            return None
+        self._by_case[case_id].add(result)
+        return self._by_case[case_id].at
+
+    def has_stopped(self, case_id: str) -> bool:
+        """Return whether the outcomes of the case with this fingerprint suffice."""
+        stopping = self._by_case.get(case_id)
+        return stopping is not None and stopping.at is not None
