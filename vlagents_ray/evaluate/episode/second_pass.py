@@ -173,21 +173,25 @@ class _Comparison(EpisodeObserver):
         self._outcomes = outcomes
         self._record = record
         self._steps = -1  # before the reset
+        self._difference: str | None = None  # of the newest observation
 
     def add_observation(self, obs: Obs) -> None:
-        """Record an observation; raise `_DifferenceFound` if it is not that of the first pass."""
+        """Record an observation; raise `_DifferenceFound` if that of the reset has changed."""
         self._steps += 1
         self._record(obs)
-        difference = self._observations[self._steps].difference(_Digests.from_obs(obs))
-        if difference is not None:
-            self._report(difference)
+        first_pass = self._observations[self._steps]
+        self._difference = first_pass.difference(_Digests.from_obs(obs))
+        if self._steps == 0:
+            self._require_none(self._difference)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Raise `_DifferenceFound` if the outcome of an action is not that of the first pass."""
-        if (reward, success) != self._outcomes[self._steps - 1]:
-            self._report("reward or success")
+        """Raise `_DifferenceFound` if the observation or the outcome of an action has changed."""
+        is_same = (reward, success) == self._outcomes[self._steps - 1]
+        self._require_none(self._difference if is_same else "reward or success")
 
-    def _report(self, difference: str) -> None:
+    def _require_none(self, difference: str | None) -> None:
+        if difference is None:
+            return
         is_last = self._steps == len(self._outcomes)
         steps = "the last step" if is_last else f"{self._steps} steps"
         raise _DifferenceFound(f"after {steps}, {difference} differs")
