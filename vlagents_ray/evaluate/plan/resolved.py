@@ -85,6 +85,9 @@ def resolve(config: EvalConfig, workers: int | None = None) -> ResolvedPlan:
         workers: The number of workers, where it is decided already; None: `chosen_workers`. A
             robot's trials need none.
 
+    Returns:
+        The plan, whose workers are decided and whose envs and trackers are known.
+
     Raises:
         ConfigError: Two cases are the same, an env does not take its options, a tracker is not
             registered, or `config.workers` is 0 and something needs Ray.

@@ -343,7 +343,22 @@ def play_trials(
     robot: Robot | None = None,
     agent_factory: AgentFactory | None = None,
 ) -> Summary:
-    """Evaluate as `evaluate_on_robot` does, by a plan that is already resolved."""
+    """Evaluate as `evaluate_on_robot` does, by a plan that is already resolved.
+
+    Args:
+        plan: The plan, whose configuration passes `require_trials`.
+        operator: The operator at the robot.
+        robot: The robot; by default one of the class `config.robot.arm`.
+        agent_factory: Called with a policy to make its agent for a trial, in place of a connection
+            to its `url`.
+
+    Returns:
+        The summary of all results in the plan's folder.
+
+    Raises:
+        VLAgentsError: As for `evaluate_on_robot`.
+        TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
+    """
     if plan.record != "none":
         for module in ("av", "pyarrow"):
             require(module)
