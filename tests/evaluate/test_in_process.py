@@ -24,6 +24,7 @@ from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan import resolved
+from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers import in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
@@ -77,7 +78,8 @@ def test_a_short_evaluation_that_needs_no_ray_has_no_workers(
 ) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(resolved, "node_of_this_process", lambda: None)
-    assert resolved.resolve(flat_config(envs=[LINE], out="out", **changes)).workers == workers
+    config = flat_config(envs=[LINE], out="out", **changes)
+    assert resolved.chosen_workers(config, plan_cases(config)) == workers
 
 
 def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -227,7 +227,7 @@ def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None
         store.note_env(case.place, EnvInfo({"simulator": "line", "version": 1, "node": "b"}, {}))
         store.record(done(planned(config())[0].key), attempts=1)
     with Store(resolve(config(resume=True))) as store:
-        assert store.cases == [case]
+        assert store.cases == (case,)
         with pytest.raises(
             ConfigError, match=r"its description 'version' was 1, is 2\n.*--accept-changes"
         ):
