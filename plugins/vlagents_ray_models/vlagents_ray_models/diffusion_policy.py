@@ -31,42 +31,38 @@ class DiffusionPolicyConfig(ModelConfig):
 
     checkpoint: str = Field(
         min_length=1,
-        description="a .ckpt file, or a folder or org/name@COMMIT of the hub, with only one; "
-        "`{step}` stands for "
-        "checkpoint_step",
+        description="a .ckpt file, or a folder or hub id (org/name@COMMIT) with only one; `{step}` "
+        "stands for checkpoint_step",
     )
     trust_checkpoint: bool = Field(
         default=False,
         description="these checkpoints are pickles, and loading one runs the code that its author "
-        "put in: set true if "
-        "you trust its origin",
+        "put in: set true if you trust its origin",
     )
     source_dir: str | None = Field(
         default=None,
-        description="a checkout of Diffusion Policy; unset: the installed one, or that of "
-        "DIFFUSION_POLICY_SRC",
+        description="a checkout of Diffusion Policy; unset: the installed one, or the one that "
+        "DIFFUSION_POLICY_SRC names",
     )
     dtype: Literal["auto", "float32"] = Field(
         default="auto", description="float32, as its authors compute"
     )
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="queue",
-        description="as in all models; 'queue' because the model sees the last frames, those "
-        "within a chunk too, "
-        "which arrive here only if each of them is sent",
+        description="as in all models; 'queue' by default, because the model reads the last "
+        "frames, including those within a chunk, which it gets only if each of them is sent",
     )
     state: list[str] | None = Field(
         default=None,
-        description="parts that follow each other as the checkpoint's low_dim keys do; unset: "
-        "parts of their names, "
-        "'state' for a checkpoint without cameras",
+        description="parts of the state in the order of the checkpoint's low_dim keys; unset: the "
+        "parts with the names of these keys, or 'state' for a checkpoint without cameras",
     )
     steps: int | None = Field(
-        default=None, ge=1, description="denoising steps; unset: those of the checkpoint"
+        default=None, ge=1, description="denoising steps; unset: as many as in the checkpoint"
     )
 
 
-USUAL_CAMERAS = {  # of the authors' tasks
+USUAL_CAMERAS = {  # names of the authors' tasks -> ours
     "image": "front",
     "agentview_image": "front",
     "robot0_eye_in_hand_image": "wrist",
@@ -75,7 +71,7 @@ _POSE_NUMBERS = 10  # position, rotation in six numbers, gripper
 
 
 class DiffusionPolicy(ModelPolicy):
-    """The policy of a Diffusion Policy checkpoint, which calls the module's `predict_action` for
+    """The policy of a Diffusion Policy checkpoint. It calls the module's `predict_action` once for
     a whole batch.
     """
 
@@ -89,16 +85,25 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
+        """The contract of the checkpoint; before it is loaded, only that no instruction is
+        needed.
+        """
         network: DiffusionNetwork | None = self.model
         if network is None:
             return Contract(instruction=False)
-        parts, sizes = self._parts(network), network.vectors.values()
-        own = {part: StateSpec(size) for part, size in zip(parts, sizes, strict=False)}
-        state = {"state": own} if self.config.state is None else {}
-        action = _action(network.module.action_dim, absolute=network.absolute)
-        horizon = network.module.n_action_steps
+
+        state_parts = self._state_parts(network)
+        facts: dict[str, Any] = {
+            "instruction": False,
+            "action": _action_spec(network.module.action_dim, absolute=network.absolute),
+        }
+        if self.config.state is None:
+            widths = network.vectors.values()
+            facts["state"] = {
+                part: StateSpec(width) for part, width in zip(state_parts, widths, strict=True)
+            }
         return self.stated(
-            self._cameras(network), parts, horizon, instruction=False, action=action, **state
+            self._cameras(network), state_parts, network.module.n_action_steps, **facts
         )
 
     @property
@@ -106,8 +111,9 @@ class DiffusionPolicy(ModelPolicy):
         return None if self.model is None else sum(self.model.vectors.values())
 
     def load(self) -> DiffusionNetwork:
+        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = DiffusionNetwork.load(self.config)
-        self._cameras(network)
+        self._cameras(network)  # raises unless the configured cameras fit
         if self.config.compile_on(network.staging.device.type):
             compile_with(network, self.compilation)
         return network
@@ -115,54 +121,65 @@ class DiffusionPolicy(ModelPolicy):
     def perceive(self, obs: Obs) -> StagedRow:
         """Return images (H, W, 3) uint8 and vectors (D,) float32 by the checkpoint's names."""
         network: DiffusionNetwork = self.model
-        seen = {
-            name: _resized(image, *network.images[name])
-            for name, image in camera_images(obs, self._cameras(network)).items()
-        }
-        vector = state_vector(obs, self._parts(network), self.state_dim)
+        inputs: dict[str, np.ndarray] = {}
+        for name, image in camera_images(obs, self._cameras(network)).items():
+            height, width = network.images[name]
+            inputs[name] = _resized(image, height, width)
+
+        vector = state_vector(obs, self._state_parts(network), self.state_dim)
         ends = np.cumsum([0, *network.vectors.values()])
-        parts = {
-            name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)
-        }
-        return network.staging.stage(seen | parts)
+        for name, (start, end) in zip(network.vectors, pairwise(ends), strict=True):
+            inputs[name] = vector[start:end]
+        return network.staging.stage(inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
+        """Compute the chunks of all rows in one call of the module, each with its own noise."""
+        from vlagents_ray_models.sampling_rng import RowNoise
+
         network: DiffusionNetwork = self.model
-        torch, steps = require("torch"), self.history
-        frames = [frame for row in rows for frame in row.history(steps)]
+        torch = require("torch")
+        steps = self.history
+        frames = []
+        for row in rows:
+            frames += row.history(steps)
         batch = network.staging.stack(frames, keep=steps > 1)
+
         inputs = {name: tensor.unflatten(0, (len(rows), steps)) for name, tensor in batch.items()}
         for name in network.images:  # (B, T, H, W, 3) uint8 -> (B, T, 3, H, W) in [0, 1]
             inputs[name] = inputs[name].movedim(-1, 2).float() / 255
-        from vlagents_ray_models.sampling_rng import RowNoise
 
-        # The scheduler's steps draw in the latter.
-        own = network.module, require("diffusers.utils.torch_utils")
-        with torch.inference_mode(), RowNoise(rows, network.draws, *own):
+        # The scheduler's steps draw their noise in this module of diffusers.
+        drawing_modules = (network.module, require("diffusers.utils.torch_utils"))
+        with torch.inference_mode(), RowNoise(rows, network.draws, *drawing_modules):
             actions = network.module.predict_action(inputs)["action"]
         return [Prediction(chunk) for chunk in fetch(actions.float())]
 
-    def _parts(self, network: DiffusionNetwork) -> list[str]:
-        usual = ["state" if name == OBS else name for name in network.vectors]
-        return usual if self.config.state is None else self.config.state
+    def _state_parts(self, network: DiffusionNetwork) -> list[str]:
+        """Return the parts of our state, in the order of the checkpoint's vectors."""
+        if self.config.state is not None:
+            return self.config.state
+        return ["state" if name == OBS else name for name in network.vectors]
 
     def _cameras(self, network: DiffusionNetwork) -> dict[str, str]:
+        """Return our camera for each image of the checkpoint."""
         usual = {name: ours for name, ours in USUAL_CAMERAS.items() if name in network.images}
         return choose_cameras(self.config.cameras, usual, list(network.images))
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale an image, and crop its centre to the model's aspect ratio, as in the authors'
-    get_real_obs_dict.
+    """Scale an (H, W, 3) uint8 image to (height, width, 3), and crop its centre to the model's
+    aspect ratio, as the authors' get_real_obs_dict does.
     """
     if image.shape[:2] == (height, width):
         return image.copy()
-    transform = require("diffusion_policy.common.cv2_util").get_image_transform
-    return np.ascontiguousarray(transform(image.shape[1::-1], (width, height))(image))
+
+    get_image_transform = require("diffusion_policy.common.cv2_util").get_image_transform
+    transform = get_image_transform(image.shape[1::-1], (width, height))
+    return np.ascontiguousarray(transform(image))
 
 
-def _action(dim: int, *, absolute: bool) -> ActionSpec:
-    """Describe the actions; with `abs_action` they are one or two poses in the base frame, with
+def _action_spec(dim: int, *, absolute: bool) -> ActionSpec:
+    """Describe the actions. With `abs_action` they are one or two poses in the base frame, with
     6D rotations.
     """
     if not absolute or dim % _POSE_NUMBERS:
@@ -171,7 +188,8 @@ def _action(dim: int, *, absolute: bool) -> ActionSpec:
 
 
 OBS = "obs"  # the only input of a policy without cameras
-_WEIGHTS = "policy.obs_encoder.rgb_model.weights"
+# The setting of the training that names initial weights of the image encoder.
+_INITIAL_WEIGHTS = "policy.obs_encoder.rgb_model.weights"
 
 
 @dataclass(frozen=True)
@@ -182,13 +200,16 @@ class DiffusionNetwork:
     staging: Staging
     images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
     vectors: dict[str, int]  # length, by the checkpoint's name, in its order
-    absolute: bool  # poses with 6D rotations, as in the robomimic tasks with `abs_action`
-    draws: int  # of noise in a pass, made at once; a pass may need others
+    # Whether actions are poses with 6D rotations, as in the robomimic tasks with `abs_action`.
+    absolute: bool
+    draws: int  # draws of noise that are made together for a pass, which may need more
 
     @classmethod
     def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
-        """Read the checkpoint; raises `ConfigError` if it is not trusted, incomplete, or of
-        another family.
+        """Read the checkpoint.
+
+        Raises:
+            ConfigError: It is not trusted, incomplete, or of another family.
         """
         if not config.trust_checkpoint:
             raise ConfigError(
@@ -199,33 +220,41 @@ class DiffusionNetwork:
         path = checkpoint_file(config)
         ensure_torchvision()
         use_source("diffusion_policy", "DIFFUSION_POLICY_SRC", config.source_dir)
-        settings, state = _read(path)
-        module = _made(path, settings)
+
+        settings, weights = _read_payload(path)
+        module = _make_module(path, settings)
         try:
-            module.load_state_dict(state)
+            module.load_state_dict(weights)
         except RuntimeError as error:
             raise ConfigError(
                 f"checkpoint {path}: does not fill its own policy: {error}"
             ) from error
-        require_loaded(module, state)
-        images, vectors = _inputs(module, settings)
-        absent = sorted({"action", *images, *vectors} - set(module.normalizer.params_dict.keys()))
+        require_loaded(module, weights)
+
+        images, vectors = _input_shapes(module, settings)
+        normalized_names = set(module.normalizer.params_dict.keys())
+        absent = sorted({"action", *images, *vectors} - normalized_names)
         if absent:
             raise ConfigError(
                 f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers have "
                 "no units; save it after the workspace has called set_normalizer"
             )
+
         if config.steps is not None:
             module.num_inference_steps = config.steps
         device = torch_device(config.device)
-        absolute = bool(require("omegaconf").OmegaConf.select(settings, "task.abs_action"))
         module.to(device).eval()
-        return cls(module, Staging(device), images, vectors, absolute, _draws(module, device))
+        _sample_without_waiting(module, device)
+        absolute = bool(require("omegaconf").OmegaConf.select(settings, "task.abs_action"))
+        return cls(module, Staging(device), images, vectors, absolute, _noise_draws(module))
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file; raises `ConfigError` also for a hub id without a commit, whose pickle
-    may change.
+    """Find the .ckpt file.
+
+    Raises:
+        ConfigError: There is no such file or more than one, or the checkpoint is a hub id without
+            a commit, whose pickle may change.
     """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     commit = revision(path)
@@ -236,23 +265,25 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
             f"become others; want the commit that you trust, such as {repository}@{commit}, which "
             "it is now"
         )
+
     if path.is_file():
         return path
-    found = sorted(path.rglob("*.ckpt"))
-    if len(found) != 1:
-        names = [str(file.relative_to(path)) for file in found[:10]]
+    files = sorted(path.rglob("*.ckpt"))
+    if len(files) != 1:
+        names = [str(file.relative_to(path)) for file in files[:10]]
         raise ConfigError(
             f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only "
             "one"
         )
-    return find_checkpoint(str(found[0]))
+    return find_checkpoint(str(files[0]))
 
 
-def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
-    """Return the settings of the training and the weights, averaged ones if the training
-    computed them.
+def _read_payload(path: Path) -> tuple[Any, Mapping[str, Any]]:
+    """Return the settings of the training and the weights, which are the averaged ones if the
+    training computed such.
     """
-    torch, dill = require("torch"), require("dill")
+    torch = require("torch")
+    dill = require("dill")
     try:
         payload = torch.load(path, map_location="cpu", pickle_module=dill, weights_only=False)
         settings, states = payload["cfg"], payload["state_dicts"]
@@ -261,11 +292,9 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
             f"checkpoint {path}: got no payload of a Diffusion Policy workspace "
             f"({type(error).__name__}: {error}); want a .ckpt that its save_checkpoint wrote"
         ) from error
-    name = (
-        "ema_model"
-        if require("omegaconf").OmegaConf.select(settings, "training.use_ema")
-        else "model"
-    )
+
+    averages = require("omegaconf").OmegaConf.select(settings, "training.use_ema")
+    name = "ema_model" if averages else "model"
     if name not in states:
         raise ConfigError(
             f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has "
@@ -274,52 +303,70 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
     return settings, states[name]
 
 
-def _made(path: Path, settings: Any) -> Any:
+def _make_module(path: Path, settings: Any) -> Any:
+    """Make the policy's module from the settings of its training.
+
+    Raises:
+        ConfigError: It is no diffusion policy, or crops images at random during inference.
+    """
     omegaconf = require("omegaconf").OmegaConf
-    if omegaconf.select(settings, _WEIGHTS) not in (None, "r3m", "R3M"):
+    if omegaconf.select(settings, _INITIAL_WEIGHTS) not in (None, "r3m", "R3M"):
         # The initial weights of the training would be downloaded, only to be replaced.
-        omegaconf.update(settings, _WEIGHTS, None)
+        omegaconf.update(settings, _INITIAL_WEIGHTS, None)
+
     module = require("hydra.utils").instantiate(settings.policy)
     if not hasattr(module, "noise_scheduler"):
         raise ConfigError(
             f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of "
             "diffusion_policy.policy's Diffusion…Policy"
         )
-    if any(
-        type(part).__name__ == "CropRandomizer" and "robomimic" in type(part).__module__
-        for part in module.modules()
-    ):
-        raise ConfigError(
-            f"checkpoint {path}: its encoder crops at random while it acts, so actions would "
-            "depend on neighbours; want one trained with eval_fixed_crop: true"
-        )
+
+    for submodule in module.modules():
+        cls = type(submodule)
+        if cls.__name__ == "CropRandomizer" and "robomimic" in cls.__module__:
+            raise ConfigError(
+                f"checkpoint {path}: its encoder crops at random while it acts, so actions would "
+                "depend on neighbours; want one trained with eval_fixed_crop: true"
+            )
     return module
 
 
-def _inputs(module: Any, settings: Any) -> tuple[dict[str, tuple[int, int]], dict[str, int]]:
-    if (shapes := settings.policy.get("shape_meta")) is None:
+def _input_shapes(module: Any, settings: Any) -> tuple[dict[str, tuple[int, int]], dict[str, int]]:
+    """Return the height and width of each image, and the length of each vector, by name."""
+    shapes = settings.policy.get("shape_meta")
+    if shapes is None:
         return {}, {OBS: module.obs_dim}
-    images = {name: one for name, one in shapes.obs.items() if one.get("type", "low_dim") == "rgb"}
-    vectors = {name: one for name, one in shapes.obs.items() if name not in images}
-    return (
-        {name: (one.shape[1], one.shape[2]) for name, one in images.items()},
-        {name: one.shape[0] for name, one in vectors.items()},
-    )
+
+    images: dict[str, tuple[int, int]] = {}
+    vectors: dict[str, int] = {}
+    for name, entry in shapes.obs.items():
+        if entry.get("type", "low_dim") == "rgb":
+            images[name] = (entry.shape[1], entry.shape[2])
+        else:
+            vectors[name] = entry.shape[0]
+    return images, vectors
 
 
-def _draws(module: Any, device: Any) -> int:
-    """Have the module denoise without waiting for its device, and return how often it then draws
-    noise.
+def _sample_without_waiting(module: Any, device: Any) -> None:
+    """Set the scheduler's time steps, and make the module denoise without waiting for its
+    device.
     """
     scheduler = module.noise_scheduler
     scheduler.set_timesteps(module.num_inference_steps)
-    # Else the loop may be another.
+    # A class from elsewhere may define a different loop.
     if type(module).conditional_sample.__module__.startswith("diffusion_policy."):
         module.conditional_sample = partial(
             _conditional_sample, module, scheduler.timesteps.to(device)
         )
-    noisy = "variance_type" in scheduler.config  # DDPM's steps add noise, except the last one
-    return 1 + noisy * int((scheduler.timesteps > 0).sum())
+
+
+def _noise_draws(module: Any) -> int:
+    """Return how many times a pass draws noise, once the scheduler's time steps are set."""
+    scheduler = module.noise_scheduler
+    if "variance_type" not in scheduler.config:
+        return 1
+    # Each of DDPM's steps adds noise, except the last one.
+    return 1 + int((scheduler.timesteps > 0).sum())
 
 
 def _conditional_sample(
@@ -332,26 +379,46 @@ def _conditional_sample(
     cond: Any = None,
     **options: Any,
 ) -> Any:
-    """Return numbers (B, T, D), denoised as the module's `conditional_sample` does, without waiting
-    for a GPU.
+    """Denoise as the module's `conditional_sample` does, without waiting for a GPU.
 
-    Theirs copies the time to it, and indexes by truth values, at each step. `times` are on the
-    device; the scheduler branches on its own, on the CPU. `data` (B, T, D) are not denoised where
-    `known`.
+    The module's own loop waits in each step: it copies the time to the device, and indexes by
+    truth values.
+
+    Args:
+        module: The policy's module.
+        times: The scheduler's time steps, on the device.
+        data: (B, T, D), the values that are not denoised.
+        known: (B, T, D) bool, where `data` applies.
+        generator: The generator of the scheduler's noise.
+        cond: The observations, unless `options` has "local_cond" or "global_cond".
+        options: Further arguments of the network and of the scheduler's `step`.
+
+    Returns:
+        The denoised values, (B, T, D).
     """
-    torch, scheduler = require("torch"), module.noise_scheduler
-    names = [name for name in ("local_cond", "global_cond") if name in options]
-    seen: dict[str, Any] = {name: options.pop(name) for name in names} or {"cond": cond}
+    torch = require("torch")
+    scheduler = module.noise_scheduler
+    conditions: dict[str, Any] = {}
+    for name in ("local_cond", "global_cond"):
+        if name in options:
+            conditions[name] = options.pop(name)
+    if not conditions:
+        conditions["cond"] = cond
+
     randn = require("diffusers.utils.torch_utils").randn_tensor
-    numbers = torch.where(known, data, randn(data.shape, device=data.device, dtype=data.dtype))
+    noise = randn(data.shape, device=data.device, dtype=data.dtype)
+    sample = torch.where(known, data, noise)
+
+    # The network reads the time on the device; the scheduler branches on its time on the CPU.
     scheduler.set_timesteps(module.num_inference_steps)
-    for time, time_there in zip(scheduler.timesteps, times, strict=True):
-        output = module.model(numbers, time_there, **seen)
-        numbers = scheduler.step(output, time, numbers, generator=generator, **options).prev_sample
-        numbers = torch.where(known, data, numbers)
-    return numbers
+    for time, device_time in zip(scheduler.timesteps, times, strict=True):
+        output = module.model(sample, device_time, **conditions)
+        sample = scheduler.step(output, time, sample, generator=generator, **options).prev_sample
+        sample = torch.where(known, data, sample)
+    return sample
 
 
+# The flag of a module -> the argument of its network that takes the observations.
 _CONDITIONS = {
     "obs_as_cond": "cond",
     "obs_as_local_cond": "local_cond",
@@ -360,40 +427,48 @@ _CONDITIONS = {
 
 
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
-    """Compile a module's denoising network and its image encoder, both of which `predict_action`
-    calls.
+    """Compile the denoising network and the image encoder of a module, both of which
+    `predict_action` calls.
+
+    Args:
+        network: The network, whose module is changed.
+        compilation: The compilation of the policy.
     """
     module = network.module
-    _without_branches_on_values(module, network.staging.device)
-    condition = next(
-        (name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), ""
-    )
-    module.model.forward = _denoising(module.model.forward, condition, compilation)
-    if (encoder := getattr(module, "obs_encoder", None)) is not None:
+    _replace_branches_on_values(module, network.staging.device)
+
+    flags = [flag for flag in _CONDITIONS if getattr(module, flag, False)]
+    condition = _CONDITIONS[flags[0]] if flags else ""
+    module.model.forward = _compiled_denoiser(module.model.forward, condition, compilation)
+
+    encoder = getattr(module, "obs_encoder", None)
+    if encoder is not None:
         names = [*network.images, *network.vectors]
-        encoder.forward = _looking(encoder.forward, names, module.n_obs_steps, compilation)
+        encoder.forward = _compiled_encoder(encoder.forward, names, module.n_obs_steps, compilation)
 
 
-def _denoising(
+def _compiled_denoiser(
     forward: Callable[..., Any], condition: str, compilation: Compilation
 ) -> Callable[..., Any]:
     """Return the denoising network as its loop calls it; `condition` is the name of its argument
     for observations.
     """
 
-    def denoise(sample: Any, times: Any, *seen: Any) -> Any:
-        return forward(sample, times, **dict(zip([condition], seen, strict=False)))
+    def denoise(sample: Any, times: Any, *observations: Any) -> Any:
+        # There are no observations where the sample contains them.
+        return forward(sample, times, **dict(zip([condition], observations, strict=False)))
 
     core = compilation.core("denoise", denoise)
 
-    def call(sample: Any, time: Any, *seen: Any, **named: Any) -> Any:
-        given = [one for one in (*seen, *named.values()) if one is not None]
-        return core(sample, time.to(sample.device).expand(len(sample)), *given)
+    def call(sample: Any, time: Any, *args: Any, **options: Any) -> Any:
+        times = time.to(sample.device).expand(len(sample))
+        observations = [value for value in (*args, *options.values()) if value is not None]
+        return core(sample, times, *observations)
 
     return call
 
 
-def _looking(
+def _compiled_encoder(
     forward: Callable[..., Any], names: list[str], steps: int, compilation: Compilation
 ) -> Callable[[Mapping[str, Any]], Any]:
     """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of
@@ -401,34 +476,34 @@ def _looking(
     """
 
     def encode_images(*frames: Any) -> Any:
-        seen = {name: frame.flatten(0, 1) for name, frame in zip(names, frames, strict=True)}
-        return forward(seen).reshape(len(frames[0]), steps, -1)
+        inputs = {name: frame.flatten(0, 1) for name, frame in zip(names, frames, strict=True)}
+        return forward(inputs).reshape(len(frames[0]), steps, -1)
 
     core = compilation.core("vision encoder", encode_images)
 
-    def call(seen: Mapping[str, Any]) -> Any:
-        return core(*(seen[name].unflatten(0, (-1, steps)) for name in names)).flatten(0, 1)
+    def call(inputs: Mapping[str, Any]) -> Any:
+        frames = [inputs[name].unflatten(0, (-1, steps)) for name in names]
+        return core(*frames).flatten(0, 1)
 
     return call
 
 
-def _without_branches_on_values(module: Any, device: Any) -> None:
-    """Replace parts of torch that branch on values of tensors, which compiled programs cannot
-    do.
+def _replace_branches_on_values(module: Any, device: Any) -> None:
+    """Replace the methods of torch that branch on values of tensors, which compiled programs
+    cannot do.
     """
-    torch, transforms = require("torch"), require("torchvision.transforms")
-    for part in module.modules():
-        if isinstance(part, transforms.Normalize):  # refuses a std of 0
-            mean, std = (
-                torch.tensor(numbers, device=device).view(-1, 1, 1)
-                for numbers in (part.mean, part.std)
-            )
-            part.forward = partial(_normalised, mean, std)
-        elif isinstance(part, torch.nn.TransformerDecoder):
-            # tests whether its mask is causal, for a faster kernel
-            part.forward = partial(part.forward, tgt_is_causal=False)
-        elif isinstance(part, torch.nn.TransformerEncoder):
-            part.forward = partial(part.forward, is_causal=False)
+    torch = require("torch")
+    transforms = require("torchvision.transforms")
+    for layer in module.modules():
+        if isinstance(layer, transforms.Normalize):  # checks for a std of 0
+            mean = torch.tensor(layer.mean, device=device).view(-1, 1, 1)
+            std = torch.tensor(layer.std, device=device).view(-1, 1, 1)
+            layer.forward = partial(_normalised, mean, std)
+        elif isinstance(layer, torch.nn.TransformerDecoder):
+            # checks whether its mask is causal, for a faster kernel
+            layer.forward = partial(layer.forward, tgt_is_causal=False)
+        elif isinstance(layer, torch.nn.TransformerEncoder):
+            layer.forward = partial(layer.forward, is_causal=False)
 
 
 def _normalised(mean: Any, std: Any, image: Any) -> Any:
