@@ -40,8 +40,8 @@ from vlagents_ray.registry import require
 from vlagents_ray_models.model_code import remote_code, use_source
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
-# Representations of actions -> whether decoded ones are deltas.
-_CONVERTED = {"RELATIVE": False, "DELTA": True}
+# Relative representations of actions -> whether decoded actions are deltas.
+_RELATIVE = {"RELATIVE": False, "DELTA": True}
 _SPACES = {"NON_EEF": "joint", "EEF": "ee_pose"}
 _ROTATIONS = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
 _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T's training does"
@@ -51,131 +51,175 @@ _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T
 class Embodiment:
     """The inputs and the actions of one robot of a checkpoint."""
 
-    value: str  # its name, by which GR00T's code finds it, like an `EmbodimentTag`
+    value: str  # its name, which GR00T's code reads from this field, as from an `EmbodimentTag`
     cameras: tuple[str, ...]
     state: Mapping[str, int]  # groups and their widths, in the model's order
-    action: Mapping[str, int]
-    # Of "video" and "state": offsets of the observations read, 0 for the newest.
-    moments: Mapping[str, tuple[int, ...]]
+    action: Mapping[str, int]  # as `state`
+    # For "video" and "state", the offsets of the observations that are read; 0 is the newest.
+    offsets: Mapping[str, tuple[int, ...]]
     horizon: int  # rows of a chunk
     spec: ActionSpec
-    # Of the training: "state" and "action", by group, in the robot's units.
+    # Bounds of the training's "state" and "action", by group, in the robot's units.
     ranges: Mapping[str, Any]
 
     @property
     def history(self) -> int:
         """The number of consecutive observations that the model reads."""
-        return 1 - min(min(moments, default=0) for moments in self.moments.values())
+        return 1 - min(min(offsets, default=0) for offsets in self.offsets.values())
 
     @classmethod
-    def of(cls, folder: Path, name: str | None) -> Embodiment:
-        """Read an embodiment from a processor's folder, by default the only one; raises
-        `ConfigError`.
+    def from_folder(cls, folder: Path, name: str | None) -> Embodiment:
+        """Read an embodiment from the folder of a processor.
+
+        Args:
+            folder: The folder with the processor's configuration and its statistics.
+            name: The name of the embodiment; None: the only one that has statistics.
+
+        Raises:
+            ConfigError: A file or a statistic is missing, or `name` does not decide on one
+                embodiment.
         """
-        try:
-            settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
-            statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
-            configs = settings["modality_configs"]
-        except FileNotFoundError as error:
-            have = sorted(one.name for one in folder.iterdir())
-            raise ConfigError(
-                f"checkpoint {folder}: has no {Path(error.filename).name}, has {have}; {_CURE}"
-            ) from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(
-                f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's "
-                f"processor ({type(error).__name__}: {error}); {_CURE}"
-            ) from error
-        known = sorted(set(configs) & set(statistics))
-        chosen = name if name is not None else known[0] if len(known) == 1 else None
-        if chosen is None or chosen not in known:
-            others = sorted(set(configs) - set(statistics))
-            raise ConfigError(
-                f"embodiment: got {name!r}, want one of "
-                f"{known}{f'; {others} have no statistics in this checkpoint' if others else ''}"
-            )
-        config, numbers = configs[chosen], statistics[chosen]
-        names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
-        ranges = {
-            kind: {
-                group: _range(folder, numbers, kind, group, names)
-                for group in config[kind]["modality_keys"]
-            }
-            for kind in ("state", "action")
-        }
-        widths = {
-            kind: {group: len(one[names[0]]) for group, one in groups.items()}
-            for kind, groups in ranges.items()
-        }
+        settings, statistics = _read_processor(folder)
+        configs = settings["modality_configs"]
+        name = _choose_embodiment(name, configs, statistics)
+        config = configs[name]
+
+        bound_names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
+        ranges: dict[str, dict[str, dict[str, list[float]]]] = {}
+        widths: dict[str, dict[str, int]] = {}
+        for kind in ("state", "action"):
+            ranges[kind], widths[kind] = {}, {}
+            for group in config[kind]["modality_keys"]:
+                bounds = _bounds(folder, statistics[name], kind, group, bound_names)
+                ranges[kind][group] = bounds
+                widths[kind][group] = len(bounds[bound_names[0]])
+
+        action_spec = _action_spec(
+            config["action"].get("action_configs") or (),
+            sum(widths["action"].values()),
+            converts=bool(settings.get("use_relative_action")),
+        )
         return cls(
-            chosen,
-            tuple(config["video"]["modality_keys"]),
-            widths["state"],
-            widths["action"],
-            {kind: tuple(config[kind]["delta_indices"]) for kind in ("video", "state")},
-            len(config["action"]["delta_indices"]),
-            _action(
-                config["action"].get("action_configs") or (),
-                sum(widths["action"].values()),
-                converted=bool(settings.get("use_relative_action")),
-            ),
-            ranges,
+            value=name,
+            cameras=tuple(config["video"]["modality_keys"]),
+            state=widths["state"],
+            action=widths["action"],
+            offsets={kind: tuple(config[kind]["delta_indices"]) for kind in ("video", "state")},
+            horizon=len(config["action"]["delta_indices"]),
+            spec=action_spec,
+            ranges=ranges,
         )
 
     def require_fits(self, config: Any) -> None:
         """Raise `ConfigError` unless the model of `config` has room for the state, the actions
         and the chunk's rows.
         """
-        for what, got, most in (
-            ("state", sum(self.state.values()), config.max_state_dim),
-            ("action", sum(self.action.values()), config.max_action_dim),
-            ("chunk", self.horizon, config.action_horizon),
-        ):
-            if got > most:
+        sizes = (
+            ("state", "numbers", sum(self.state.values()), config.max_state_dim),
+            ("action", "numbers", sum(self.action.values()), config.max_action_dim),
+            ("chunk", "rows", self.horizon, config.action_horizon),
+        )
+        for name, unit, size, largest in sizes:
+            if size > largest:
                 raise ConfigError(
-                    f"embodiment {self.value!r}: its {what} has {got} "
-                    f"{'rows' if what == 'chunk' else 'numbers'}, the "
-                    f"model at most {most}: is the processor that of another checkpoint?"
+                    f"embodiment {self.value!r}: its {name} has {size} {unit}, the model at most "
+                    f"{largest}: is the processor that of another checkpoint?"
                 )
 
 
-def _range(
-    folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]
-) -> dict[str, Any]:
-    """Return the bounds of a group of the state or of actions, which are finite."""
-    bounds = [
-        np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names
-    ]
-    if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
+def _read_processor(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the settings of a processor and its statistics by embodiment."""
+    try:
+        settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
+        statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
+        settings["modality_configs"]  # raises KeyError if there are none
+    except FileNotFoundError as error:
+        files = sorted(file.name for file in folder.iterdir())
         raise ConfigError(
-            f"checkpoint {folder}: {STATISTICS} has no {list(names)} of {kind} {group!r}, has "
-            f"those of {sorted(numbers.get(kind, {}))}; without them its numbers have no units: "
+            f"checkpoint {folder}: has no {Path(error.filename).name}, has {files}; {_CURE}"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's "
+            f"processor ({type(error).__name__}: {error}); {_CURE}"
+        ) from error
+    return settings, statistics
+
+
+def _choose_embodiment(
+    name: str | None, configs: Mapping[str, Any], statistics: Mapping[str, Any]
+) -> str:
+    """Return the name if that embodiment has statistics; for None, the only one that has."""
+    usable = sorted(set(configs) & set(statistics))
+    if name is None and len(usable) == 1:
+        return usable[0]
+    if name is None or name not in usable:
+        unusable = sorted(set(configs) - set(statistics))
+        hint = f"; {unusable} have no statistics in this checkpoint" if unusable else ""
+        raise ConfigError(f"embodiment: got {name!r}, want one of {usable}{hint}")
+    return name
+
+
+def _bounds(
+    folder: Path,
+    statistics: Mapping[str, Any],
+    kind: str,
+    group: str,
+    bound_names: tuple[str, str],
+) -> dict[str, list[float]]:
+    """Return the bounds of a group by their names.
+
+    Args:
+        folder: The folder of the processor, for messages.
+        statistics: The statistics of the embodiment.
+        kind: "state" or "action".
+        group: The name of the group.
+        bound_names: The names of the lower and the upper bounds.
+
+    Raises:
+        ConfigError: A bound is missing or not finite.
+    """
+    of_kind = statistics.get(kind, {})
+    lower, upper = (
+        np.asarray(of_kind.get(group, {}).get(name, ()), np.float64) for name in bound_names
+    )
+    if lower.ndim != 1 or not lower.size or lower.shape != upper.shape:
+        raise ConfigError(
+            f"checkpoint {folder}: {STATISTICS} has no {list(bound_names)} of {kind} {group!r}, "
+            f"has those of {sorted(of_kind)}; without them its numbers have no units: {_CURE}"
+        )
+    if not np.isfinite([lower, upper]).all():
+        raise ConfigError(
+            f"checkpoint {folder}: {list(bound_names)} of {kind} {group!r} are not all finite; "
             f"{_CURE}"
         )
-    if not np.isfinite(bounds).all():
-        raise ConfigError(
-            f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}"
-        )
-    return dict(zip(names, (bound.tolist() for bound in bounds), strict=True))
+    return dict(zip(bound_names, (lower.tolist(), upper.tolist()), strict=True))
 
 
-def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
+def _action_spec(groups: Any, dim: int, *, converts: bool) -> ActionSpec:
     """Describe the actions by their relative groups.
 
-    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract
-    does not state it. GR00T converts relative groups to absolute ones if the processor has
-    `use_relative_action`.
+    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the
+    contract does not declare these.
+
+    Args:
+        groups: The checkpoint's description of each group.
+        dim: How many numbers an action has.
+        converts: Whether GR00T converts relative groups to absolute ones, as it does if the
+            processor has `use_relative_action`.
     """
-    stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
-    tables: Any = {
-        "delta": (_CONVERTED, "rep"),
+    relative = [group for group in groups if converts and group["rep"] in _RELATIVE]
+    fields: dict[str, tuple[Mapping[str, Any], str]] = {
+        "delta": (_RELATIVE, "rep"),
         "space": (_SPACES, "type"),
         "rotation": (_ROTATIONS, "format"),
     }
-    found = {
-        name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()
-    }
-    return ActionSpec(dim=dim, **{name: one.pop() for name, one in found.items() if len(one) == 1})
+    facts: dict[str, Any] = {}
+    for field_name, (meanings, key) in fields.items():
+        values = {meanings.get(group[key]) for group in relative}
+        if len(values) == 1:  # an `ActionSpec` has one value for all groups
+            facts[field_name] = values.pop()
+    return ActionSpec(dim=dim, **facts)
 
 
 class Gr00tConfig(ModelConfig):
@@ -184,13 +228,12 @@ class Gr00tConfig(ModelConfig):
     checkpoint: str = Field(
         min_length=1,
         description="folder of GR00T's training, such as outputs/checkpoint-{step}, or hub id: "
-        "org/name, "
-        "org/name@COMMIT",
+        "org/name, org/name@COMMIT",
     )
     source_dir: str | None = Field(
         default=None,
-        description="a checkout of Isaac-GR00T; unset: the variable GR00T_SRC, or what is "
-        "installed",
+        description="a checkout of Isaac-GR00T; unset: the one that the variable GR00T_SRC names, "
+        "or the installed one",
     )
     embodiment: str | None = Field(
         default=None,
@@ -200,8 +243,8 @@ class Gr00tConfig(ModelConfig):
     backbone: str | None = Field(
         default=None,
         description="N1.7: folder of the vision-language model that the checkpoint names, "
-        "nvidia/Cosmos-Reason2-2B, "
-        "whose path must contain that name; unset: from the hub or its cache",
+        "nvidia/Cosmos-Reason2-2B, whose path must contain that name; unset: from the hub or its "
+        "cache",
     )
     steps: int | None = Field(
         default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4"
@@ -210,18 +253,25 @@ class Gr00tConfig(ModelConfig):
         default=32,
         ge=0,
         description="compiled: tokens that a prompt may have beyond two words; a longer one runs "
-        "without",
+        "without compilation",
     )
     trust_remote_code: bool = Field(
         default=False,
         description="run Python code in the checkpoint or its backbone: write access to them then "
-        "gives all rights "
-        "of this process",
+        "gives all rights of this process",
     )
 
 
 SOURCE = "GR00T_SRC"
 _MODEL = "config.json"
+
+
+@dataclass(frozen=True)
+class Gr00tInputs:
+    """The inputs of one row."""
+
+    processed: Any  # the result of the checkpoint's processor
+    state: dict[str, np.ndarray]  # (T, D) float32 by group, from which actions are decoded
 
 
 @dataclass(frozen=True)
@@ -231,37 +281,43 @@ class Gr00tNetwork:
     model: Any
     processor: Any
     embodiment: Embodiment
-    # Held while a thread's processor reads an observation: its transforms store their parameters,
-    # and it changes the warning filters of the whole process.
+    # One thread at a time may use the processor: its transforms store their parameters, and it
+    # changes the warning filters of the whole process.
     reading: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def load(cls, config: Gr00tConfig) -> Gr00tNetwork:
-        """Read a checkpoint; raises `ConfigError` if a part of it is missing, unknown or
-        randomly initialised.
+        """Read a checkpoint.
+
+        Raises:
+            ConfigError: A file or a weight of it is missing, or it is of another version or
+                embodiment.
         """
         code = _use_checkout(config.source_dir)
         folder = find_checkpoint(
             config.checkpoint, config.checkpoint_step, needs=[_MODEL, "*.safetensors"]
         )
         _require_version(folder)
-        beside = folder / "processor"  # where N1.7's training saves it
-        about = folder if (folder / CONFIG).is_file() or not beside.is_dir() else beside
-        embodiment = Embodiment.of(about, config.embodiment)
+        processor_folder = _processor_folder(folder)
+        embodiment = Embodiment.from_folder(processor_folder, config.embodiment)
+
         device = torch_device(config.device)
         dtype = torch_dtype(config.dtype, device)
-        other = {} if config.backbone is None else {"model_name": config.backbone}
+        # flash-attention computes 16-bit numbers on GPUs only.
+        uses_flash = (
+            device.type == "cuda"
+            and dtype.itemsize == 2
+            and bool(require("transformers.utils").is_flash_attn_2_available())
+        )
         transformers = require("transformers")
-        # flash-attention, if it is installed.
-        computes = device.type == "cuda" and dtype.itemsize == 2
-        flash = computes and bool(require("transformers.utils").is_flash_attn_2_available())
+        options = {} if config.backbone is None else {"model_name": config.backbone}
         with (
             remote_code(allowed=config.trust_remote_code, source=code),
-            contextlib.nullcontext() if flash else built_without_flash_attention(),
+            contextlib.nullcontext() if uses_flash else built_without_flash_attention(),
         ):
             try:
-                model = transformers.AutoModel.from_pretrained(folder, torch_dtype=dtype, **other)
-                processor = transformers.AutoProcessor.from_pretrained(about, **other)
+                model = transformers.AutoModel.from_pretrained(folder, torch_dtype=dtype, **options)
+                processor = transformers.AutoProcessor.from_pretrained(processor_folder, **options)
             except ConfigError:
                 raise
             except (
@@ -277,10 +333,11 @@ class Gr00tNetwork:
                     f"{str(error).strip()[:500]}); is it complete, of this checkout's version, and "
                     "its backbone on the hub, in the cache, or in a folder that `backbone` names?"
                 ) from error
-        if not flash:
+        if not uses_flash:
             use_torch_attention(model)
+
         saved = SavedTensors.open(folder)
-        model = _converted(model.eval().requires_grad_(False), saved, device, dtype)
+        model = _moved(model.eval().requires_grad_(False), saved, device, dtype)
         require_loaded(model, saved)
         embodiment.require_fits(model.config)
         if embodiment.value not in processor.embodiment_id_mapping:
@@ -289,6 +346,7 @@ class Gr00tNetwork:
                 f"{sorted(processor.embodiment_id_mapping)}; save the checkpoint's processor with "
                 "it"
             )
+
         if config.steps is not None:
             model.action_head.num_inference_timesteps = config.steps
         processor.eval()
@@ -299,86 +357,107 @@ class Gr00tNetwork:
         """Whether all layers above the language model mask padding, as N1.6's usual transformer
         does.
         """
-        over = getattr(self.model.action_head, "vl_self_attention", None)
-        plain = over is None or not list(over.parameters())
-        return plain and bool(self.model.config.use_alternate_vl_dit)
+        layers = getattr(self.model.action_head, "vl_self_attention", None)
+        has_none = layers is None or not list(layers.parameters())
+        return has_none and bool(self.model.config.use_alternate_vl_dit)
 
-    def inputs(
+    def read(
         self,
         images: Sequence[dict[str, np.ndarray]],
         states: Sequence[dict[str, np.ndarray]],
         instruction: str,
-    ) -> dict[str, Any]:
-        """Return the model's inputs for one row, to be passed to `chunks`.
+    ) -> Gr00tInputs:
+        """Convert observations to the inputs of one row.
 
         Args:
-            images: For each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by
-                camera.
-            states: For each moment of its state, (D,) float32 by group.
+            images: The images of each observation that the embodiment's video reads, oldest first:
+                (H, W, 3) uint8 by camera.
+            states: The state of each observation that its state reads: (D,) float32 by group.
             instruction: The task in words.
-        """
-        types, robot = require("gr00t.data.types"), self.embodiment
-        raw = {group: np.stack([one[group] for one in states]) for group in robot.state}
-        step = types.VLAStepData(
-            images={camera: [one[camera] for one in images] for camera in robot.cameras},
-            states=raw,
-            actions={},
-            text=instruction,
-            embodiment=robot,
-        )
-        with self.reading:
-            processed = self.processor(
-                [{"type": types.MessageType.EPISODE_STEP.value, "content": step}]
-            )
-        return {"processed": processed, "raw": raw}
 
-    def chunks(
-        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]]
+        Returns:
+            The inputs, to be passed to `compute_chunks`.
+        """
+        types = require("gr00t.data.types")
+        robot = self.embodiment
+        videos: dict[str, list[np.ndarray]] = {}
+        for camera in robot.cameras:
+            videos[camera] = [by_camera[camera] for by_camera in images]
+        state: dict[str, np.ndarray] = {}
+        for group in robot.state:
+            state[group] = np.stack([by_group[group] for by_group in states])
+
+        step = types.VLAStepData(
+            images=videos, states=state, actions={}, text=instruction, embodiment=robot
+        )
+        message = {"type": types.MessageType.EPISODE_STEP.value, "content": step}
+        with self.reading:
+            processed = self.processor([message])
+        return Gr00tInputs(processed, state)
+
+    def compute_chunks(
+        self, rngs: Sequence[np.random.Generator], inputs: Sequence[Gr00tInputs]
     ) -> list[np.ndarray]:
-        """Compute the chunks of rows, (horizon, D) float32 each, in one pass, or in one for each
-        length of prompts.
+        """Compute the chunks of rows in one pass, or in one pass for each length of a prompt if
+        the model does not mask padding.
 
         Args:
             rngs: The generator of each row's noise.
-            inputs: The result of `inputs` for each row.
+            inputs: The result of `read` for each row.
+
+        Returns:
+            A chunk for each row, (horizon, D) float32, in the robot's units.
         """
-        whole = self._collated(inputs)
-        lengths = whole["inputs"]["attention_mask"].sum(1).tolist()
+        batch = self._collate(inputs)
+        lengths = batch["inputs"]["attention_mask"].sum(1).tolist()
         if self.masks_padding or len(set(lengths)) == 1:
-            return self._chunks(rngs, inputs, whole)
-        found: dict[int, np.ndarray] = {}
+            return self._compute_pass(rngs, inputs, batch)
+
+        chunks: dict[int, np.ndarray] = {}
         for length in sorted(set(lengths)):
-            places = [place for place, one in enumerate(lengths) if one == length]
-            some = [inputs[place] for place in places]
-            chunks = self._chunks([rngs[place] for place in places], some, self._collated(some))
-            found |= zip(places, chunks, strict=True)
-        return [found[place] for place in range(len(inputs))]
+            indices = [i for i, row_length in enumerate(lengths) if row_length == length]
+            pass_rngs = [rngs[i] for i in indices]
+            pass_inputs = [inputs[i] for i in indices]
+            pass_chunks = self._compute_pass(pass_rngs, pass_inputs, self._collate(pass_inputs))
+            chunks |= zip(indices, pass_chunks, strict=True)
+        return [chunks[i] for i in range(len(inputs))]
 
-    def _collated(self, inputs: Sequence[dict[str, Any]]) -> Any:
-        return self.processor.collator([one["processed"] for one in inputs])
+    def _collate(self, inputs: Sequence[Gr00tInputs]) -> Any:
+        return self.processor.collator([row.processed for row in inputs])
 
-    def _chunks(
-        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]], collated: Any
+    def _compute_pass(
+        self, rngs: Sequence[np.random.Generator], inputs: Sequence[Gr00tInputs], batch: Any
     ) -> list[np.ndarray]:
+        """Compute the chunks of the rows whose inputs `batch` contains."""
         from vlagents_ray_models.sampling_rng import RowDraws
 
         with require("torch").inference_mode(), RowDraws(rngs, self.model.action_head):
-            drawn = fetch(self.model.get_action(**collated)["action_pred"].float())
-        raw = {
-            group: np.stack([one["raw"][group] for one in inputs])
-            for group in self.embodiment.state
-        }
-        decoded = self.processor.decode_action(drawn, self.embodiment, raw)
-        return list(
-            np.concatenate([decoded[group] for group in self.embodiment.action], axis=-1).astype(
-                np.float32
-            )
-        )
+            predicted = fetch(self.model.get_action(**batch)["action_pred"].float())
+
+        states: dict[str, np.ndarray] = {}
+        for group in self.embodiment.state:
+            states[group] = np.stack([row.state[group] for row in inputs])
+        decoded = self.processor.decode_action(predicted, self.embodiment, states)
+        groups = [decoded[group] for group in self.embodiment.action]
+        return list(np.concatenate(groups, axis=-1).astype(np.float32))
+
+
+def _processor_folder(folder: Path) -> Path:
+    """Return the folder of a checkpoint's processor: its own, or the one beneath it where N1.7's
+    training saves it.
+    """
+    beneath = folder / "processor"
+    return folder if (folder / CONFIG).is_file() or not beneath.is_dir() else beneath
 
 
 def _use_checkout(source_dir: str | None) -> Path:
-    """Make GR00T's code importable; return the folder of its models, which hold code that
-    transformers imports.
+    """Make GR00T's code importable.
+
+    Returns:
+        The folder of its models, whose code transformers imports.
+
+    Raises:
+        ConfigError: It is not found, or of N1.5 or an earlier version.
     """
     use_source("gr00t", SOURCE, source_dir)
     if importlib.util.find_spec("gr00t.policy") is None:
@@ -393,19 +472,23 @@ def _use_checkout(source_dir: str | None) -> Path:
     return Path(str(require("gr00t.model").__file__)).parent
 
 
-def _converted(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
-    """Move a model to a device and a dtype; N1.6's backbone is always read in bfloat16, which
-    rounds.
+def _moved(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
+    """Move a model to a device and a dtype.
+
+    GR00T's code reads N1.6's backbone in bfloat16, which rounds its weights. If the model computes
+    in another type, they are copied from the checkpoint again.
     """
-    rounded, held = require("torch").bfloat16, set(saved)
-    names = {
-        name
-        for name, one in model.state_dict().items()
-        if one.dtype == rounded != dtype and name in held
-    }
+    bfloat16 = require("torch").bfloat16
+    rounded_names: set[str] = set()
+    if dtype != bfloat16:
+        saved_names = set(saved)
+        for name, tensor in model.state_dict().items():
+            if tensor.dtype == bfloat16 and name in saved_names:
+                rounded_names.add(name)
+
     model = model.to(device=device, dtype=dtype)
     for name, tensor in model.state_dict().items():
-        if name in names:
+        if name in rounded_names:
             tensor.copy_(saved[name])
     return model
 
@@ -413,26 +496,28 @@ def _converted(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
 def _require_version(folder: Path) -> None:
     """Raise `ConfigError` unless the checkout has the class of the checkpoint's model."""
     try:
-        kind = json.loads((folder / _MODEL).read_text(encoding="utf-8")).get("model_type")
+        model_type = json.loads((folder / _MODEL).read_text(encoding="utf-8")).get("model_type")
     except (ValueError, AttributeError) as error:
         raise ConfigError(
             f"checkpoint {folder}: {_MODEL} cannot be read ({error}); copy it again"
         ) from error
-    known = sorted(one.model_type for one in require("gr00t.model").MODEL_REGISTRY)
-    if kind not in known:
+
+    registered = sorted(entry.model_type for entry in require("gr00t.model").MODEL_REGISTRY)
+    if model_type in registered:
+        return
+    if model_type is None:
+        cure = "one that LeRobot saved is served by the policy `lerobot`"
+    elif "n1_5" in str(model_type).lower():
         cure = (
-            (
-                "N1.5's code is another: serve it by its own server, and the policy `upstream` in "
-                "front of it"
-            )
-            if "n1_5" in str(kind).lower()
-            else "one that LeRobot saved is served by the policy `lerobot`"
-            if kind is None
-            else "name the checkout of its version"
+            "N1.5's code is another: serve it by its own server, and the policy `upstream` in "
+            "front of it"
         )
-        raise ConfigError(
-            f"checkpoint {folder}: got model_type {kind!r}, this checkout has {known}; {cure}"
-        )
+    else:
+        cure = "name the checkout of its version"
+    raise ConfigError(
+        f"checkpoint {folder}: got model_type {model_type!r}, this checkout has {registered}; "
+        f"{cure}"
+    )
 
 
 _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
@@ -446,10 +531,14 @@ def built_without_flash_attention() -> Iterator[None]:
     """
     base: Any = require("transformers").PreTrainedModel
     check = vars(base).get(_CHECK)
-    if check is None:  # newer: N1.7's, which falls back to another attention
+    if check is None:  # N1.7's transformers, which falls back to another attention
         yield
         return
-    setattr(base, _CHECK, classmethod(lambda _, config, *__, **___: config))
+
+    def accept(_cls: Any, config: Any, *_args: Any, **_options: Any) -> Any:
+        return config
+
+    setattr(base, _CHECK, classmethod(accept))
     try:
         yield
     finally:
@@ -457,28 +546,30 @@ def built_without_flash_attention() -> Iterator[None]:
 
 
 def use_torch_attention(model: Any) -> None:
-    """Replace flash-attention by torch's attention; N1.6's vision tower attends within each
-    image.
+    """Replace flash-attention with torch's attention in all layers of a model.
+
+    Torch's attention does not separate the images that N1.6's vision encoder concatenates;
+    `packed_attention` does.
     """
     transformers = require("transformers.modeling_utils")
     for module in model.modules():
         config: Any = getattr(module, "config", None)
         if config is not None and getattr(config, "_attn_implementation", None) == _FLASH:
-            packed = config.model_type.startswith("siglip2")
-            config._attn_implementation = _PACKED if packed else "sdpa"
+            is_packed = config.model_type.startswith("siglip2")
+            config._attn_implementation = _PACKED if is_packed else "sdpa"
     transformers.AttentionInterface.register(_PACKED, packed_attention)
 
 
 def packed_attention(
-    _: Any,
+    _module: Any,
     query: Any,
     key: Any,
     value: Any,
-    __: Any = None,
+    _attention_mask: Any = None,
     *,
     scaling: float,
     seq_len_list: Sequence[int],
-    **___: Any,
+    **_options: Any,
 ) -> tuple[Any, None]:
     """Attend within each of several concatenated sequences.
 
@@ -493,71 +584,83 @@ def packed_attention(
         (1, tokens, heads, D), and None in place of the weights.
     """
     attention = require("torch.nn.functional").scaled_dot_product_attention
-    if len(set(seq_len_list)) == 1:  # equal lengths: one call, with a row for each sequence
-        rows = [
-            one[0].unflatten(1, (-1, seq_len_list[0])).transpose(0, 1)
-            for one in (query, key, value)
-        ]
-        return attention(*rows, scale=scaling).transpose(1, 2).flatten(0, 1)[None], None
-    parts = zip(*(one.split(list(seq_len_list), dim=2) for one in (query, key, value)), strict=True)
-    return require("torch").cat(
-        [attention(*part, scale=scaling) for part in parts], dim=2
-    ).transpose(1, 2), None
+    lengths = list(seq_len_list)
+    if len(set(lengths)) == 1:  # equal lengths: one call, with a row for each sequence
+        rows = []
+        for tensor in (query, key, value):
+            rows.append(tensor[0].unflatten(1, (-1, lengths[0])).transpose(0, 1))
+        attended = attention(*rows, scale=scaling)
+        return attended.transpose(1, 2).flatten(0, 1)[None], None
+
+    attended_sequences = []
+    split_tensors = [tensor.split(lengths, dim=2) for tensor in (query, key, value)]
+    for sequence in zip(*split_tensors, strict=True):
+        attended_sequences.append(attention(*sequence, scale=scaling))
+    return require("torch").cat(attended_sequences, dim=2).transpose(1, 2), None
 
 
-# Of tokens (B, S), arguments of N1.6's usual transformer and N1.7's.
+# Masks of tokens (B, S): arguments of N1.6's usual transformer and of N1.7's.
 _MASKS = ("image_mask", "backbone_attention_mask")
 
 
 def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None:
     """Compile the transformer that a GR00T network calls in each step of the flow.
 
-    If it masks padding, prompts with up to `spare` tokens more than those of the first call, the
-    warm-up's, are padded to one shape.
+    If it masks padding, prompts are padded to one shape: the length in the first call, which is
+    the warm-up, and `spare` tokens more.
+
+    Args:
+        transformer: The transformer, whose `forward` is replaced.
+        spare: How many tokens a prompt may have beyond those of the warm-up.
+        compilation: The compilation of the policy.
     """
-    functional, forward = require("torch.nn.functional"), transformer.forward
+    functional = require("torch.nn.functional")
+    forward = transformer.forward
+    padded_length = 0  # tokens; 0 before the first call
 
-    def denoise(hidden: Any, times: Any, seen: Any, *masks: Any) -> Any:
-        masked = dict(zip(_MASKS, masks, strict=False))
-        return forward(hidden_states=hidden, encoder_hidden_states=seen, timestep=times, **masked)
-
-    core, length = compilation.core("denoise", denoise), 0
-
-    def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **given: Any) -> Any:
-        """Return the core's result; the cache of keys and values is not used, as it is of this
-        act alone.
-        """
-        nonlocal length
-        if not compilation.mode:
-            return forward(hidden_states, encoder_hidden_states, timestep, **given)
-        seen, masks = (
-            encoder_hidden_states,
-            [given[name] for name in _MASKS if given.get(name) is not None],
+    def denoise(hidden: Any, times: Any, context: Any, *masks: Any) -> Any:
+        masks_by_name = dict(zip(_MASKS, masks, strict=False))
+        return forward(
+            hidden_states=hidden, encoder_hidden_states=context, timestep=times, **masks_by_name
         )
-        length = length or seen.shape[1] + spare
-        if masks and (missing := length - seen.shape[1]) > 0:
-            seen = functional.pad(seen, (0, 0, 0, missing))
+
+    core = compilation.core("denoise", denoise)
+
+    def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **options: Any) -> Any:
+        """Return the core's result. It does not use the cache of keys and values, which is for
+        this call alone.
+        """
+        nonlocal padded_length
+        if not compilation.mode:
+            return forward(hidden_states, encoder_hidden_states, timestep, **options)
+
+        context = encoder_hidden_states
+        masks = [options[name] for name in _MASKS if options.get(name) is not None]
+        padded_length = padded_length or context.shape[1] + spare
+        missing = padded_length - context.shape[1]
+        if masks and missing > 0:
+            context = functional.pad(context, (0, 0, 0, missing))
             masks = [functional.pad(mask, (0, missing)) for mask in masks]
-        return core(hidden_states, timestep, seen, *masks)
+        return core(hidden_states, timestep, context, *masks)
 
     transformer.forward = call
 
 
-# Of LIBERO; other embodiments use the checkpoint's names.
+# LIBERO's names -> ours; for other embodiments, our names are the checkpoint's.
 USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}
-# The part of the state for a group `gripper` with several numbers, as in LIBERO.
+# The part of our state for a group `gripper` with several numbers, as in LIBERO.
 GRIPPER_QPOS = "gripper_qpos"
 
 
 @dataclass(frozen=True)
-class SeenByGr00t:
-    """An observation by the embodiment's names, and the model's inputs if they need no other
+class Gr00tFrame:
+    """An observation by the embodiment's names, with the model's inputs if they need no other
     observation.
     """
 
     images: dict[str, np.ndarray]  # (H, W, 3) uint8
     state: dict[str, np.ndarray]  # (D,) float32
-    inputs: dict[str, Any] | None = None
+    inputs: Gr00tInputs | None = None
 
 
 class Gr00t(ModelPolicy):
@@ -578,81 +681,89 @@ class Gr00t(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the embodiment; before the checkpoint is loaded it states only the
-        instruction.
+        """The contract of the embodiment; before the checkpoint is loaded, only that an
+        instruction is needed.
         """
         if self.model is None:
             return Contract(instruction=True)
+
         robot = self.model.embodiment
-        parts = self._parts(robot)
-        own = {part: StateSpec(width) for part, width in parts.items() if part != GRIPPER}
-        state = {"state": own} if self.config.state is None else {}
-        return self.stated(
-            self._cameras(robot), list(parts), robot.horizon, action=robot.spec, **state
-        )
+        widths = self._state_widths(robot)
+        facts: dict[str, Any] = {"action": robot.spec}
+        if self.config.state is None:
+            facts["state"] = {
+                part: StateSpec(width) for part, width in widths.items() if part != GRIPPER
+            }
+        return self.stated(self._cameras(robot), list(widths), robot.horizon, **facts)
 
     def load(self) -> Gr00tNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
-        self._cameras(network.embodiment)
+        self._cameras(network.embodiment)  # raises unless the configured cameras fit
         self.statistics = {
-            "parts": list(self._parts(network.embodiment)),
+            "parts": list(self._state_widths(network.embodiment)),
             **network.embodiment.ranges,
         }
         compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 
-    def perceive(self, obs: Obs) -> SeenByGr00t:
+    def perceive(self, obs: Obs) -> Gr00tFrame:
         """Return the images and the state by the embodiment's names, and, without a history, the
         model's inputs.
         """
-        network = self.loaded()
+        network: Gr00tNetwork = self.loaded()
         robot = network.embodiment
-        images = {
-            name: image.copy() for name, image in camera_images(obs, self._cameras(robot)).items()
-        }
-        vector = state_vector(obs, list(self._parts(robot)), self.state_dim)
+        images = camera_images(obs, self._cameras(robot))
+        images = {name: image.copy() for name, image in images.items()}
+
+        vector = state_vector(obs, list(self._state_widths(robot)), self.state_dim)
         ends = np.cumsum([0, *robot.state.values()])
-        state = {
-            group: vector[a:b] for group, (a, b) in zip(robot.state, pairwise(ends), strict=True)
-        }
+        state: dict[str, np.ndarray] = {}
+        for group, (start, end) in zip(robot.state, pairwise(ends), strict=True):
+            state[group] = vector[start:end]
+
         if self.history > 1:
-            return SeenByGr00t(images, state)
-        moments = (len(robot.moments["video"]), len(robot.moments["state"]))
-        inputs = network.inputs(
-            [images] * moments[0], [state] * moments[1], self._begun().instruction
-        )
-        return SeenByGr00t(images, state, inputs)
+            return Gr00tFrame(images, state)
+        # Without a history, all offsets are 0.
+        all_images = [images] * len(robot.offsets["video"])
+        all_states = [state] * len(robot.offsets["state"])
+        inputs = network.read(all_images, all_states, self._begun().instruction)
+        return Gr00tFrame(images, state, inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows whose observations GR00T's processor accepts."""
 
-        def compute(good: list[tuple[np.random.Generator, dict[str, Any]]]) -> list[Prediction]:
-            return [Prediction(chunk) for chunk in self.loaded().chunks(*zip(*good, strict=True))]
+        def compute(valid: list[tuple[np.random.Generator, Gr00tInputs]]) -> list[Prediction]:
+            rngs, inputs = zip(*valid, strict=True)
+            return [Prediction(chunk) for chunk in self.loaded().compute_chunks(rngs, inputs)]
 
         return compute_valid([attempt(self._inputs, row) for row in rows], compute)
 
-    def _inputs(self, row: Row) -> tuple[np.random.Generator, dict[str, Any]]:
+    def _inputs(self, row: Row) -> tuple[np.random.Generator, Gr00tInputs]:
         """Return the random generator and the model's inputs of a row."""
-        newest = row.frames[-1]
+        newest: Gr00tFrame = row.frames[-1]
         if newest.inputs is not None:
             return row.rng, newest.inputs
+
         network: Gr00tNetwork = self.loaded()
         frames = row.history(self.history)
-        moments = network.embodiment.moments
-        images = [frames[moment - 1].images for moment in moments["video"]]
-        state = [frames[moment - 1].state for moment in moments["state"]]
-        return row.rng, network.inputs(images, state, row.instruction)
+        offsets = network.embodiment.offsets
+        images = [frames[offset - 1].images for offset in offsets["video"]]
+        states = [frames[offset - 1].state for offset in offsets["state"]]
+        return row.rng, network.read(images, states, row.instruction)
 
-    def _parts(self, robot: Embodiment) -> dict[str, int | None]:
+    def _state_widths(self, robot: Embodiment) -> dict[str, int | None]:
         """Return the parts of our state that form the model's, with their widths if known."""
         if self.config.state is not None:
             return dict.fromkeys(self.config.state)
-        return {
-            GRIPPER_QPOS if group == GRIPPER and width > 1 else group: width
-            for group, width in robot.state.items()
-        }
+
+        widths: dict[str, int | None] = {}
+        for group, width in robot.state.items():
+            part = GRIPPER_QPOS if group == GRIPPER and width > 1 else group
+            widths[part] = width
+        return widths
 
     def _cameras(self, robot: Embodiment) -> dict[str, str]:
+        """Return our camera for each camera of the embodiment."""
         usual = {name: USUAL_CAMERAS.get(name, name) for name in robot.cameras}
         return choose_cameras(self.config.cameras, usual, list(robot.cameras))

@@ -27,7 +27,7 @@ def test_ranges_are_those_of_the_normalisation_in_the_order_of_the_model(
     (tmp_path / CONFIG).write_text(json.dumps({"processor_kwargs": settings}))
     (tmp_path / STATISTICS).write_text(json.dumps({"mine": {"state": named, "action": named}}))
     trained = Trained.from_statistics(
-        {"parts": ["arm", "gripper"], **Embodiment.of(tmp_path, None).ranges}
+        {"parts": ["arm", "gripper"], **Embodiment.from_folder(tmp_path, None).ranges}
     )
     for span in (trained.state, trained.action):
         assert span is not None

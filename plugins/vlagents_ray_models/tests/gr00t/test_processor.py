@@ -43,9 +43,8 @@ def test_each_observation_is_read_by_itself_on_several_threads(
     network = Gr00tNetwork(None, Processor(), robot)
 
     def read(text: str) -> Any:
-        return network.inputs(
-            [{"front": np.zeros((2, 2, 3), np.uint8)}], [{"arm": np.zeros(2)}], text
-        )["processed"]
+        images = [{"front": np.zeros((2, 2, 3), np.uint8)}]
+        return network.read(images, [{"arm": np.zeros(2)}], text).processed
 
     texts = [f"task {number}" for number in range(40)]
     with ThreadPoolExecutor(4) as threads:
