@@ -1,4 +1,4 @@
-"""Keys and values of a transformers cache as one tensor, which a compiled core can take and
+"""Keys and values of a transformers cache as one tensor, which a compiled core can accept and
 return.
 """
 
@@ -9,26 +9,43 @@ from typing import Any
 
 
 def layers_of(cache: Any) -> list[tuple[Any, Any]]:
-    """Return keys and values of each layer of a transformers `DynamicCache`; its versions differ
-    in where they are.
+    """Return the keys and values of a transformers `DynamicCache` of any version.
+
+    Args:
+        cache: The cache.
+
+    Returns:
+        Keys and values of each layer, (B, heads, L, E) each.
     """
-    if hasattr(cache, "layers"):
+    if hasattr(cache, "layers"):  # newer versions
         return [(layer.keys, layer.values) for layer in cache.layers]
     return [cache[number] for number in range(len(cache))]
 
 
 def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
-    """Return the keys and values (B, heads, L, E) of each layer in one tensor (B, layers, 2,
-    heads, L, E).
+    """Stack the keys and values of all layers.
+
+    Args:
+        layers: Keys and values of each layer, (B, heads, L, E) each.
+
+    Returns:
+        One tensor, (B, layers, 2, heads, L, E).
     """
-    import torch  # the compiler follows a statement, and not `require`
+    import torch  # torch's compiler follows this statement, but not `require`
 
     return torch.stack([torch.stack(layer, 1) for layer in layers], 1)
 
 
 def cache_of(layers: Sequence[Any]) -> Any:
-    """Return a transformers `DynamicCache` with these keys and values, (B, 2, …) for each layer."""
-    # The compiler follows a statement, and not `require`; nor does it follow the lazy module
+    """Make a transformers `DynamicCache`.
+
+    Args:
+        layers: Keys and values of each layer in one tensor, (B, 2, heads, L, E).
+
+    Returns:
+        The cache, which contains them.
+    """
+    # Torch's compiler follows this statement, but neither `require` nor the lazy module
     # `transformers` itself.
     from transformers.cache_utils import DynamicCache
 

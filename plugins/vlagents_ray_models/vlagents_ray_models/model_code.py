@@ -1,5 +1,5 @@
-"""Python code of models from elsewhere: a checkout of their repository, or code in or named by a
-checkpoint.
+"""Python code of models that is not part of this package: from a checkout of the authors'
+repository, in a checkpoint, or in a hub repository that a checkpoint names.
 
 The code of a checkpoint runs with all rights of this process.
 """
@@ -26,60 +26,65 @@ def use_source(
     """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or
     from an installation.
 
-    A named checkout has priority, since Python would import any folder with the package's name,
-    such as a checkout in the working directory.
+    A named checkout has priority over an installation, since Python would import any folder with
+    the package's name, such as a checkout in the working directory.
 
     Args:
         package: The name of the package.
         variable: The environment variable that names a checkout.
-        source_dir: A checkout that replaces the variable's.
-        within: The folders of the checkout to import from; the first one holds `package`.
+        source_dir: A checkout to use in place of the variable's.
+        within: The folders of the checkout to import from; the first one contains `package`.
 
     Raises:
-        ConfigError: None of them holds the package.
+        ConfigError: The package is neither in the checkout nor installed.
     """
     checkout = source_dir or os.environ.get(variable)
     if not checkout and importlib.util.find_spec(package) is not None:
         return
-    folders = (
-        []
-        if not checkout
-        else [Path(checkout).expanduser().resolve() / folder for folder in within]
-    )
+
+    folders: list[Path] = []
+    if checkout:
+        root = Path(checkout).expanduser().resolve()
+        folders = [root / folder for folder in within]
     if not folders or not (folders[0] / package).is_dir():
         where = f"${variable}, which is not set" if not checkout else f"{checkout!r}"
         raise ConfigError(
             f"{package!r}: neither installed nor in {where}; check out its repository, and name "
             f"that folder as the policy's source_dir or in {variable}"
         )
+
     sys.path[:0] = [str(folder) for folder in folders if str(folder) not in sys.path]
 
 
 @contextlib.contextmanager
 def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
-    """Keep transformers from importing code of a checkpoint or hub repository in this context,
-    unless it is allowed.
+    """Prevent transformers from importing code of a checkpoint or of a hub repository in this
+    context, unless it is allowed.
 
-    This also holds if a library requests such code: some pass `trust_remote_code=True` with a name
-    that they read from the checkpoint. A model that needs the code fails with a `ConfigError`.
+    This includes code that a library requests: some pass `trust_remote_code=True` with a name that
+    they read from the checkpoint.
 
     Args:
         allowed: Whether all code may be imported.
-        source: The folder of a family's own code, which may be imported: some load a part of it in
-            this way.
+        source: The folder of a family's own code, which may be imported: some families have
+            transformers import a part of it.
+
+    Raises:
+        ConfigError: A model in this context needs code that may not be imported.
     """
     if allowed or importlib.util.find_spec("transformers") is None:
         yield
         return
     dynamic: Any = require("transformers.dynamic_module_utils")
-    # All imports of such code pass through these three: the first finds it and calls the second,
-    # which copies it to the cache; the third executes it.
+    # All imports of such code pass through these three functions: the first finds it and calls the
+    # second, which copies it to the cache; the third executes it.
     names = ("get_cached_module_file", "create_dynamic_module", "get_class_in_module")
-    find, create, execute = ways = [getattr(dynamic, name) for name in names]
-    own: set[str] = set()  # copies of the source's files
-    finding_own = False
+    originals = [getattr(dynamic, name) for name in names]
+    find, create, execute = originals
+    own_copies: set[str] = set()  # copies of files of `source`
+    finding_own = False  # whether `find` is running for a file of `source`
 
-    def refuse(name: Any) -> NoReturn:
+    def reject(name: Any) -> NoReturn:
         raise ConfigError(
             f"{str(name)!r}: is Python code of the checkpoint, or of what it names on the hub; "
             f"{CURE}"
@@ -87,27 +92,28 @@ def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
 
     def find_own(folder: Any, *args: Any, **options: Any) -> Any:
         nonlocal finding_own
-        place = Path(folder)
+        path = Path(folder)
         finding_own = (
-            source is not None and place.is_dir() and source.resolve() in place.resolve().parents
+            source is not None and path.is_dir() and source.resolve() in path.resolve().parents
         )
         try:
             copy = find(folder, *args, **options)
-            own.update([copy] if finding_own else [])
+            if finding_own:
+                own_copies.add(copy)
         finally:
             finding_own = False
         return copy
 
     def create_own(name: Any, *args: Any, **options: Any) -> Any:
-        return create(name, *args, **options) if finding_own else refuse(name)
+        return create(name, *args, **options) if finding_own else reject(name)
 
     def execute_own(name: Any, copy: Any, *args: Any, **options: Any) -> Any:
-        return execute(name, copy, *args, **options) if copy in own else refuse(name)
+        return execute(name, copy, *args, **options) if copy in own_copies else reject(name)
 
-    for name, way in zip(names, (find_own, create_own, execute_own), strict=True):
-        setattr(dynamic, name, way)
+    for name, replacement in zip(names, (find_own, create_own, execute_own), strict=True):
+        setattr(dynamic, name, replacement)
     try:
         yield
     finally:
-        for name, way in zip(names, ways, strict=True):
-            setattr(dynamic, name, way)
+        for name, original in zip(names, originals, strict=True):
+            setattr(dynamic, name, original)
