@@ -1,4 +1,6 @@
-"""Octo, with windows of real frames, tasks in words or as images, and the noise of each session."""
+"""Octo, with windows of real frames, tasks in words or as images, and noise that each session
+draws itself.
+"""
 
 from __future__ import annotations
 
@@ -49,8 +51,7 @@ class OctoConfig(ModelConfig):
     trust_remote_code: bool = Field(
         default=False,
         description="load a checkpoint that names other code than Octo's components, which then "
-        "runs with all rights "
-        "of this process, or that has transformers run code from the hub",
+        "runs with all rights of this process, or that has transformers run code from the hub",
     )
 
     dataset: str | None = Field(
@@ -70,8 +71,7 @@ class OctoConfig(ModelConfig):
     crop: bool = Field(
         default=True,
         description="show the middle 90% of the primary camera's area, the average crop of the "
-        "training, as Octo's "
-        "ResizeImageWrapper does",
+        "training, as Octo's ResizeImageWrapper does",
     )
     goal: Literal["either", "language", "image"] = Field(
         default="either",
@@ -85,8 +85,8 @@ USUAL_CAMERAS = {PRIMARY: "front", "image_wrist": "wrist"}
 
 
 class Octo(ModelPolicy):
-    """The policy of an Octo checkpoint: a row for each session, with its window of frames and
-    its noise.
+    """The policy of an Octo checkpoint. Each session has a row with its own window of frames and
+    its own noise.
     """
 
     Config: ClassVar[type] = OctoConfig
@@ -100,31 +100,36 @@ class Octo(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
+        """The contract of the checkpoint; before it is loaded, only the kind of its tasks and the
+        configured window.
+        """
         instruction = {"language": True, "image": False}.get(self.config.goal)
         network: OctoNetwork | None = self.model
         if network is None:
             return Contract(instruction=instruction, history=self.config.window)
-        action = _action(
-            len(network.statistics(self.config.dataset, "action")["mean"]), self.config.dataset
-        )
-        cameras, parts, horizon = (
+
+        dim = len(network.statistics(self.config.dataset, "action")["mean"])
+        return self.stated(
             self._cameras(network),
             self.config.state or (),
             network.head.action_horizon,
+            instruction=instruction,
+            action=_action_spec(dim, self.config.dataset),
         )
-        return self.stated(cameras, parts, horizon, instruction=instruction, action=action)
 
     @property
     def state_dim(self) -> int | None:
         return None if self.model is None else self.model.proprio_dim
 
     def load(self) -> OctoNetwork:
+        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         config = self.config
         network = OctoNetwork.load(config)
-        self._cameras(network)
-        wanted = ("mean", "std") if config.normalization == "normal" else ("mean", "p01", "p99")
+        self._cameras(network)  # raises unless the configured cameras fit
+        needed = ("mean", "std") if config.normalization == "normal" else ("mean", "p01", "p99")
         statistics = network.statistics(config.dataset, "action")
-        if absent := [name for name in wanted if name not in statistics]:
+        absent = [name for name in needed if name not in statistics]
+        if absent:
             raise ConfigError(
                 f"normalization {config.normalization!r}: the statistics of {config.dataset!r} "
                 f"have {sorted(statistics)}, not {absent}; set it as in training"
@@ -134,6 +139,7 @@ class Octo(ModelPolicy):
                 f"window: got {config.window}, want at most {network.longest}; trained: "
                 f"{network.window}"
             )
+
         if (network.proprio_dim is None) != (not config.state):
             need = (
                 "reads no state"
@@ -144,11 +150,11 @@ class Octo(ModelPolicy):
                 f"state: got {config.state}, but the checkpoint {need}; set it as in training"
             )
         if network.proprio_dim is not None:
-            network.statistics(config.dataset, PROPRIO)
+            network.statistics(config.dataset, PROPRIO)  # raises if there are none
         return network
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, whose task is `obs.info["goal_image"]` if there is one, else the
+        """Begin an episode. Its task is `obs.info["goal_image"]` if there is one, else the
         instruction.
         """
         goal = self._goal(obs, instruction)
@@ -158,55 +164,64 @@ class Octo(ModelPolicy):
         return info
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
+        """Return the images (H, W, 3) uint8 and the normalised state (D,) float32 by Octo's
+        names.
+        """
         network: OctoNetwork = self.model
-        seen = {
-            name: self._image(name, image)
-            for name, image in camera_images(obs, self._cameras(network)).items()
-        }
+        inputs: dict[str, np.ndarray] = {}
+        for name, image in camera_images(obs, self._cameras(network)).items():
+            inputs[name] = self._image(name, image)
+
         if network.proprio_dim is not None:
             vector = state_vector(obs, self.config.state or (), network.proprio_dim)
-            seen[PROPRIO] = normalised_state(
-                vector, network.statistics(self.config.dataset, PROPRIO)
-            )
-        return seen
+            statistics = network.statistics(self.config.dataset, PROPRIO)
+            inputs[PROPRIO] = normalised_state(vector, statistics)
+        return inputs
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks, with one pass of the transformer per window and one of the action
-        head per row.
+        """Compute the chunks: one pass of the transformer for all windows, and one of the action
+        head for all rows.
         """
         network: OctoNetwork = self.model
         firsts, owners = self.observations_of(rows)
-        asked = [rows[i] for i in firsts]
+        encoded_rows = [rows[i] for i in firsts]
         keys = np.stack([row.rng.integers(2**32, size=2, dtype=np.uint32) for row in rows])
+
+        encoded = network.encode(self._observations(encoded_rows), self._tasks(encoded_rows))
         statistics = network.statistics(self.config.dataset, "action")
-        encoded = network.encode(self._observations(asked), self._tasks(asked))
-        actions = network.decode(encoded, np.array(owners), keys, len(statistics["mean"]))
-        return [
-            Prediction(real_actions(chunk, statistics, self.config.normalization))
-            for chunk in actions
-        ]
+        chunks = network.decode(encoded, np.array(owners), keys, len(statistics["mean"]))
+        normalization = self.config.normalization
+        return [Prediction(real_actions(chunk, statistics, normalization)) for chunk in chunks]
 
     def _observations(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
-        """Return windows (B, W, ...), padded with the first frame, which is masked there."""
+        """Return windows (B, W, …) of observations by name, with "timestep_pad_mask" (B, W).
+
+        A window before which there are too few frames begins with copies of its first frame, which
+        are masked.
+        """
         length = self.history
         histories = [row.history(length) for row in rows]
-        observations = {
-            name: np.stack([np.stack([frame[name] for frame in frames]) for frames in histories])
-            for name in histories[0][0]
-        }
-        real = [min(len(row.frames), length) for row in rows]
-        observations["timestep_pad_mask"] = np.arange(length) >= length - np.array(real)[:, None]
+        observations: dict[str, np.ndarray] = {}
+        for name in histories[0][0]:
+            windows = []
+            for frames in histories:
+                windows.append(np.stack([frame[name] for frame in frames]))
+            observations[name] = np.stack(windows)
+
+        real_lengths = np.array([min(len(row.frames), length) for row in rows])
+        observations["timestep_pad_mask"] = np.arange(length) >= length - real_lengths[:, None]
         return observations
 
     def _tasks(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the tasks of a batch: words with blank goal images, or goal images with blank
-        words, with masks.
+        words, and their masks.
         """
         goals = [row.memory.get(GOAL_IMAGE) for row in rows]
-        words = [
-            row.instruction if goal is None else "" for row, goal in zip(rows, goals, strict=True)
-        ]
-        tasks: dict[str, Any] = self.model.model.create_tasks(texts=words)
+        texts = []
+        for row, goal in zip(rows, goals, strict=True):
+            texts.append(row.instruction if goal is None else "")
+
+        tasks: dict[str, Any] = self.model.model.create_tasks(texts=texts)
         for i, goal in enumerate(goals):
             if goal is not None:
                 tasks[PRIMARY][i] = goal
@@ -215,16 +230,23 @@ class Octo(ModelPolicy):
         return tasks
 
     def _goal(self, obs: Obs, instruction: str | None) -> np.ndarray | None:
-        goal, kind = obs.info.get(GOAL_IMAGE), self.config.goal
-        if (goal is None and (kind == "image" or not instruction)) or (
-            goal is not None and kind == "language"
-        ):
-            wanted = {"language": "an instruction", "image": f"info[{GOAL_IMAGE!r}]"}
+        """Return the goal image at the model's size; None if the instruction is the task.
+
+        Raises:
+            InvalidObservation: There is no task of the configured kind, or the image is none.
+        """
+        goal = obs.info.get(GOAL_IMAGE)
+        task = self.config.goal
+        accepts_words = task != "image" and bool(instruction)
+        accepts_image = task != "language"
+        if not (accepts_words if goal is None else accepts_image):
+            tasks = {"language": "an instruction", "image": f"info[{GOAL_IMAGE!r}]"}
+            expected = tasks.get(task, " or ".join(tasks.values()))
             raise InvalidObservation(
                 f"task: got {'no goal image' if goal is None else 'a goal image'} and the "
-                f"instruction {instruction!r}, want "
-                f"{wanted.get(kind, ' or '.join(wanted.values()))}; see the policy's `goal`"
+                f"instruction {instruction!r}, want {expected}; see the policy's `goal`"
             )
+
         if goal is None:
             return None
         if (
@@ -237,23 +259,24 @@ class Octo(ModelPolicy):
         return self._image(PRIMARY, goal)
 
     def _image(self, name: str, image: np.ndarray) -> np.ndarray:
-        return resized(image, *self.model.cameras[name], crop=self.config.crop and name == PRIMARY)
+        height, width = self.model.cameras[name]
+        return resized(image, height, width, crop=self.config.crop and name == PRIMARY)
 
     def _cameras(self, network: OctoNetwork) -> dict[str, str]:
-        chosen, known = self.config.cameras, list(network.cameras)
-        if chosen and set(chosen) <= set(known):
+        """Return our camera for each image that the model gets."""
+        chosen = self.config.cameras
+        names = list(network.cameras)
+        if chosen and set(chosen) <= set(names):
             return chosen  # Octo was trained with missing cameras, whose tokens it omits
-        return choose_cameras(
-            chosen, {name: ours for name, ours in USUAL_CAMERAS.items() if name in known}, known
-        )
+        usual = {name: ours for name, ours in USUAL_CAMERAS.items() if name in names}
+        return choose_cameras(chosen, usual, names)
 
 
-def _action(dim: int, dataset: str | None) -> ActionSpec:
-    """Describe the actions of a pretraining dataset in its standard form; fine-tuned checkpoints do
-    not state theirs.
+def _action_spec(dim: int, dataset: str | None) -> ActionSpec:
+    """Describe the actions of a pretraining dataset, which have a standard form.
 
-    octo/data/oxe: change of the end effector's position and of its roll, pitch and yaw, then the
-    gripper, 1 = open.
+    The form is that of octo/data/oxe: the change of the end effector's position and of its roll,
+    pitch and yaw, then the gripper, 1 = open. Fine-tuned checkpoints do not declare theirs.
     """
     if dataset is None or dim != 7:
         return ActionSpec(dim=dim)
@@ -280,14 +303,21 @@ _EPSILON = 1e-8  # added to a standard deviation by Octo's NormalizeProprio
 
 
 def octo_model_class(source_dir: str | None) -> Any:
-    """Import `octo.model.octo_model.OctoModel`, from a checkout if one is given."""
+    """Import `octo.model.octo_model.OctoModel`.
+
+    Args:
+        source_dir: A checkout of Octo; None: the one that OCTO_SRC names, or the installed one.
+
+    Raises:
+        ConfigError: Octo is not found.
+    """
     use_source("octo", "OCTO_SRC", source_dir)
     if "dlimp" not in sys.modules and importlib.util.find_spec("dlimp") is None:
         # Octo's data loaders import it; the model only uses a constant of their module.
         stub: Any = types.ModuleType("dlimp")
         stub.DLataset = object
         sys.modules["dlimp"] = stub
-    # It only resizes images, and JAX needs the memory.
+    # TensorFlow only resizes images, and JAX needs the memory of the GPU.
     require("tensorflow").config.set_visible_devices([], "GPU")
     return require("octo.model.octo_model").OctoModel
 
@@ -301,24 +331,27 @@ class OctoNetwork:
         self.model = model
         self.params = jax.device_put(model.params, device)
         self.head = model.module.heads["action"]
+        # Observations: as many as in training, and as many as the model has positions for.
         self.window: int = model.example_batch["observation"]["timestep_pad_mask"].shape[1]
         self.longest: int = model.module.octo_transformer.max_horizon
+
         self._decode = jax.jit(self._decoded, static_argnames="dim")
         self._encode = jax.jit(self._encoded)
-        self._gather = jax.jit(
-            lambda encoded, owners: jax.tree_util.tree_map(lambda one: one[owners], encoded)
-        )
+        self._gather = jax.jit(self._gathered)
 
     @classmethod
     def load(cls, config: OctoConfig) -> OctoNetwork:
-        """Read a checkpoint; raises `ConfigError` if it is incomplete, or names code that is not
-        Octo's.
+        """Read a checkpoint.
+
+        Raises:
+            ConfigError: It is incomplete, or names code that is not Octo's and is not trusted.
         """
         octo_model = octo_model_class(config.source_dir)
         folder, step = _folder_and_step(config.checkpoint, config.checkpoint_step)
-        chosen = jax_device(config.device)
+        device = jax_device(config.device)
         if not config.trust_remote_code:
             require_own_classes(folder / _FILES[0])
+
         try:
             with remote_code(allowed=config.trust_remote_code):
                 model = octo_model.load_pretrained(str(folder), step)
@@ -330,14 +363,14 @@ class OctoNetwork:
                 "is it complete, of this version of Octo, and is its language encoder's tokenizer "
                 "on the hub or in the cache?"
             ) from error
-        network, example, jax = cls(model, chosen), model.example_batch, require("jax")
+
+        jax = require("jax")
+        network = cls(model, device)
+        observation = model.example_batch["observation"]
+        inputs = (observation, model.example_batch["task"], observation["timestep_pad_mask"])
         init = partial(model.module.init, train=False)
-        inputs = (
-            example["observation"],
-            example["task"],
-            example["observation"]["timestep_pad_mask"],
-        )
-        require_filled(model.params, jax.eval_shape(init, jax.random.PRNGKey(0), *inputs)["params"])
+        shapes = jax.eval_shape(init, jax.random.PRNGKey(0), *inputs)["params"]
+        require_filled(model.params, shapes)
         if type(network.head).__name__ not in _HEADS:
             raise ConfigError(
                 f"action head: got {type(network.head).__name__}, want one of {list(_HEADS)}"
@@ -347,41 +380,60 @@ class OctoNetwork:
     @cached_property
     def cameras(self) -> dict[str, tuple[int, int]]:
         """The height and width of each image that a tokenizer reads, by Octo's name."""
-        found = self._read_by("ImageTokenizer", "obs_stack_keys", ("image_.*",))
-        return {
-            name: (shape[0], shape[1]) for name, shape in found.items() if name.startswith("image_")
-        }
+        shapes = self._shapes_read_by("ImageTokenizer", "obs_stack_keys", ("image_.*",))
+        cameras: dict[str, tuple[int, int]] = {}
+        for name, shape in shapes.items():
+            if name.startswith("image_"):
+                cameras[name] = (shape[0], shape[1])
+        return cameras
 
     @cached_property
     def proprio_dim(self) -> int | None:
         """The length of the state vector; None if no tokenizer reads it."""
-        found = self._read_by("LowdimObsTokenizer", "obs_keys", ())
-        return found[PROPRIO][0] if PROPRIO in found else None
+        shapes = self._shapes_read_by("LowdimObsTokenizer", "obs_keys", ())
+        return shapes[PROPRIO][0] if PROPRIO in shapes else None
 
-    def statistics(self, dataset: str | None, part: str) -> dict[str, np.ndarray]:
-        """Return the statistics of "action" or "proprio"; raises `ConfigError` if there are
-        none.
+    def statistics(self, dataset: str | None, name: str) -> dict[str, np.ndarray]:
+        """Return statistics of the checkpoint.
+
+        Args:
+            dataset: The dataset; None: the checkpoint's only one.
+            name: "action" or "proprio".
+
+        Returns:
+            An array (D,) for each statistic, such as "mean".
+
+        Raises:
+            ConfigError: The checkpoint has no such statistics.
         """
-        have = self.model.dataset_statistics
-        own = have if dataset is None else have.get(dataset, {})
-        if part not in own:
-            choices = sorted(
-                name for name, value in have.items() if isinstance(value, Mapping) and part in value
+        by_dataset = self.model.dataset_statistics
+        by_name = by_dataset if dataset is None else by_dataset.get(dataset, {})
+        if name not in by_name:
+            choices = []
+            for dataset_name in sorted(by_dataset):
+                statistics = by_dataset[dataset_name]
+                if isinstance(statistics, Mapping) and name in statistics:
+                    choices.append(dataset_name)
+            expected = (
+                f"one of {choices}" if choices else "a checkpoint with dataset_statistics.json"
             )
             raise ConfigError(
-                f"dataset {dataset!r}: the checkpoint has no statistics of {part!r} for it, so its "
-                "numbers have "
-                "no units; want "
-                f"{f'one of {choices}' if choices else 'a checkpoint with dataset_statistics.json'}"
-                f"{', or none' if part in have else ''}"
+                f"dataset {dataset!r}: the checkpoint has no statistics of {name!r} for it, so its "
+                f"numbers have no units; want {expected}{', or none' if name in by_dataset else ''}"
             )
-        return {name: np.asarray(values) for name, values in own[part].items()}
+        return {statistic: np.asarray(values) for statistic, values in by_name[name].items()}
 
     def encode(
         self, observations: Mapping[str, np.ndarray], tasks: Mapping[str, Any]
     ) -> tuple[Any, Any]:
-        """Compute the inputs of the action head on the device: tokens (P, W, N, E) and their
-        mask (P, W, N).
+        """Compute the inputs of the action head.
+
+        Args:
+            observations: Windows (P, W, …) of P observations by name, with "timestep_pad_mask".
+            tasks: Their tasks, as `create_tasks` of the model returns them.
+
+        Returns:
+            Tokens (P, W, N, E) and their mask (P, W, N), on the device.
         """
         encoded: tuple[Any, Any] = self._encode(self.params, observations, tasks)
         return encoded
@@ -389,8 +441,16 @@ class OctoNetwork:
     def decode(
         self, encoded: tuple[Any, Any], owners: np.ndarray, keys: np.ndarray, dim: int
     ) -> np.ndarray:
-        """Sample normalised actions (B, H, dim) from `encode` of `owners` (B,), with random keys
-        (B, 2) uint32.
+        """Sample normalised actions.
+
+        Args:
+            encoded: The result of `encode` for P observations.
+            owners: (B,) int, the observation of each row.
+            keys: (B, 2) uint32, the random key of each row.
+            dim: How many numbers an action has.
+
+        Returns:
+            The actions, (B, H, dim).
         """
         tokens, mask = encoded if len(encoded[0]) == len(owners) else self._gather(encoded, owners)
         return np.asarray(self._decode(self.params, tokens, mask, keys, dim=dim))
@@ -405,40 +465,55 @@ class OctoNetwork:
             train=False,
             method="octo_transformer",
         )
-        read = outputs[self.head.readout_key]
-        return read.tokens, read.mask
+        readout = outputs[self.head.readout_key]
+        return readout.tokens, readout.mask
+
+    @staticmethod
+    def _gathered(encoded: Any, owners: Any) -> Any:
+        return require("jax").tree_util.tree_map(lambda array: array[owners], encoded)
 
     def _decoded(self, params: Any, tokens: Any, mask: Any, keys: Any, dim: int) -> Any:
-        group = require("octo.model.components.base").TokenGroup
+        token_group = require("octo.model.components.base").TokenGroup
         head = self.model.module.bind({"params": params}).heads["action"]
 
-        def alone(tokens: Any, mask: Any, key: Any) -> Any:
-            read = {head.readout_key: group(tokens[None], mask[None])}
-            return head.predict_action(read, train=False, rng=key, embodiment_action_dim=dim)[0]
+        def decode_row(tokens: Any, mask: Any, key: Any) -> Any:
+            readouts = {head.readout_key: token_group(tokens[None], mask[None])}
+            return head.predict_action(readouts, train=False, rng=key, embodiment_action_dim=dim)[0]
 
-        return require("jax").vmap(alone)(tokens, mask, keys)[..., :dim]
+        return require("jax").vmap(decode_row)(tokens, mask, keys)[..., :dim]
 
-    def _read_by(
+    def _shapes_read_by(
         self, tokenizer: str, setting: str, usual: tuple[str, ...]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the parts of an observation that match the patterns of one kind
-        of tokenizer.
+        """Return the shapes of the arrays that a class of tokenizers reads from an observation.
+
+        Args:
+            tokenizer: The name of the class.
+            setting: Its setting for the patterns of the arrays' names.
+            usual: The patterns of a tokenizer without that setting.
         """
-        specs = [
-            s
-            for s in self.model.config["model"]["observation_tokenizers"].values()
-            if s["name"] == tokenizer
-        ]
-        patterns = [pattern for spec in specs for pattern in spec["kwargs"].get(setting, usual)]
-        return {
-            name: tuple(array.shape[2:])
-            for name, array in self.model.example_batch["observation"].items()
-            if any(re.match(pattern, name) for pattern in patterns)
-        }
+        patterns: list[str] = []
+        for spec in self.model.config["model"]["observation_tokenizers"].values():
+            if spec["name"] == tokenizer:
+                patterns += spec["kwargs"].get(setting, usual)
+
+        shapes: dict[str, tuple[int, ...]] = {}
+        for name, array in self.model.example_batch["observation"].items():
+            if any(re.match(pattern, name) for pattern in patterns):
+                shapes[name] = tuple(array.shape[2:])
+        return shapes
 
 
 def normalised_state(vector: np.ndarray, statistics: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Normalise the state, (P,) float32, as Octo's NormalizeProprio does."""
+    """Normalise a state as Octo's NormalizeProprio does.
+
+    Args:
+        vector: The state, (P,) float32.
+        statistics: Its "mean", its "std" and perhaps a "mask", (P,) each.
+
+    Returns:
+        The normalised state, (P,) float32. Numbers outside of the mask stay unchanged.
+    """
     scaled = (vector - statistics["mean"]) / (statistics["std"] + _EPSILON)
     return np.where(statistics.get("mask", True), scaled, vector).astype(np.float32)
 
@@ -446,8 +521,15 @@ def normalised_state(vector: np.ndarray, statistics: Mapping[str, np.ndarray]) -
 def real_actions(
     actions: np.ndarray, statistics: Mapping[str, np.ndarray], normalization: str
 ) -> np.ndarray:
-    """Convert normalised actions (..., D) to the units of the data, float32; masked-out numbers
-    stay unchanged.
+    """Convert normalised actions to the units of the data.
+
+    Args:
+        actions: Normalised actions, (..., D).
+        statistics: Their statistics and perhaps a "mask", (D,) each.
+        normalization: "normal", or "bounds", as in `OctoConfig`.
+
+    Returns:
+        The actions, (..., D) float32. Numbers outside of the mask stay unchanged.
     """
     if normalization == "normal":
         scaled = actions * statistics["std"] + statistics["mean"]
@@ -463,19 +545,24 @@ def _folder_and_step(checkpoint: str, step: int | None) -> tuple[Path, int]:
     if folder.name.isdigit() and not (folder / _FILES[0]).exists():
         folder, step = folder.parent, int(folder.name)
     find_checkpoint(str(folder), needs=_FILES)
-    steps = sorted(int(p.name) for p in folder.iterdir() if p.is_dir() and p.name.isdigit())
+    steps = []
+    for path in folder.iterdir():
+        if path.is_dir() and path.name.isdigit():
+            steps.append(int(path.name))
     if not steps:
         raise ConfigError(
             f"checkpoint {folder}: has no step, a folder with a number for a name; copy all of it"
         )
-    step = steps[-1] if step is None else step
-    for part in (*_FILES, str(step)):  # the files of the weights; training adds further steps
-        find_checkpoint(str(folder / part))
+    if step is None:
+        step = max(steps)
+    # These files alone identify the checkpoint: training adds further steps to the folder.
+    for name in (*_FILES, str(step)):
+        find_checkpoint(str(folder / name))
     return folder, step
 
 
-_PARTS = "octo.model.components."  # tokenizers, encoders, action heads
-_TEXT = "octo.data.utils.text_processing"
+_COMPONENTS = "octo.model.components."  # tokenizers, encoders, action heads
+_TEXT_PROCESSING = "octo.data.utils.text_processing"
 
 
 def require_own_classes(file: Path) -> None:
@@ -484,66 +571,82 @@ def require_own_classes(file: Path) -> None:
 
     Other classes are not imported, since Octo accepts any callable of any module, including
     `os.system`.
+
+    Args:
+        file: The config.json of a checkpoint.
     """
     try:
         config = json.loads(file.read_text(encoding="utf-8"))
-        loaded = {name: config[name] for name in ("model", "text_processor")}
+        sections = {name: config[name] for name in ("model", "text_processor")}
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{file}: not a configuration of Octo's ({type(error).__name__}: {error})"
         ) from error
-    named = [(spec["module"], spec["name"]) for spec in _specs(loaded)]
+
+    classes = [(spec["module"], spec["name"]) for spec in _specs(sections)]
     for is_own in (_is_own_name, _is_own_class):  # check all names before importing anything
-        for module, name in named:
+        for module, name in classes:
             if not is_own(module, name):
                 raise ConfigError(
-                    f"{file}: names {name!r} of {module!r}, want a class of {_PARTS}* or {_TEXT}: "
-                    f"loading the checkpoint would run that, whatever it is; {CURE}"
+                    f"{file}: names {name!r} of {module!r}, want a class of {_COMPONENTS}* or "
+                    f"{_TEXT_PROCESSING}: loading the checkpoint would run that, whatever it is; "
+                    f"{CURE}"
                 )
 
 
 def _specs(value: object) -> Iterator[Mapping[str, Any]]:
+    """Yield each specification of a class at any depth of a configuration."""
     if isinstance(value, Mapping):
         if "module" in value and "name" in value:
             yield value
-        for one in value.values():
-            yield from _specs(one)
+        for nested in value.values():
+            yield from _specs(nested)
     elif isinstance(value, list):
-        for one in value:
-            yield from _specs(one)
+        for nested in value:
+            yield from _specs(nested)
 
 
 def _is_own_name(module: object, name: object) -> bool:
+    """Return whether a module of Octo's components or text processors may contain the name."""
     if not isinstance(module, str) or not isinstance(name, str) or not name.isidentifier():
         return False
-    return module == _TEXT or module.startswith(_PARTS)
+    return module == _TEXT_PROCESSING or module.startswith(_COMPONENTS)
 
 
 def _is_own_class(module: str, name: str) -> bool:
     """Return whether Octo defines a class itself, rather than importing it into its module."""
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        value = getattr(importlib.import_module(module), name, None)
     except ImportError as error:
         raise ConfigError(
             f"{module}: this Octo does not have it ({error}); is the checkpoint of this version?"
         ) from error
-    return inspect.isclass(found) and found.__module__.startswith("octo.")
+    return inspect.isclass(value) and value.__module__.startswith("octo.")
 
 
-# Share of each side, from the average area of training's random crops.
-_CROPPED = np.sqrt(np.float32(0.9))
+# Share of each side that is shown; its square is the average area of training's random crops.
+_CROP_SIDE = np.sqrt(np.float32(0.9))
 
 
 def resized(image: np.ndarray, height: int, width: int, *, crop: bool) -> np.ndarray:
-    """Resize an (H, W, 3) uint8 image to (height, width, 3) by Lanczos, from its centre if
-    `crop`; returns a copy.
+    """Resize an image with a Lanczos filter, as Octo does.
+
+    Args:
+        image: The image, (H, W, 3) uint8.
+        height: The height of the result, px.
+        width: The width of the result, px.
+        crop: Whether to show only the centre of the image.
+
+    Returns:
+        A copy, (height, width, 3) uint8.
     """
     if not crop and image.shape[:2] == (height, width):
         return image.copy()  # the filter would change nothing
+
     tf = require("tensorflow")
-    found = tf.image.resize(image, (height, width), method="lanczos3", antialias=True)
+    scaled = tf.image.resize(image, (height, width), method="lanczos3", antialias=True)
     if crop:
-        edge = (np.float32(1) - _CROPPED) / 2
-        box = [[edge, edge, edge + _CROPPED, edge + _CROPPED]]
-        found = tf.image.crop_and_resize(found[None], box, [0], (height, width))[0]
-    return np.asarray(tf.cast(tf.clip_by_value(tf.round(found), 0, 255), tf.uint8))
+        margin = (np.float32(1) - _CROP_SIDE) / 2
+        box = [[margin, margin, margin + _CROP_SIDE, margin + _CROP_SIDE]]
+        scaled = tf.image.crop_and_resize(scaled[None], box, [0], (height, width))[0]
+    return np.asarray(tf.cast(tf.clip_by_value(tf.round(scaled), 0, 255), tf.uint8))
