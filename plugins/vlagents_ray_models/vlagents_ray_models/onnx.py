@@ -1,7 +1,7 @@
 """Exported policies of any kind, ONNX files and TorchScript archives.
 
-A deployment file states the source of each input, and the meaning of the outputs. Each session
-keeps its recurrent state, and all share a batch.
+A deployment file declares the source of each input and the meaning of the outputs. Each session
+keeps its own recurrent state, and all sessions share a batch.
 """
 
 from __future__ import annotations
@@ -46,21 +46,23 @@ class Scaling(BaseModel, extra="forbid"):
 
     mean: Numbers | dict[str, Numbers] = Field(
         default=0.0,
-        description="one for all, a list, or either by part of the state; of an action, its offset",
+        description="one number for all, a list, or either by part of the state; for an action, "
+        "its offset",
     )
     std: Numbers | dict[str, Numbers] = Field(
-        default=1.0, description="as `mean`; of an action, its scale"
+        default=1.0, description="as `mean`; for an action, its scale"
     )
     min: Numbers | dict[str, Numbers] | None = Field(
-        default=None, description="with `max`, becomes -1 in the model"
+        default=None, description="with `max`: the number that becomes -1 in the model"
     )
     max: Numbers | dict[str, Numbers] | None = Field(
-        default=None, description="with `min`, becomes 1 in the model"
+        default=None, description="with `min`: the number that becomes 1 in the model"
     )
     clip: tuple[float, float] | None = Field(
         default=None, description="limits of the model's numbers"
     )
-    _known: dict[str, tuple[Any, Any]] = PrivateAttr(default_factory=dict)  # mean and std by part
+    # Mean and std by part of the state, float32, once they are used.
+    _arrays: dict[str, tuple[Any, Any]] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_pair(self) -> Self:
@@ -72,38 +74,51 @@ class Scaling(BaseModel, extra="forbid"):
 
     @property
     def parts(self) -> set[str]:
-        """The parts of the state that have their own statistics."""
-        named = (one for one in (self.mean, self.std, self.min, self.max) if isinstance(one, dict))
-        return {part for one in named for part in one}
+        """The parts of the state that have statistics of their own."""
+        parts: set[str] = set()
+        for statistic in (self.mean, self.std, self.min, self.max):
+            if isinstance(statistic, dict):
+                parts.update(statistic)
+        return parts
 
     def normalized(self, values: np.ndarray, part: str = "") -> np.ndarray:
-        """Return the robot's numbers, float32, as the model's; `part` is the name of the part of
-        the state.
+        """Convert the robot's numbers to the model's.
+
+        Args:
+            values: The robot's numbers, (..., D) float32.
+            part: The part of the state that they are.
+
+        Returns:
+            The model's numbers, (..., D).
         """
         if self.model_fields_set & {"mean", "std", "min"}:
-            mean, std = self._statistics(part)
+            mean, std = self._mean_and_std(part)
             values = (values - mean) / std
         return values if self.clip is None else values.clip(*self.clip)
 
     def unnormalized(self, values: np.ndarray) -> np.ndarray:
-        """Return the model's numbers, float32, as the robot's."""
-        mean, std = self._statistics()
+        """Convert the model's numbers, (..., D) float32, to the robot's."""
+        mean, std = self._mean_and_std()
         restored: np.ndarray = values * std + mean
         return restored
 
-    def _statistics(self, part: str = "") -> tuple[Any, Any]:
-        def named(value: Any, usual: float) -> Any:
-            return np.asarray(
-                value.get(part, usual) if isinstance(value, dict) else value, np.float32
-            )
-
-        if part not in self._known:
+    def _mean_and_std(self, part: str = "") -> tuple[Any, Any]:
+        if part not in self._arrays:
             if self.min is None:
-                self._known[part] = named(self.mean, 0.0), named(self.std, 1.0)
+                mean = _statistic(self.mean, part, 0.0)
+                std = _statistic(self.std, part, 1.0)
             else:
-                low, high = named(self.min, -1.0), named(self.max, 1.0)
-                self._known[part] = (high + low) / 2, (high - low) / 2
-        return self._known[part]
+                low = _statistic(self.min, part, -1.0)
+                high = _statistic(self.max, part, 1.0)
+                mean, std = (high + low) / 2, (high - low) / 2
+            self._arrays[part] = mean, std
+        return self._arrays[part]
+
+
+def _statistic(setting: Any, part: str, default: float) -> Any:
+    """Return a statistic of a part of the state as an array, float32."""
+    value = setting.get(part, default) if isinstance(setting, dict) else setting
+    return np.asarray(value, np.float32)
 
 
 class Input(Scaling):
@@ -115,38 +130,38 @@ class Input(Scaling):
         default=None, description="as the policy's `state`, for one of several vectors"
     )
     constant: float | list[Any] | None = Field(
-        default=None, description="the same numbers in each act"
+        default=None, description="the same numbers in each call"
     )
     step: float | None = Field(
-        default=None, description="a counter of the session's passes, which begins with this"
+        default=None, description="a counter of the session's passes, which begins with this number"
     )
     noise: Literal[True] | None = Field(
-        default=None, description="standard normal numbers, by the session's seed"
+        default=None, description="standard normal numbers, drawn from the session's seed"
     )
     instruction: Literal["text", "tokens", "mask"] | None = Field(
         default=None,
-        description="a string, or the ids by tokenizer.json beside the file, or the mask of the "
-        "ids",
+        description="the instruction as a string, or its token ids from the tokenizer.json next to "
+        "the file, or the mask of these ids",
     )
     history: int = Field(
-        default=1, ge=1, description="how many of the last observations it holds, oldest first"
+        default=1, ge=1, description="how many of the last observations it contains, oldest first"
     )
     shape: list[int] | None = Field(
         default=None,
         description="for a file that leaves lengths open, as all TorchScript does; -1 is the batch",
     )
     range: tuple[float, float] = Field(
-        default=(0.0, 1.0), description="of an image that is not uint8"
+        default=(0.0, 1.0), description="the range of an image that is not uint8"
     )
     resize: bool = Field(
-        default=False, description="take images of any size, and pad them with black"
+        default=False, description="accept images of any size, and pad them with black"
     )
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        named = [name for name in SOURCES if getattr(self, name) is not None]
-        if len(named) > 1:
-            raise ValueError(f"got {named}, want one source of an input")
+        sources = [name for name in SOURCES if getattr(self, name) is not None]
+        if len(sources) > 1:
+            raise ValueError(f"got {sources}, want one source of an input")
         return self
 
 
@@ -156,7 +171,8 @@ class Action(Scaling):
     """
 
     output: str | None = Field(
-        default=None, description="its name; unset: the only one that nothing else names"
+        default=None,
+        description="name of the output; unset: the only one that no other setting names",
     )
 
 
@@ -165,19 +181,20 @@ class OnnxConfig(ModelConfig):
 
     checkpoint: str = Field(
         min_length=1,
-        description="an .onnx file or a TorchScript archive (.pt, .jit), or a folder or "
-        "org/name@COMMIT of the hub "
-        "with one; `{step}` stands for checkpoint_step",
+        description="an .onnx file or a TorchScript archive (.pt, .jit), or a folder or hub id "
+        "(org/name@COMMIT) with one; `{step}` stands for checkpoint_step",
     )
     trust_checkpoint: bool = Field(
         default=False,
         description="a TorchScript archive is a program: set true if you trust its author",
     )
-    dtype: Literal["auto"] = Field(default="auto", description="the file's")
+    dtype: Literal["auto"] = Field(default="auto", description="as in the file")
     compile: Literal[False, "auto"] = Field(
-        default="auto", description="nothing to compile: the runtime optimises it"
+        default="auto", description="nothing to compile: the runtime optimises the file"
     )
-    threads: int = Field(default=1, ge=0, description="of ONNX Runtime on a CPU; 0: its own choice")
+    threads: int = Field(
+        default=1, ge=0, description="threads of ONNX Runtime on a CPU; 0: the runtime decides"
+    )
 
     cameras: dict[str, str] | None = Field(
         default=None, description="each input that is an image -> your camera"
@@ -185,8 +202,7 @@ class OnnxConfig(ModelConfig):
     state: list[str] | None = Field(
         default=None,
         description="parts of the one input that no other setting names, in their order; "
-        "'previous_output' is the last "
-        "action before offset and scale, zeros at first",
+        "'previous_output' is the last action before offset and scale, zeros at first",
     )
     inputs: dict[str, Input] = Field(
         default={}, description="the source and the conversion of an input, by its name"
@@ -200,7 +216,7 @@ class OnnxConfig(ModelConfig):
     action: Action = Field(
         default=Action(), description="which output is the action, its offset and its scale"
     )
-    info: list[str] = Field(default=[], description="outputs that an act returns in its info")
+    info: list[str] = Field(default=[], description="outputs that a call returns in its info")
     contract: dict[str, Any] = Field(
         default={},
         description="facts that the file lacks: {control_hz: 50, action: {space: joint, delta: "
@@ -210,14 +226,14 @@ class OnnxConfig(ModelConfig):
         default=32,
         ge=1,
         le=256,
-        description="last observations from which a memory is computed again, if the session's "
-        "replica is lost",
+        description="how many of the last observations a recurrent state is computed from again if "
+        "the session's replica is lost",
     )
 
 
 TOKENIZER = "tokenizer.json"
 _TORCHSCRIPT = (".pt", ".pth", ".jit")
-# Those that numpy names otherwise.
+# ONNX's names of types -> numpy's, where they differ.
 _TYPES = {"float": "float32", "double": "float64", "string": "object"}
 
 Arrays = Mapping[str, np.ndarray]
@@ -227,30 +243,33 @@ Arrays = Mapping[str, np.ndarray]
 class Tensor:
     """An input of a graph."""
 
-    shape: tuple[int, ...]  # -1: the batch
+    shape: tuple[int, ...]  # -1 is the batch
     dtype: np.dtype[Any]
 
     @cached_property
-    def axis(self) -> int | None:
-        """The dimension of the batch; None if there is one row."""
+    def batch_axis(self) -> int | None:
+        """The dimension of the batch; None if the input has one row."""
         return self.shape.index(-1) if -1 in self.shape else None
 
     @cached_property
-    def row(self) -> tuple[int, ...]:
+    def row_shape(self) -> tuple[int, ...]:
         """The shape with a batch of one."""
         return tuple(abs(length) for length in self.shape)
 
     @cached_property
     def size(self) -> int:
         """How many numbers a row has."""
-        return prod(self.row)
+        return prod(self.row_shape)
 
     def zeros(self) -> np.ndarray:
-        return np.full(self.row, "" if self.dtype == object else 0, self.dtype)
+        """Return a row of zeros, or of empty strings."""
+        return np.full(self.row_shape, "" if self.dtype == object else 0, self.dtype)
 
     def random(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a row of numbers in [0, 1)."""
-        return self.zeros() if self.dtype == object else rng.random(self.row).astype(self.dtype)
+        """Return a row of numbers in [0, 1), or of empty strings."""
+        if self.dtype == object:
+            return self.zeros()
+        return rng.random(self.row_shape).astype(self.dtype)
 
 
 class OnnxGraph:
@@ -262,7 +281,7 @@ class OnnxGraph:
         options = runtime.SessionOptions()
         options.intra_op_num_threads = config.threads
         options.use_deterministic_compute = True
-        # errors: it warns of each unused weight that an exporter left.
+        # Errors only, as there is a warning for each unused weight that an exporter left.
         options.log_severity_level = 3
         try:
             self._session = runtime.InferenceSession(
@@ -272,23 +291,26 @@ class OnnxGraph:
             raise ConfigError(
                 f"checkpoint {path}: ONNX Runtime cannot read it: {_first_line(error)}"
             ) from error
-        # It only warns, and would compute on the CPU.
+        # ONNX Runtime only warns of this, and would compute on the CPU.
         if provider not in self._session.get_providers():
             raise ConfigError(
                 f"device {config.device!r}: {provider} did not start, as the log says; install the "
                 "CUDA and cuDNN that this onnxruntime-gpu needs, or set device: cpu with "
                 "resources: {num_gpus: 0}"
             )
-        self.outputs: list[str] = [one.name for one in self._session.get_outputs()]
+
+        self.outputs: list[str] = [output.name for output in self._session.get_outputs()]
         self.inputs: dict[str, Tensor] = {}
-        for one in self._session.get_inputs():
-            kind = one.type.removeprefix("tensor(").removesuffix(")")
-            stated = [length if isinstance(length, int) else -1 for length in one.shape]
-            self.inputs[one.name] = Tensor(
-                _shape(one.name, stated, config), np.dtype(_TYPES.get(kind, kind))
-            )
+        for graph_input in self._session.get_inputs():
+            name = graph_input.name
+            onnx_type = graph_input.type.removeprefix("tensor(").removesuffix(")")
+            dtype = np.dtype(_TYPES.get(onnx_type, onnx_type))
+            # An open length has a name, or none.
+            lengths = [length if isinstance(length, int) else -1 for length in graph_input.shape]
+            self.inputs[name] = Tensor(_shape(name, lengths, config), dtype)
 
     def run(self, feeds: Arrays) -> dict[str, np.ndarray]:
+        """Return all outputs by name, from all inputs by name."""
         return dict(zip(self.outputs, self._session.run(None, feeds), strict=True))
 
 
@@ -297,34 +319,43 @@ class TorchScript:
 
     def __init__(self, path: Path, config: OnnxConfig) -> None:
         torch = require("torch")
-        self._device, self.outputs = torch_device(config.device), config.outputs
+        self._device = torch_device(config.device)
+        self.outputs = config.outputs
         try:
             self._module = torch.jit.load(str(path), map_location=self._device).eval()
-            names = [one.name for one in self._module.forward.schema.arguments[1:]]
+            arguments = self._module.forward.schema.arguments[1:]  # without `self`
         except (RuntimeError, AttributeError, ValueError) as error:
             raise ConfigError(
                 f"checkpoint {path}: torch.jit.load cannot read it: {_first_line(error)}"
             ) from error
-        self.inputs = {
-            name: Tensor(_shape(name, None, config), np.dtype(np.float32)) for name in names
-        }
+
+        self.inputs: dict[str, Tensor] = {}
+        for argument in arguments:
+            shape = _shape(argument.name, None, config)
+            self.inputs[argument.name] = Tensor(shape, np.dtype(np.float32))
 
     def run(self, feeds: Arrays) -> dict[str, np.ndarray]:
+        """Return all outputs by name, from all inputs by name."""
         torch = require("torch")
         with torch.inference_mode():
-            found = self._module(
-                *(torch.from_numpy(feeds[name]).to(self._device) for name in self.inputs)
-            )
-        found = found if isinstance(found, tuple | list) else (found,)
-        if len(found) != len(self.outputs):
+            args = [torch.from_numpy(feeds[name]).to(self._device) for name in self.inputs]
+            returned = self._module(*args)
+        results = returned if isinstance(returned, tuple | list) else (returned,)
+        if len(results) != len(self.outputs):
             raise ConfigError(
-                f"outputs: got {self.outputs}, want names for the {len(found)} results of `forward`"
+                f"outputs: got {self.outputs}, want names for the {len(results)} results of "
+                "`forward`"
             )
-        return {name: fetch(one.float()) for name, one in zip(self.outputs, found, strict=True)}
+        return {
+            name: fetch(result.float()) for name, result in zip(self.outputs, results, strict=True)
+        }
 
 
 def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
     """Read the checkpoint.
+
+    Args:
+        config: The settings of the policy.
 
     Returns:
         The graph, and its file.
@@ -334,18 +365,22 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
     """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     files = [path] if path.is_file() else sorted(path.rglob("*"))
-    found = [file for file in files if file.suffix in (".onnx", *_TORCHSCRIPT)]
-    if len(found) != 1:
+    graph_files = [file for file in files if file.suffix in (".onnx", *_TORCHSCRIPT)]
+    if len(graph_files) != 1:
+        names = [file.name for file in graph_files or files]
         raise ConfigError(
-            f"checkpoint {path}: got {[one.name for one in found or files][:10]}, want one file "
-            f"with the suffix .onnx or {', '.join(_TORCHSCRIPT)}; name that file"
+            f"checkpoint {path}: got {names[:10]}, want one file with the suffix .onnx or "
+            f"{', '.join(_TORCHSCRIPT)}; name that file"
         )
-    [file] = found
-    # The parts beside it count for its digest, too: weights of a large graph, the tokenizer.
+    [file] = graph_files
+
+    # The digest of a single file also covers the files that belong to it: the weights of a large
+    # graph and the tokenizer.
     if path == file:
         for pattern in (f"{file.name}[._]*", TOKENIZER):
-            for part in file.parent.glob(pattern):
-                find_checkpoint(str(part))
+            for related in file.parent.glob(pattern):
+                find_checkpoint(str(related))
+
     if file.suffix == ".onnx":
         return OnnxGraph(file, config), file
     if not config.trust_checkpoint:
@@ -360,337 +395,416 @@ def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0][:300]
 
 
-def _shape(name: str, stated: Sequence[int] | None, config: OnnxConfig) -> tuple[int, ...]:
-    """Return the shape of an input, of which the file states what is not -1."""
-    given = config.inputs[name].shape if name in config.inputs else None
-    shape = stated if given is None else given
+def _shape(name: str, lengths: Sequence[int] | None, config: OnnxConfig) -> tuple[int, ...]:
+    """Return the shape of an input.
+
+    Args:
+        name: The name of the input.
+        lengths: Its lengths in the file, where -1 is an open one; None if the file has none.
+        config: The settings, whose shape replaces the file's.
+
+    Raises:
+        ConfigError: More than one length is open, or all are.
+    """
+    configured = config.inputs[name].shape if name in config.inputs else None
+    shape = lengths if configured is None else configured
     if shape is None or shape.count(-1) > 1:
         raise ConfigError(
-            f"inputs: {name}: shape: got {given}, the file states {stated or 'none'}, want all "
-            "lengths that the policy was trained with, and -1 for the batch, such as [-1, 48]"
+            f"inputs: {name}: shape: got {configured}, the file states {lengths or 'none'}, want "
+            "all lengths that the policy was trained with, and -1 for the batch, such as [-1, 48]"
         )
     return tuple(shape)
 
 
 # The part of the state that is the model's last action, in the model's numbers.
 PREVIOUS = "previous_output"
-# Of outputs alone and in a batch, relative to the largest: more than another order of sums changes.
+# Largest difference of outputs computed alone and in a batch, relative to the largest output: more
+# than a different order of summation changes.
 _TOLERANCE = 1e-3
 
 
 class Network:
-    """A graph whose inputs and outputs have a meaning; all sessions share it, and change nothing
-    in it.
+    """A graph with the meaning of its inputs and outputs. All sessions share it, and none changes
+    it.
     """
 
     def __init__(self, graph: OnnxGraph | TorchScript, path: Path, config: OnnxConfig) -> None:
-        """Map the inputs and outputs, and try the graph on random rows; raises `ConfigError` if
-        they do not fit.
+        """Map the inputs and outputs, and try the graph on random rows.
+
+        Args:
+            graph: The graph.
+            path: Its file.
+            config: The settings of the policy.
+
+        Raises:
+            ConfigError: The graph does not fit the settings, or cannot be run.
         """
-        self.graph, self.config, self.cameras = graph, config, config.cameras or {}
+        self.graph = graph
+        self.config = config
+        self.cameras = config.cameras or {}
         self.options = {name: config.inputs.get(name, Input()) for name in graph.inputs}
-        self.vectors = {
-            name: one.state for name, one in self.options.items() if one.state is not None
-        }
+        self.vectors: dict[str, list[str]] = {}  # each input that is a vector -> its parts
+        for name, option in self.options.items():
+            if option.state is not None:
+                self.vectors[name] = option.state
         self._require_mapped()
         self._require_used()
-        self.constants = {
-            name: self._constant(name)
-            for name, one in self.options.items()
-            if one.constant is not None
-        }
+
+        self.constants: dict[str, np.ndarray] = {}
+        for name, option in self.options.items():
+            if option.constant is not None:
+                self.constants[name] = self._constant(name)
         self.inputs = {
-            name: one for name, one in graph.inputs.items() if name not in self.constants
+            name: tensor for name, tensor in graph.inputs.items() if name not in self.constants
         }
         self.tokenizer = self._tokenizer(path)
+
         self.batched = False
         example = self._try_rows()
-        for name, later in config.recurrent.items():
-            if example[later].shape != graph.inputs[name].row:
+        for name, next_value in config.recurrent.items():
+            input_shape, output_shape = graph.inputs[name].row_shape, example[next_value].shape
+            if output_shape != input_shape:
                 raise ConfigError(
-                    f"recurrent: {{{name}: {later}}}: got an output {example[later].shape} for an "
-                    f"input {graph.inputs[name].row}, want equal shapes; name the output that is "
-                    "the input's next value"
+                    f"recurrent: {{{name}: {next_value}}}: got an output {output_shape} for an "
+                    f"input {input_shape}, want equal shapes; name the output that is the input's "
+                    "next value"
                 )
-        self.previous = np.zeros(example[self.action].size, np.float32)
+        # PREVIOUS before the first action, (H * D,).
+        self.zero_output = np.zeros(example[self.action].size, np.float32)
         self._require_fitting(example)
         self.contract = self._contract(*self.chunk(example).shape)
 
     @cached_property
-    def remembers(self) -> bool:
-        """Whether an act depends on earlier ones of its session, other than by `history`."""
-        steps = any(one.step is not None for one in self.options.values())
-        return (
-            steps
-            or bool(self.config.recurrent)
-            or any(PREVIOUS in parts for parts in self.vectors.values())
-        )
+    def has_memory(self) -> bool:
+        """Whether a result depends on earlier ones of its session, except through `history`."""
+        counts_steps = any(option.step is not None for option in self.options.values())
+        reads_previous = any(PREVIOUS in parts for parts in self.vectors.values())
+        return counts_steps or reads_previous or bool(self.config.recurrent)
 
     @cached_property
     def action(self) -> str:
         """The output that is the action."""
-        others = {*self.config.recurrent.values(), *self.config.info}
-        return self.config.action.output or next(
-            name for name in self.graph.outputs if name not in others
-        )
+        if self.config.action.output:
+            return self.config.action.output
+        other_outputs = {*self.config.recurrent.values(), *self.config.info}
+        return next(name for name in self.graph.outputs if name not in other_outputs)
 
     def chunk(self, outputs: Arrays) -> np.ndarray:
         """Return the action in a row's outputs as a new array (H, D) float32, in the model's
         numbers.
         """
-        output, clip = outputs[self.action], self.config.action.clip
-        rows = output.reshape(-1, output.shape[-1] if output.ndim else 1).astype(np.float32)
-        return rows if clip is None else rows.clip(*clip)
+        output = outputs[self.action]
+        dim = output.shape[-1] if output.ndim else 1
+        chunk = output.reshape(-1, dim).astype(np.float32)
+        clip = self.config.action.clip
+        return chunk if clip is None else chunk.clip(*clip)
 
-    def length(self, name: str) -> int:
-        """Return how many numbers of a vector come from one observation, without the previous
+    def observed_length(self, name: str) -> int:
+        """Return how many numbers of a vector come from one observation: all but the previous
         output.
         """
-        previous = PREVIOUS in self.vectors[name]
-        return (
-            self.graph.inputs[name].size // self.options[name].history
-            - len(self.previous) * previous
-        )
+        length = self.graph.inputs[name].size // self.options[name].history
+        if PREVIOUS in self.vectors[name]:
+            length -= len(self.zero_output)
+        return length
 
-    def size(self, name: str) -> tuple[int, int]:
-        """Return height and width of an image."""
-        shape = self.graph.inputs[name].row
+    def image_size(self, name: str) -> tuple[int, int]:
+        """Return the height and the width of an image."""
+        shape = self.graph.inputs[name].row_shape
         height, width = shape[-3:-1] if shape[-1] == 3 else shape[-2:]
         return height, width
 
-    def texts(self, instruction: str) -> dict[str, np.ndarray]:
-        """Return the inputs that an instruction becomes."""
-        found = {}
-        for name, one in self.options.items():
+    def encode_instruction(self, instruction: str) -> dict[str, np.ndarray]:
+        """Return the inputs that contain the instruction, with a batch of one.
+
+        Raises:
+            InvalidObservation: It has more tokens than an input.
+        """
+        encoded: dict[str, np.ndarray] = {}
+        for name, option in self.options.items():
             tensor = self.graph.inputs[name]
-            if one.instruction == "text":
-                found[name] = np.full(tensor.row, instruction, object)
-            elif one.instruction is not None:
-                ids = self.tokenizer.encode(instruction).ids
-                if len(ids) > tensor.size:
-                    raise InvalidObservation(
-                        f"instruction: got {len(ids)} tokens, want at most {tensor.size}; shorten "
-                        "it"
-                    )
-                mask = one.instruction == "mask"
-                found[name] = np.full(tensor.size, 0 if mask else self.pad, tensor.dtype)
-                found[name][: len(ids)] = 1 if mask else ids
-        return found
+            if option.instruction is None:
+                continue
+            if option.instruction == "text":
+                encoded[name] = np.full(tensor.row_shape, instruction, object)
+                continue
+
+            ids = self.tokenizer.encode(instruction).ids
+            if len(ids) > tensor.size:
+                raise InvalidObservation(
+                    f"instruction: got {len(ids)} tokens, want at most {tensor.size}; shorten it"
+                )
+            is_mask = option.instruction == "mask"
+            values = np.full(tensor.size, 0 if is_mask else self.pad_id, tensor.dtype)
+            values[: len(ids)] = 1 if is_mask else ids
+            encoded[name] = values
+        return encoded
 
     def run(self, rows: Sequence[Arrays]) -> list[dict[str, np.ndarray]]:
-        """Return the used outputs of each row: of all in one pass, if the file has an open batch.
+        """Return the used outputs of each row, all from one pass if the file has an open batch.
 
         Args:
-            rows: The inputs of each row but the constants, with a batch of one.
+            rows: The inputs of each row except the constants, with a batch of one.
         """
-        if len(rows) == 1 or not self.batched:
-            found = [self.graph.run({**row, **self.constants}) for row in rows]
-            return [{name: one[name] for name in self._used} for one in found]
-        feeds = {
-            name: np.concatenate([row[name] for row in rows], one.axis)
-            for name, one in self.inputs.items()
-        }
+        if len(rows) > 1 and self.batched:
+            return self._run_batch(rows)
+        return [self._run_row(row) for row in rows]
+
+    def _run_row(self, row: Arrays) -> dict[str, np.ndarray]:
+        outputs = self.graph.run({**row, **self.constants})
+        return {name: outputs[name] for name in self._output_axes}
+
+    def _run_batch(self, rows: Sequence[Arrays]) -> list[dict[str, np.ndarray]]:
+        feeds: dict[str, np.ndarray] = {}
+        for name, tensor in self.inputs.items():
+            feeds[name] = np.concatenate([row[name] for row in rows], tensor.batch_axis)
         for name, value in self.constants.items():
-            axis = self.graph.inputs[name].axis
+            axis = self.graph.inputs[name].batch_axis
             feeds[name] = value if axis is None else np.repeat(value, len(rows), axis)
-        together = self.graph.run(feeds)
-        split = {
-            name: np.split(together[name], len(rows), axis) for name, axis in self._used.items()
-        }
-        return [{name: parts[i] for name, parts in split.items()} for i in range(len(rows))]
+        outputs = self.graph.run(feeds)
+
+        row_outputs: list[dict[str, np.ndarray]] = [{} for _ in rows]
+        for name, axis in self._output_axes.items():
+            blocks = np.split(outputs[name], len(rows), axis)
+            for of_row, block in zip(row_outputs, blocks, strict=True):
+                of_row[name] = block
+        return row_outputs
 
     def _try_rows(self) -> dict[str, np.ndarray]:
-        """Find out whether rows may share a pass, and return the outputs of one."""
-        recurrent = {
-            later: self.graph.inputs[name].axis or 0
-            for name, later in self.config.recurrent.items()
-        }
-        # With the batch's dimension.
-        self._used = dict.fromkeys((self.action, *self.config.info), 0) | recurrent
+        """Run random rows, decide whether rows may share a pass, and return the outputs of one.
+
+        Raises:
+            ConfigError: The graph fails, or returns different outputs for the same inputs.
+        """
+        # The outputs that are used, with the dimension of their batch.
+        self._output_axes = dict.fromkeys((self.action, *self.config.info), 0)
+        for name, next_value in self.config.recurrent.items():
+            self._output_axes[next_value] = self.graph.inputs[name].batch_axis or 0
+
         rng = np.random.default_rng(0)
-        rows = [{name: one.random(rng) for name, one in self.inputs.items()} for _ in range(2)]
+        rows = []
+        for _ in range(2):
+            rows.append({name: tensor.random(rng) for name, tensor in self.inputs.items()})
         try:
             *alone, again = self.run([*rows, rows[0]])
         except ConfigError:
             raise
         except Exception as error:  # of the runtimes' many classes
-            shapes = ", ".join(f"{name} {one.row} {one.dtype}" for name, one in self.inputs.items())
+            shapes = ", ".join(
+                f"{name} {tensor.row_shape} {tensor.dtype}" for name, tensor in self.inputs.items()
+            )
             raise ConfigError(f"the file fails on {shapes}: {_first_line(error)}") from error
+
         if not _close(alone[0], again):
             raise ConfigError(
                 "the file computes another output from the same inputs: it draws noise, or keeps a "
                 "state, in which sessions would mix; export that as an input (`noise: true`, or "
                 "`recurrent`)"
             )
-        self.batched = all(one.axis is not None for one in self.inputs.values())
-        try:
-            self.batched = self.batched and all(map(_close, alone, self.run(rows)))
-            # As those of a sequence, if its length is open and not the batch.
-            why = "rows change each other in it"
-        except Exception as error:  # noqa: BLE001 - an open length may be another than the batch's
-            self.batched, why = False, _first_line(error)
-        if not self.batched and all(one.axis is not None for one in self.inputs.values()):
-            log.warning(
-                "rows are computed one by one, as the file's open dimension is no batch: %s", why
-            )
+        self.batched = self._can_batch(rows, alone)
         return alone[0]
 
+    def _can_batch(self, rows: Sequence[Arrays], alone: Sequence[Mapping[str, np.ndarray]]) -> bool:
+        """Return whether rows have the same outputs in one pass as alone; if not, log why."""
+        if any(tensor.batch_axis is None for tensor in self.inputs.values()):
+            return False
+
+        try:
+            if all(map(_close, alone, self._run_batch(rows))):
+                return True
+            # This happens if the open length is that of a sequence.
+            reason = "rows change each other in it"
+        except Exception as error:  # noqa: BLE001 - an open length may be another than the batch's
+            reason = _first_line(error)
+        log.warning(
+            "rows are computed one by one, as the file's open dimension is no batch: %s", reason
+        )
+        return False
+
     def _require_mapped(self) -> None:
-        """Give the one input that nothing names the parts in `state`; raises `ConfigError`
-        unless all are mapped.
+        """Assign the parts in `state` to the one input without another source.
+
+        Raises:
+            ConfigError: An input has no source or several, the action is not determined, or a name
+                is unknown.
         """
         config, inputs, outputs = self.config, self.graph.inputs, self.graph.outputs
-        sourced = [name for name, one in config.inputs.items() if one.model_fields_set & {*SOURCES}]
-        named = [*self.cameras, *config.recurrent, *sourced]
-        left = [name for name in inputs if name not in named] or ["state"] * (
-            config.state is not None
-        )
-        if config.state is not None and len(left) == 1 and left[0] in inputs:
-            self.vectors[left.pop()] = config.state
+        with_source = []
+        for name, option in config.inputs.items():
+            if option.model_fields_set & {*SOURCES}:
+                with_source.append(name)
+        named_inputs = [*self.cameras, *config.recurrent, *with_source]
+        without_source = [name for name in inputs if name not in named_inputs]
+        if config.state is not None:
+            if not without_source:
+                without_source = ["state"]  # the setting, which has no input left
+            if len(without_source) == 1 and without_source[0] in inputs:
+                self.vectors[without_source.pop()] = config.state
+
+        other_outputs = {*config.recurrent.values(), *config.info}
+        named_outputs = set(other_outputs)
+        if config.action.output:
+            named_outputs.add(config.action.output)
         unknown = {*self.cameras, *config.inputs, *config.recurrent} - inputs.keys()
-        of_others = {*config.recurrent.values(), *config.info}
-        unknown |= {*of_others, *filter(None, [config.action.output])} - {*outputs}
-        free = [name for name in outputs if name not in of_others]
+        unknown |= named_outputs - {*outputs}
+
+        action_candidates: list[str] = []  # if the action is not determined
+        if not config.action.output:
+            action_candidates = [name for name in outputs if name not in other_outputs]
+            if len(action_candidates) == 1:
+                action_candidates = []
+            elif not action_candidates:
+                action_candidates = ["none of the outputs"]
+
         problems = {
             "unknown": sorted(unknown),
-            "named twice": sorted({name for name in named if named.count(name) > 1}),
-            "inputs without a source": left,
-            "one of them the action": []
-            if config.action.output or len(free) == 1
-            else free or ["none of the outputs"],
+            "named twice": sorted({name for name in named_inputs if named_inputs.count(name) > 1}),
+            "inputs without a source": without_source,
+            "one of them the action": action_candidates,
         }
-        if said := "; ".join(f"{what}: {names}" for what, names in problems.items() if names):
+        summary = "; ".join(f"{problem}: {names}" for problem, names in problems.items() if names)
+        if summary:
+            shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in inputs.items())
             raise ConfigError(
-                "the file has inputs "
-                f"{', '.join(f'{name} {one.shape}' for name, one in inputs.items())} and outputs "
-                f"{outputs}, which the settings do not fit, {said}; name each input in `cameras`, "
-                "`recurrent` or `inputs`, but for one, which has the parts in `state`, and the "
-                "output in `action`"
+                f"the file has inputs {shapes} and outputs {outputs}, which the settings do not "
+                f"fit, {summary}; name each input in `cameras`, `recurrent` or `inputs`, but for "
+                "one, which has the parts in `state`, and the output in `action`"
             )
 
     def _require_used(self) -> None:
-        """Raise `ConfigError` for an option that its input does not use, and a part that it does
-        not have.
+        """Raise `ConfigError` for an option that its input does not use, and for statistics of a
+        part that it does not have.
         """
         unused = {"action": self.config.action.parts}
-        for name, one in self.config.inputs.items():
-            usable = {"shape", *SOURCES}
-            if name in {*self.vectors, *self.cameras}:
-                usable |= {"history", *Scaling.model_fields}
-            if name in self.cameras:
-                raw = self.graph.inputs[name].dtype == np.uint8
-                usable = (usable - {*Scaling.model_fields} if raw else usable | {"range"}) | {
-                    "resize"
-                }
-            unused[f"inputs: {name}"] = (one.model_fields_set - usable) | (
-                one.parts - {*self.vectors.get(name, ())}
-            )
-        for where, names in unused.items():
+        for name, option in self.config.inputs.items():
+            unused_options = option.model_fields_set - self._usable_options(name)
+            unknown_parts = option.parts - {*self.vectors.get(name, ())}
+            unused[f"inputs: {name}"] = unused_options | unknown_parts
+        for setting, names in unused.items():
             if names:
                 raise ConfigError(
-                    f"{where}: has no use of {sorted(names)}; leave it out, or correct the name"
+                    f"{setting}: has no use of {sorted(names)}; leave it out, or correct the name"
                 )
+
+    def _usable_options(self, name: str) -> set[str]:
+        """Return the fields of `Input` that have an effect for an input."""
+        usable = {"shape", *SOURCES}
+        if name in self.cameras:
+            usable |= {"history", "resize"}
+            if self.graph.inputs[name].dtype == np.uint8:
+                return usable  # the model gets the pixels unchanged
+            usable |= {"range", *Scaling.model_fields}
+        elif name in self.vectors:
+            usable |= {"history", *Scaling.model_fields}
+        return usable
 
     def _constant(self, name: str) -> np.ndarray:
         tensor, value = self.graph.inputs[name], self.options[name].constant
         try:
-            return np.broadcast_to(np.asarray(value, tensor.dtype), tensor.row).copy()
+            return np.broadcast_to(np.asarray(value, tensor.dtype), tensor.row_shape).copy()
         except ValueError as error:
             raise ConfigError(
-                f"inputs: {name}: constant: got {value}, want numbers of {tensor.row}"
+                f"inputs: {name}: constant: got {value}, want numbers of {tensor.row_shape}"
             ) from error
 
     def _require_fitting(self, example: Arrays) -> None:
-        """Raise `ConfigError` unless images are images, and lists of statistics as long as their
-        numbers.
+        """Raise `ConfigError` unless the inputs of cameras have the shape of images, and lists of
+        statistics are as long as what they scale.
         """
-        scaled: list[tuple[str, Any, Any]] = [
+        # The setting, its conversion, and numbers of the shape that it converts.
+        conversions: list[tuple[str, Any, Any]] = [
             ("action", self.config.action.unnormalized, self.chunk(example))
         ]
         for name in self.cameras:
-            tensor, (height, width) = self.graph.inputs[name], self.size(name)
-            if (
-                len(tensor.shape) < 4
-                or tensor.size != self.options[name].history * height * width * 3
-            ):
+            option, tensor = self.options[name], self.graph.inputs[name]
+            height, width = self.image_size(name)
+            if len(tensor.shape) < 4 or tensor.size != option.history * height * width * 3:
                 raise ConfigError(
                     f"cameras: {name}: got an input {tensor.shape}, want (-1, 3, H, W) or (-1, H, "
                     "W, 3), with `history` images before them; is it an image?"
                 )
-            scaled.append((f"inputs: {name}", self.options[name].normalized, np.zeros((1, 3))))
+            conversions.append((f"inputs: {name}", option.normalized, np.zeros((1, 3))))
+
         for name, parts in self.vectors.items():
-            if self.length(name) < 0 or parts.count(PREVIOUS) > 1:
+            if self.observed_length(name) < 0 or parts.count(PREVIOUS) > 1:
                 raise ConfigError(
-                    f"inputs: {name}: {PREVIOUS} has {len(self.previous)} numbers, which do not "
+                    f"inputs: {name}: {PREVIOUS} has {len(self.zero_output)} numbers, which do not "
                     "fit in"
                 )
-            values = self.previous if PREVIOUS in parts else np.zeros(self.length(name))
-            scaled.append((f"inputs: {name}", self.options[name].normalized, values))
-        for where, convert, values in scaled:
+            values = self.zero_output if PREVIOUS in parts else np.zeros(self.observed_length(name))
+            conversions.append((f"inputs: {name}", self.options[name].normalized, values))
+
+        for setting, convert, values in conversions:
             try:
                 fits = convert(values).shape == values.shape
             except ValueError:
                 fits = False
             if not fits:
                 raise ConfigError(
-                    f"{where}: got lists of statistics of another length, want {values.shape[-1]} "
-                    f"numbers, or one for all; with {PREVIOUS}, statistics by part"
+                    f"{setting}: got lists of statistics of another length, want "
+                    f"{values.shape[-1]} numbers, or one for all; with {PREVIOUS}, statistics by "
+                    "part"
                 )
 
     def _tokenizer(self, path: Path) -> Any:
-        if not {"tokens", "mask"} & {one.instruction for one in self.options.values()}:
+        """Read the tokenizer next to the graph's file; return None if no input needs it."""
+        if not {"tokens", "mask"} & {option.instruction for option in self.options.values()}:
             return None
-        if not path.with_name(TOKENIZER).is_file():
-            raise ConfigError(
-                f"{path.with_name(TOKENIZER)}: is missing, want that of the instruction, by "
-                "`tokenizers`"
-            )
-        tokenizer = require("tokenizers", extra="onnx").Tokenizer.from_file(
-            str(path.with_name(TOKENIZER))
-        )
-        self.pad = (tokenizer.padding or {}).get("pad_id", 0)
+
+        file = path.with_name(TOKENIZER)
+        if not file.is_file():
+            raise ConfigError(f"{file}: is missing, want that of the instruction, by `tokenizers`")
+        tokenizer = require("tokenizers", extra="onnx").Tokenizer.from_file(str(file))
+        self.pad_id = (tokenizer.padding or {}).get("pad_id", 0)
         tokenizer.no_padding()
         tokenizer.no_truncation()
         return tokenizer
 
     def _contract(self, horizon: int, dim: int) -> Contract:
-        config, state = self.config, {}
-        for name, parts in self.vectors.items():
-            state.update(
-                state_specs([part for part in parts if part != PREVIOUS], self.length(name))
-            )
+        """Return the contract of the settings, with the shapes of the file."""
+        config = self.config
         try:
-            stated = Contract.from_json(config.contract)
+            configured = Contract.from_json(config.contract)
         except MalformedMessage as error:
             raise ConfigError(f"contract: {error}") from error
+
+        cameras: dict[str, CameraSpec] = {}
+        for name, camera in self.cameras.items():
+            resizes = self.options[name].resize
+            cameras[camera] = CameraSpec() if resizes else CameraSpec(*self.image_size(name))
+        state = {}
+        for name, parts in self.vectors.items():
+            observed_parts = [part for part in parts if part != PREVIOUS]
+            state.update(state_specs(observed_parts, self.observed_length(name)))
+
+        histories = [option.history for option in self.options.values()]
+        if self.has_memory:
+            histories.append(config.burn_in)
         return replace(
-            stated,
-            cameras={
-                ours: CameraSpec() if self.options[name].resize else CameraSpec(*self.size(name))
-                for name, ours in self.cameras.items()
-            },
-            state=state | dict(stated.state or {}),
+            configured,
+            cameras=cameras,
+            state=state | dict(configured.state or {}),
             gripper=any(map(needs_gripper, self.vectors.values())),
-            instruction=any(one.instruction for one in self.options.values()),
-            action=replace(stated.action, dim=dim),
+            instruction=any(option.instruction for option in self.options.values()),
+            action=replace(configured.action, dim=dim),
             chunk=min(config.execute or horizon, horizon) if config.actions == "chunk" else 1,
-            history=max(
-                [config.burn_in * self.remembers, *(one.history for one in self.options.values())]
-            ),
+            history=max(histories, default=0),
         )
 
 
-def _close(found: Arrays, wanted: Arrays) -> bool:
-    def close(one: np.ndarray, other: np.ndarray) -> bool:
-        largest = np.abs(other[np.isfinite(other)]).max(initial=1)
-        return one.shape == other.shape and np.allclose(
-            one, other, rtol=0, atol=_TOLERANCE * largest, equal_nan=True
-        )
+def _close(outputs: Arrays, expected: Arrays) -> bool:
+    """Return whether all expected outputs are equal up to `_TOLERANCE`."""
+    for name, expected_values in expected.items():
+        values = outputs[name]
+        largest = np.abs(expected_values[np.isfinite(expected_values)]).max(initial=1)
+        if values.shape != expected_values.shape or not np.allclose(
+            values, expected_values, rtol=0, atol=_TOLERANCE * largest, equal_nan=True
+        ):
+            return False
+    return True
 
-    return all(close(found[name], one) for name, one in wanted.items())
 
-
-_STEP, _RECURRENT = "step", "recurrent"  # keys in a session's memory, beside PREVIOUS
+_STEP, _RECURRENT = "step", "recurrent"  # keys in a session's memory, in addition to PREVIOUS
 
 
 @dataclass(slots=True)
@@ -698,7 +812,7 @@ class Frame:
     """The inputs of one observation."""
 
     values: dict[str, np.ndarray]
-    # Where PREVIOUS belongs in a vector, until an act fills it.
+    # The index in a vector at which PREVIOUS begins, until the next pass fills it in.
     gaps: dict[str, int] = field(default_factory=dict)
 
 
@@ -712,137 +826,147 @@ class Onnx(ModelPolicy):
 
     @property
     def history(self) -> int:
-        return (
-            1
-            if self.model is None
-            else max((one.history for one in self.model.options.values()), default=1)
-        )
+        if self.model is None:
+            return 1
+        return max((option.history for option in self.model.options.values()), default=1)
 
     @property
     def contract(self) -> Contract:
         return Contract() if self.model is None else self.model.contract
 
     def load(self) -> Network:
-        return Network(*read_graph(self.config), self.config)
+        """Read the file; raises `ConfigError` if it cannot be read or does not fit the
+        settings.
+        """
+        graph, path = read_graph(self.config)
+        return Network(graph, path, self.config)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode, and encode its instruction."""
         info = super().reset(obs, instruction, **kwargs)
-        self._begun().prompt = self.loaded().texts(instruction or "")
+        self._begun().prompt = self.loaded().encode_instruction(instruction or "")
         return info
 
     def observe(self, obs: Obs) -> None:
         """Add an observation, from which the model also computes its next memory."""
         super().observe(obs)
-        if self.model.remembers:
+        if self.model.has_memory:
             episode = self._begun()
-            self.predict(
-                [
-                    Row(
-                        tuple(episode.frames),
-                        episode.instruction,
-                        episode.rng,
-                        memory=episode.memory,
-                    )
-                ]
-            )
+            frames = tuple(episode.frames)
+            row = Row(frames, episode.instruction, episode.rng, memory=episode.memory)
+            self.predict([row])
 
     def perceive(self, obs: Obs) -> Frame:
+        """Return the inputs that come from an observation and from the instruction."""
         network: Network = self.model
         frame = Frame(dict(self._begun().prompt))
         for name, image in camera_images(obs, network.cameras).items():
             frame.values[name] = self._pixels(name, image)
-        for name, parts in network.vectors.items():
-            option, length = network.options[name], network.length(name)
-            if not option.parts and PREVIOUS not in parts:
-                frame.values[name] = option.normalized(state_vector(obs, parts, length))
-                continue
-            # Raises what does not fit.
-            state_vector(obs, [part for part in parts if part != PREVIOUS], length)
-            pieces = [
-                network.previous if part == PREVIOUS else state_vector(obs, [part])
-                for part in parts
-            ]
-            if PREVIOUS in parts:
-                frame.gaps[name] = sum(map(len, pieces[: parts.index(PREVIOUS)]))
-            try:
-                pieces = [
-                    option.normalized(piece, part)
-                    for piece, part in zip(pieces, parts, strict=True)
-                ]
-            except ValueError as error:
-                raise InvalidObservation(
-                    f"state: the statistics of {name!r} do not fit its parts: {error}"
-                ) from error
-            frame.values[name] = np.concatenate(pieces)
+        for name in network.vectors:
+            self._add_vector(frame, name, obs)
         return frame
 
+    def _add_vector(self, frame: Frame, name: str, obs: Obs) -> None:
+        """Add a vector of an observation to a frame, with a gap for PREVIOUS."""
+        network: Network = self.model
+        option, parts = network.options[name], network.vectors[name]
+        length = network.observed_length(name)
+        if not option.parts and PREVIOUS not in parts:
+            frame.values[name] = option.normalized(state_vector(obs, parts, length))
+            return
+
+        # This raises an error if the observation does not fit.
+        state_vector(obs, [part for part in parts if part != PREVIOUS], length)
+        blocks = []
+        for part in parts:
+            if part == PREVIOUS:
+                frame.gaps[name] = sum(map(len, blocks))
+                blocks.append(network.zero_output)
+            else:
+                blocks.append(state_vector(obs, [part]))
+
+        try:
+            blocks = [
+                option.normalized(block, part) for block, part in zip(blocks, parts, strict=True)
+            ]
+        except ValueError as error:
+            raise InvalidObservation(
+                f"state: the statistics of {name!r} do not fit its parts: {error}"
+            ) from error
+        frame.values[name] = np.concatenate(blocks)
+
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        network, config = self.model, self.config
-        found = []
-        for row, outputs in zip(rows, network.run([self._feed(row) for row in rows]), strict=True):
-            action = network.chunk(outputs)
-            if network.remembers:
+        """Compute the chunks of all rows, and update the memory of each."""
+        network: Network = self.model
+        config = self.config
+        outputs_by_row = network.run([self._feed(row) for row in rows])
+
+        predictions = []
+        for row, outputs in zip(rows, outputs_by_row, strict=True):
+            chunk = network.chunk(outputs)
+            if network.has_memory:
                 row.memory[_STEP] = row.memory.get(_STEP, 0) + 1
-                row.memory[PREVIOUS] = action.ravel()
+                row.memory[PREVIOUS] = chunk.ravel()
                 row.memory[_RECURRENT] = {
-                    name: outputs[later].copy() for name, later in config.recurrent.items()
+                    name: outputs[next_value].copy()
+                    for name, next_value in config.recurrent.items()
                 }
-            found.append(
-                Prediction(
-                    config.action.unnormalized(action),
-                    info={name: outputs[name] for name in config.info},
-                )
-            )
-        return found
+            info = {name: outputs[name] for name in config.info}
+            predictions.append(Prediction(config.action.unnormalized(chunk), info=info))
+        return predictions
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        rng, options = np.random.default_rng(seed), self.model.options
-        one_frame = {
-            name: tensor.random(rng).ravel()[: tensor.size // options[name].history]
-            for name, tensor in self.model.graph.inputs.items()
-        }
-        return Row((Frame(one_frame),), instruction, rng)
+        rng = np.random.default_rng(seed)
+        values: dict[str, np.ndarray] = {}
+        for name, tensor in self.model.graph.inputs.items():
+            length = tensor.size // self.model.options[name].history
+            values[name] = tensor.random(rng).ravel()[:length]
+        return Row((Frame(values),), instruction, rng)
 
     def _feed(self, row: Row) -> dict[str, np.ndarray]:
         """Return the inputs of a row, with a batch of one."""
-        network: Network = self.model
-        for frame in row.frames:
-            for name, start in frame.gaps.items():
-                previous = network.options[name].normalized(
-                    row.memory.get(PREVIOUS, network.previous), PREVIOUS
-                )
-                frame.values[name][start : start + len(previous)] = previous
-            frame.gaps = {}
-        feed = {}
-        for name, tensor in network.inputs.items():
-            option = network.options[name]
+        self._fill_gaps(row)
+        feed: dict[str, np.ndarray] = {}
+        for name, tensor in self.model.inputs.items():
+            option = self.model.options[name]
             if name in self.config.recurrent:
                 value = row.memory.get(_RECURRENT, {}).get(name, tensor.zeros())
             elif option.step is not None:
-                value = np.full(tensor.row, option.step + row.memory.get(_STEP, 0))
+                value = np.full(tensor.row_shape, option.step + row.memory.get(_STEP, 0))
             elif option.noise:
-                value = row.noise(*tensor.row)
+                value = row.noise(*tensor.row_shape)
             else:
-                value = np.stack(
-                    [frame.values[name] for frame in row.history(option.history)]
-                ).reshape(tensor.row)
+                values = [frame.values[name] for frame in row.history(option.history)]
+                value = np.stack(values).reshape(tensor.row_shape)
             feed[name] = value.astype(tensor.dtype, copy=False)
         return feed
+
+    def _fill_gaps(self, row: Row) -> None:
+        """Write the previous output into the frames that were observed since it was computed."""
+        network: Network = self.model
+        output = row.memory.get(PREVIOUS, network.zero_output)
+        for frame in row.frames:
+            for name, start in frame.gaps.items():
+                previous = network.options[name].normalized(output, PREVIOUS)
+                frame.values[name][start : start + len(previous)] = previous
+            frame.gaps = {}
 
     def _pixels(self, name: str, image: np.ndarray) -> np.ndarray:
         """Return an image (H, W, 3) uint8 as the model's input, without its batch."""
         network: Network = self.model
-        option, tensor, size = network.options[name], network.graph.inputs[name], network.size(name)
+        option, tensor = network.options[name], network.graph.inputs[name]
+        height, width = network.image_size(name)
         if option.resize:
-            image = resize_with_pad(image, *size)
-        if image.shape[:2] != size:
+            image = resize_with_pad(image, height, width)
+        if image.shape[:2] != (height, width):
             raise InvalidObservation(
                 f"camera {network.cameras[name]!r}: got {image.shape[0]}x{image.shape[1]}, want "
-                f"{size[0]}x{size[1]}; send that size, or set `resize: true` for the input {name!r}"
+                f"{height}x{width}; send that size, or set `resize: true` for the input {name!r}"
             )
+
         if tensor.dtype != np.uint8:
             low, high = map(np.float32, option.range)
-            image = option.normalized(
-                image.astype(np.float32) * (high - low) / np.float32(255) + low
-            )
-        return image.copy() if tensor.row[-1] == 3 else image.transpose(2, 0, 1).copy()
+            scaled = image.astype(np.float32) * (high - low) / np.float32(255) + low
+            image = option.normalized(scaled)
+        channels_last = tensor.row_shape[-1] == 3
+        return image.copy() if channels_last else image.transpose(2, 0, 1).copy()
