@@ -36,7 +36,7 @@ def transforms(**changes: Any) -> Transforms:
         for end in (LOW, LOW + WIDTH)
     ]
     given: dict[str, Any] = {"forward": forward, "bounds": bounds} | changes
-    return Transforms(inputs=None, outputs=None, robot="AlohaInputs", prompt=True, **given)
+    return Transforms(inputs=None, outputs=None, robot="AlohaInputs", needs_prompt=True, **given)
 
 
 def test_ranges_are_in_the_units_of_the_robot_and_unknown_where_numbers_are_mixed() -> None:

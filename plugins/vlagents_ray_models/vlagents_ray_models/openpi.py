@@ -54,8 +54,14 @@ class RobotConvention:
     optional: tuple[str, ...] = ()  # cameras that openpi masks if they are missing
 
     def read(self, obs: Obs) -> dict[str, Any]:
-        """Convert an observation to openpi's, without the prompt: copies of the images, uint8,
-        and states, float32.
+        """Convert an observation to openpi's, without the prompt.
+
+        Args:
+            obs: The observation.
+
+        Returns:
+            Copies of the images, uint8 in the convention's layout, and the state's vectors,
+            float32, under openpi's keys. A dot in a key leads to a nested dict.
         """
         data: dict[str, Any] = {}
         for key, image in camera_images(obs, self.cameras).items():
@@ -66,10 +72,11 @@ class RobotConvention:
 
 
 def _put(data: dict[str, Any], key: str, value: np.ndarray) -> None:
-    *above, last = key.split(".")
-    for name in above:
-        data = data.setdefault(name, {})
-    data[last] = value
+    """Store a value under a key, whose dots separate the keys of nested dicts."""
+    *outer_keys, last_key = key.split(".")
+    for outer_key in outer_keys:
+        data = data.setdefault(outer_key, {})
+    data[last_key] = value
 
 
 _ALOHA = RobotConvention(
@@ -84,10 +91,10 @@ _ALOHA = RobotConvention(
     optional=("images.cam_left_wrist", "images.cam_right_wrist"),
 )
 
-# As in openpi's examples/{libero,droid,aloha_real,aloha_sim}. The gripper closes at 1 in actions of
-# LIBERO and DROID (DROID's observed value is 0 when open); ALOHA's two, at 6 and 13, are in [0, 1],
-# 1 = open, and stay unchanged.
-ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observation transform
+# As in openpi's examples/{libero,droid,aloha_real,aloha_sim}, by the class of openpi's observation
+# transform. In actions of LIBERO and DROID, 1 closes the gripper; in DROID's observations, 0 is
+# open. ALOHA's two grippers, numbers 6 and 13, are in [0, 1], where 1 is open, and stay unchanged.
+ROBOTS: Mapping[str, RobotConvention] = {
     "LiberoInputs": RobotConvention(
         {"observation/image": "front", "observation/wrist_image": "wrist"},
         {"observation/state": {"xyz_axis_angle": 6, "gripper_qpos": 2}},
@@ -103,15 +110,23 @@ ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observatio
     ),
     "AlohaInputs": _ALOHA,
 }
-_ENDS = ("q01", "q99")  # the statistics by which a robot is compared with the training
+_QUANTILES = ("q01", "q99")  # the statistics with which a robot is compared to the training
 
 
 def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotConvention:
-    """Return the convention of a config's robot, overridden by the settings; raises
-    `ConfigError` if it is unknown.
+    """Return the convention of a robot.
+
+    Args:
+        config: The name of the training config.
+        transform: The class of its observation transform.
+        settings: The settings of the policy, which override the usual convention.
+
+    Raises:
+        ConfigError: The robot is unknown, and the settings do not describe it.
     """
     cameras, state = settings.cameras, settings.state
-    if (usual := ROBOTS.get(transform)) is None:
+    usual = ROBOTS.get(transform)
+    if usual is None:
         if cameras is None or state is None:
             raise ConfigError(
                 f"config {config!r}: its observations go through {transform or 'no transform'}, "
@@ -121,14 +136,15 @@ def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotCo
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
         cameras = {"images.cam_high": "front"}  # the simulation has one camera
-    known = [
-        key
-        for key in usual.cameras
-        if key not in usual.optional or cameras is None or key in cameras
-    ]
+
+    used_keys = []
+    for key in usual.cameras:
+        is_left_out = key in usual.optional and cameras is not None and key not in cameras
+        if not is_left_out:
+            used_keys.append(key)
     return replace(
         usual,
-        cameras=choose_cameras(cameras, usual.cameras, known),
+        cameras=choose_cameras(cameras, usual.cameras, used_keys),
         state=usual.state if state is None else state,
         layout=settings.layout or usual.layout,
     )
@@ -140,26 +156,33 @@ class Transforms:
     `create_trained_policy`.
     """
 
-    inputs: Any  # a dict of unbatched arrays -> such a dict
+    inputs: Any  # converts a dict of unbatched arrays to the model's, as `outputs` and `forward` do
     outputs: Any
     forward: Any  # the part of `inputs` for actions, before the model's own transforms
-    # Of the training's states and actions, in the units of `forward`.
+    # Lowest and highest of the training's "state" and "actions", (D,), in the units of `forward`;
+    # empty if the checkpoint has none.
     bounds: Sequence[Mapping[str, np.ndarray]]
     robot: str  # the class of its first observation transform, e.g. "LiberoInputs"
-    prompt: bool  # whether a prompt is needed; if not, the config has one
+    needs_prompt: bool  # False if the config has a prompt
 
     @classmethod
-    def of(cls, config: Any, folder: Path) -> Transforms:
-        """Read the transforms; raises `ConfigError` if the checkpoint lacks statistics of the
-        config's asset.
+    def from_folder(cls, config: Any, folder: Path) -> Transforms:
+        """Read the transforms of a checkpoint.
+
+        Args:
+            config: openpi's training config.
+            folder: The folder of the checkpoint.
+
+        Raises:
+            ConfigError: The checkpoint lacks statistics of the config's asset.
         """
         openpi = require("openpi.transforms")
-        # with the checkpoint's statistics: openpi itself would first look online
-        here = dataclasses.replace(config.data.assets, assets_dir=str(folder / "assets"))
-        data = dataclasses.replace(config.data, assets=here).create(
-            config.assets_dirs, config.model
-        )
-        statistics = _statistics(folder, data.asset_id)
+        # The statistics are the checkpoint's: openpi itself would first look online.
+        assets = dataclasses.replace(config.data.assets, assets_dir=str(folder / "assets"))
+        data_factory = dataclasses.replace(config.data, assets=assets)
+        data = data_factory.create(config.assets_dirs, config.model)
+
+        statistics = _read_statistics(folder, data.asset_id)
         quantiles = data.use_quantile_norm
         try:
             normalise = openpi.Normalize(statistics, use_quantiles=quantiles)
@@ -168,26 +191,35 @@ class Transforms:
             raise ConfigError(
                 f"checkpoint {folder}: {error}; compute its statistics with openpi's script"
             ) from error
+
         robot, model = data.data_transforms, data.model_transforms
-        known = all(getattr(one, end) is not None for one in statistics.values() for end in _ENDS)
-        ends = [
-            {name: getattr(one, end) for name, one in statistics.items()} for end in _ENDS if known
-        ]
+        default_prompts = []
+        for transform in model.inputs:
+            if isinstance(transform, openpi.InjectDefaultPrompt):
+                default_prompts.append(getattr(transform, "prompt", None))
         return cls(
-            openpi.compose([*robot.inputs, normalise, *model.inputs]),
-            openpi.compose([*model.outputs, restore, *robot.outputs]),
-            openpi.compose([*robot.inputs, normalise]),
-            [normalise(one) for one in ends],
-            type(robot.inputs[0]).__name__ if robot.inputs else "",
-            not any(
-                getattr(one, "prompt", None)
-                for one in model.inputs
-                if isinstance(one, openpi.InjectDefaultPrompt)
-            ),
+            inputs=openpi.compose([*robot.inputs, normalise, *model.inputs]),
+            outputs=openpi.compose([*model.outputs, restore, *robot.outputs]),
+            forward=openpi.compose([*robot.inputs, normalise]),
+            bounds=[normalise(quantiles) for quantiles in _quantiles(statistics)],
+            robot=type(robot.inputs[0]).__name__ if robot.inputs else "",
+            needs_prompt=not any(default_prompts),
         )
 
     def read(self, observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-        inputs: dict[str, Any] = self.inputs(_with(observation, instruction))
+        """Convert an observation to the model's inputs.
+
+        Args:
+            observation: The result of `RobotConvention.read`.
+            instruction: The task in words.
+
+        Returns:
+            The inputs of one row, by openpi's names.
+
+        Raises:
+            InvalidObservation: The instruction may be too long for the model.
+        """
+        inputs: dict[str, Any] = self.inputs(_with_prompt(observation, instruction))
         mask = np.asarray(inputs["tokenized_prompt_mask"])
         if mask.all():
             raise InvalidObservation(
@@ -197,99 +229,145 @@ class Transforms:
         return inputs
 
     def actions(self, state: np.ndarray, output: np.ndarray) -> np.ndarray:
-        """Convert the model's output for one row to actions (H, D) float32, in the robot's
-        units.
+        """Convert the model's output to actions in the robot's units.
+
+        Args:
+            state: The state of the row's inputs.
+            output: The model's output for the row: actions (H, action_dim), or tokens (T,).
+
+        Returns:
+            The actions, (H, D) float32.
         """
         return np.asarray(self.outputs({"state": state, "actions": output})["actions"], np.float32)
 
     def plan(
         self, observation: dict[str, Any], instruction: str, actions: np.ndarray
     ) -> np.ndarray:
-        """Convert a robot's actions (H, D) to the model's units, relative to the observation if
-        the model's are.
+        """Convert a robot's actions to the model's units.
+
+        Args:
+            observation: The result of `RobotConvention.read`.
+            instruction: The task in words.
+            actions: The actions in the robot's units, (H, D).
+
+        Returns:
+            The actions, (H, action_dim) float32, relative to the observation if the model's are.
         """
-        data = _with(observation, instruction) | {"actions": np.array(actions)}
+        data = _with_prompt(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
 
     def ranges(self, robot: RobotConvention) -> dict[str, Any] | None:
-        """Return `Agent.statistics` in the robot's units, with None for numbers that `forward` does
-        not only scale.
+        """Return `Agent.statistics` in the robot's units.
 
-        openpi's statistics are of transformed numbers: some of ALOHA's joints have another sign,
-        most actions are relative to the state. Random numbers show which ones are the robot's own,
-        by a factor and an offset.
+        openpi's statistics are those of transformed numbers: some of ALOHA's joints change their
+        sign, and most actions are relative to the state. Random numbers show which of the robot's
+        numbers are only multiplied by a factor and shifted by an offset.
+
+        Args:
+            robot: The convention of the robot.
+
+        Returns:
+            The statistics, with None for numbers that `forward` changes in another way; None if
+            the checkpoint has no quantiles, or the robot's actions have no known length.
         """
-        widths, rng = (
-            [sum(parts.values()) for parts in robot.state.values()],
-            np.random.default_rng(0),
-        )
-        image, seen = (
-            np.zeros((224, 224, 3) if robot.layout == "hwc" else (3, 224, 224), np.uint8),
-            [],
-        )
-        dims = {"state": sum(widths), "actions": robot.action.dim}
-        if not self.bounds or dims["actions"] is None:
+        action_dim = robot.action.dim
+        if not self.bounds or action_dim is None:
             return None
-        given = [
-            {name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in dims.items()}
-            for scale in (0, 1, 1)
-        ]
-        for one in given:
-            # A copy, which transforms change.
-            data: dict[str, Any] = {"actions": np.array(one["actions"], ndmin=2)}
-            state = dict(
-                zip(robot.state, np.split(one["state"], np.cumsum(widths)[:-1]), strict=True)
-            )
-            for key, value in (dict.fromkeys(robot.cameras, image) | state).items():
-                _put(data, key, value)
-            seen.append(self.forward(data))
-        found: dict[str, Any] = {
-            "parts": [part for parts in robot.state.values() for part in parts]
-        }
-        for (name, dim), key in zip(dims.items(), ("observation.state", "action"), strict=True):
-            zero, first, second = (np.ravel(one[name])[:dim] for one in seen)
-            factor = (first - zero) / given[1][name]
-            factor[
-                ~np.isclose(second, zero + factor * given[2][name], atol=1e-4) | (factor == 0)
-            ] = np.nan
-            ends = np.sort(
-                [(bound[name][:dim] - zero) / factor for bound in self.bounds], axis=0
-            ).tolist()
-            found[key] = {
-                _ENDS[i]: [None if np.isnan(x) else x for x in row] for i, row in enumerate(ends)
+        state_dim = sum(sum(parts.values()) for parts in robot.state.values())
+        dims = {"state": state_dim, "actions": action_dim}
+
+        # Zeros show the offsets, the first random sample the factors, and the second one checks
+        # them.
+        rng = np.random.default_rng(0)
+        samples, transformed = [], []
+        for scale in (0, 1, 1):
+            sample = {name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in dims.items()}
+            samples.append(sample)
+            transformed.append(self._transform(robot, sample["state"], sample["actions"]))
+
+        ranges: dict[str, Any] = {"parts": []}
+        for parts in robot.state.values():
+            ranges["parts"] += parts
+        for name, key in (("state", "observation.state"), ("actions", "action")):
+            dim = dims[name]
+            offset, first, second = (np.ravel(data[name])[:dim] for data in transformed)
+            factor = (first - offset) / samples[1][name]
+            predicted = offset + factor * samples[2][name]
+            is_scaled = np.isclose(second, predicted, atol=1e-4) & (factor != 0)
+            factor[~is_scaled] = np.nan
+
+            bounds = [(bound[name][:dim] - offset) / factor for bound in self.bounds]
+            lower, upper = np.sort(bounds, axis=0)  # a negative factor exchanges them
+            ranges[key] = {
+                _QUANTILES[0]: _none_for_nan(lower),
+                _QUANTILES[1]: _none_for_nan(upper),
             }
-        return found
+        return ranges
+
+    def _transform(
+        self, robot: RobotConvention, state: np.ndarray, action: np.ndarray
+    ) -> dict[str, Any]:
+        """Return the result of `forward` for a state (D,), an action (D,) and black images."""
+        # `forward` may change arrays in place, so it gets copies.
+        data: dict[str, Any] = {"actions": np.array(action, ndmin=2)}
+        image_shape = (224, 224, 3) if robot.layout == "hwc" else (3, 224, 224)
+        for key in robot.cameras:
+            _put(data, key, np.zeros(image_shape, np.uint8))
+
+        widths = [sum(parts.values()) for parts in robot.state.values()]
+        vectors = np.split(np.array(state), np.cumsum(widths)[:-1])
+        for key, vector in zip(robot.state, vectors, strict=True):
+            _put(data, key, vector)
+        transformed: dict[str, Any] = self.forward(data)
+        return transformed
 
 
-def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-    """Copy an observation as deeply as openpi's transforms modify it."""
+def _none_for_nan(values: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(value) else value for value in values.tolist()]
+
+
+def _with_prompt(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
+    """Return an observation with its prompt, copied as deeply as openpi's transforms modify it."""
     data: dict[str, Any] = require("jax").tree.map(np.array, observation)
     return data | {"prompt": instruction} if instruction else data
 
 
-def _statistics(folder: Path, asset: str | None) -> Any:
+def _quantiles(statistics: Mapping[str, Any]) -> list[dict[str, np.ndarray]]:
+    """Return each of `_QUANTILES` by the name of what it is of; none if one is missing."""
+    quantiles = []
+    for quantile in _QUANTILES:
+        values = {name: getattr(norm_stats, quantile) for name, norm_stats in statistics.items()}
+        if any(value is None for value in values.values()):
+            return []
+        quantiles.append(values)
+    return quantiles
+
+
+def _read_statistics(folder: Path, asset: str | None) -> Any:
+    """Return openpi's statistics of "state" and "actions" for an asset of a checkpoint."""
     if asset is None:
         raise ConfigError(
             "config: has no asset_id, so that nothing says which statistics are its own; set one"
         )
+
+    assets = folder / "assets"
     try:
-        found = require("openpi.shared.normalize").load(folder / "assets" / asset)
+        statistics = require("openpi.shared.normalize").load(assets / asset)
     except FileNotFoundError as error:
-        have = sorted(
-            str(p.parent.relative_to(folder / "assets"))
-            for p in folder.glob("assets/**/norm_stats.json")
-        )
+        files = assets.glob("**/norm_stats.json")
+        available = sorted(str(file.parent.relative_to(assets)) for file in files)
         raise ConfigError(
-            f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {have}; without "
-            "statistics a policy's actions have no units: copy them there, or choose the config of "
-            "its training"
+            f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {available}; "
+            "without statistics a policy's actions have no units: copy them there, or choose the "
+            "config of its training"
         ) from error
-    if absent := sorted({"state", "actions"} - set(found)):
+    absent = sorted({"state", "actions"} - set(statistics))
+    if absent:
         raise ConfigError(
             f"checkpoint {folder}: assets/{asset}/norm_stats.json has no {absent}, has "
-            f"{sorted(found)}"
+            f"{sorted(statistics)}"
         )
-    return found
+    return statistics
 
 
 class OpenPiConfig(ModelConfig):
@@ -307,20 +385,19 @@ class OpenPiConfig(ModelConfig):
     )
     source_dir: str | None = Field(
         default=None,
-        description="a checkout of openpi; unset: the variable OPENPI_SRC, or what is installed",
+        description="a checkout of openpi; unset: the one that the variable OPENPI_SRC names, or "
+        "the installed one",
     )
     cameras: dict[str, str] | None = Field(
         default=None,
-        description="openpi's keys of the images -> our cameras, a dot going one level down: "
-        "images.cam_high; unset: "
-        "those of the config's robot",
+        description="openpi's keys of the images -> our cameras, where a dot leads one level down: "
+        "images.cam_high; unset: as usual for the config's robot",
     )
     state: dict[str, dict[str, int]] | None = Field(  # type: ignore[assignment]  # openpi has several vectors, by key
         default=None,
         description="openpi's keys of the state -> the parts of ours that make up each, and how "
-        "many numbers each has; "
-        "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: those of "
-        "the config's robot",
+        "many numbers each has; 'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus "
+        "that; unset: as usual for the config's robot",
     )
     layout: Layout | None = Field(
         default=None, description="layout of the images for the transforms: hwc or chw"
@@ -339,17 +416,17 @@ logger = logging.getLogger(__name__)
 
 _STEPS = 10  # openpi's own default
 _END = 1  # PaliGemma's end of sequence
-_LISTED = 5
+_LISTED = 5  # names in a message
 
 
 @dataclass(frozen=True, slots=True)
 class SampleBatch:
     """The inputs of a model for B chunks."""
 
-    inputs: dict[str, Any]  # of P observations
-    rows: Sequence[Row]  # with plans in the model's units
-    noise: np.ndarray  # one array for each row
-    owners: Sequence[int]  # the observation of each row, as of `ModelPolicy.observations_of`
+    inputs: dict[str, Any]  # stacked inputs of P observations
+    rows: Sequence[Row]  # B rows, with plans in the model's units
+    noise: np.ndarray  # (B, H, action_dim) float32
+    owners: Sequence[int]  # the observation of each row, from `ModelPolicy.observations_of`
     dim: int | None  # how many numbers of an action are the robot's
 
 
@@ -359,60 +436,75 @@ class OpenPiModel(abc.ABC):
     # (H, action_dim) of a row's noise; None for a model without noise.
     noise_shape: tuple[int, int] | None = None
     shares = False  # whether several rows can share one observation
-    # What a learner trains: the torch module, or the dicts of arrays that JAX checkpoints have.
+    # The weights that a learner trains: a torch module, or nested dicts of JAX arrays.
     trained: Any
 
     @abc.abstractmethod
     def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Compute actions (B, H, action_dim), or tokens (B, T), and the outputs requested of
-        rows, by their places.
+        """Compute the chunks of a batch.
+
+        Args:
+            batch: The inputs.
+
+        Returns:
+            Actions (B, H, action_dim) float32, or tokens (B, T) int32; and for the index of each
+            row that requests any, the values of its behaviour.
         """
 
 
 class JaxFlow(OpenPiModel):
     """π0 and π0.5 in JAX, as two programs, each compiled once per number of rows.
 
-    The first computes the keys and values of images and instruction, once for each observation.
-    From these the second follows the flow of each row, with the steps of openpi's `sample_actions`.
+    The first program computes the keys and values of images and instruction, once for each
+    observation. From these, the second integrates the flow of each row, in the steps of openpi's
+    `sample_actions`.
     """
 
     shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
-        jax, models = require("jax"), require("openpi.models.model")
-        jnp, attention_mask = jax.numpy, require("openpi.models.pi0").make_attn_mask
-        self.trained, merged = _split(network)
+        """Prepare the programs of openpi's model on a device."""
+        jax = require("jax")
+        models = require("openpi.models.model")
+        make_attention_mask = require("openpi.models.pi0").make_attn_mask
+        jnp = jax.numpy
+        self.trained, merge = _split(network)
         self._device = device
         steps, limit = config.steps or _STEPS, config.guidance
 
         def encode(params: Any, batch: Any) -> Any:
-            model = merged(params)
+            model = merge(params)
             observation = models.preprocess_observation(None, _observation(batch), train=False)
-            tokens, seen, causal = model.embed_prefix(observation)
-            mask, places = attention_mask(seen, causal), jnp.cumsum(seen, axis=1) - 1
-            _, (keys, values) = model.PaliGemma.llm([tokens, None], mask=mask, positions=places)
-            # Rows before layers.
-            return keys.swapaxes(0, 1), values.swapaxes(0, 1), seen, observation.state
+            tokens, present, causal = model.embed_prefix(observation)
+            mask = make_attention_mask(present, causal)
+            positions = jnp.cumsum(present, axis=1) - 1
+            _, (keys, values) = model.PaliGemma.llm([tokens, None], mask=mask, positions=positions)
+            # Rows come before layers, so that `gather` can select rows.
+            return keys.swapaxes(0, 1), values.swapaxes(0, 1), present, observation.state
 
         def follow(params: Any, encoded: Any, noise: Any, guide: Any) -> Any:
-            model, guide = merged(params), Guide(*guide)
-            keys, values, seen, proprio = encoded
+            model, guide = merge(params), Guide(*guide)
+            keys, values, prefix_present, proprio = encoded
+            prefix_lengths = prefix_present.sum(-1)[:, None]
             cache = keys.swapaxes(0, 1), values.swapaxes(0, 1)
             observation = models.Observation(images={}, image_masks={}, state=proprio)
 
-            def step(now: Any) -> Any:
-                actions, time = now
-                tokens, mask, causal, condition = model.embed_suffix(
-                    observation, actions, jnp.broadcast_to(time, len(noise))
+            def step(carry: Any) -> Any:
+                actions, time = carry
+                times = jnp.broadcast_to(time, len(noise))
+                tokens, present, causal, condition = model.embed_suffix(observation, actions, times)
+                prefix_mask = jnp.broadcast_to(
+                    prefix_present[:, None], (*tokens.shape[:2], prefix_present.shape[1])
                 )
-                before = jnp.broadcast_to(seen[:, None], (*tokens.shape[:2], seen.shape[1]))
+                suffix_mask = make_attention_mask(present, causal)
                 (_, hidden), _ = model.PaliGemma.llm(
                     [None, tokens],
-                    mask=jnp.concatenate([before, attention_mask(mask, causal)], axis=-1),
-                    positions=seen.sum(-1)[:, None] + jnp.cumsum(mask, axis=-1) - 1,
+                    mask=jnp.concatenate([prefix_mask, suffix_mask], axis=-1),
+                    positions=prefix_lengths + jnp.cumsum(present, axis=-1) - 1,
                     kv_cache=cache,
                     adarms_cond=[None, condition],
                 )
+
                 velocity = model.action_out_proj(hidden[:, -noise.shape[1] :])
                 velocity = guide.steer(
                     velocity,
@@ -425,54 +517,64 @@ class JaxFlow(OpenPiModel):
                 )
                 return actions - velocity / steps, time - 1 / steps
 
-            return jax.lax.while_loop(lambda now: now[1] >= 0.5 / steps, step, (noise, 1.0))[0]
+            def is_unfinished(carry: Any) -> Any:
+                _, time = carry
+                return time >= 0.5 / steps
+
+            actions, _ = jax.lax.while_loop(is_unfinished, step, (noise, 1.0))
+            return actions
 
         def gather(encoded: Any, owners: Any) -> Any:
-            return jax.tree.map(lambda one: one[owners], encoded)
+            return jax.tree.map(lambda array: array[owners], encoded)
 
-        # `gather` is apart from `follow`: one of each two sizes compiles in no time, `follow` in
-        # minutes
-        self._encode, self._gather, self._follow = jax.jit(encode), jax.jit(gather), jax.jit(follow)
+        self._encode = jax.jit(encode)
+        # A program for each pair of a number of observations and a number of rows: `gather`
+        # compiles in no time, while `follow` would take minutes for each.
+        self._gather = jax.jit(gather)
+        self._follow = jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
     def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Compute actions (B, H, action_dim) float32; a batch without plans runs the same
-        program without guidance.
+        """Compute actions (B, H, action_dim) float32. A batch without plans runs the same
+        program, without guidance.
         """
-        jax, guide = require("jax"), Guide.for_rows(batch.rows, *batch.noise.shape[1:])
+        guide = Guide.for_rows(batch.rows, *batch.noise.shape[1:])
         if guide is None:
-            none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
-            guide = Guide(np.zeros_like(batch.noise), none, none)
-        given = (
-            batch.inputs,
-            np.asarray(batch.owners),
-            batch.noise,
-            (guide.plan, guide.frozen, guide.weight),
-        )
-        inputs, owners, noise, plan = jax.device_put(given, self._device)
+            zeros = np.zeros((*batch.noise.shape[:2], 1), np.float32)
+            guide = Guide(np.zeros_like(batch.noise), zeros, zeros)
+        guide_arrays = (guide.plan, guide.frozen, guide.weight)
+        arrays = (batch.inputs, np.asarray(batch.owners), batch.noise, guide_arrays)
+        inputs, owners, noise, device_guide = require("jax").device_put(arrays, self._device)
+
         encoded = self._encode(self.trained, inputs)
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
-        # Waits for the device.
-        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32), {}
+        actions = self._follow(self.trained, encoded, noise, device_guide)
+        return np.asarray(actions, np.float32), {}  # waits for the device
 
 
 class JaxTokens(OpenPiModel):
     """π0-FAST in JAX, with greedy decoding and without noise."""
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
-        jax, self._device, most = require("jax"), device, config.max_decoding_steps
-        self.trained, merged = _split(network)
+        """Prepare the program of openpi's model on a device."""
+        jax = require("jax")
+        self.trained, merge = _split(network)
+        self._device = device
 
         def sample(params: Any, batch: Any) -> Any:
-            return merged(params).sample_actions(
-                jax.random.key(0), _observation(batch), max_decoding_steps=most
+            return merge(params).sample_actions(
+                jax.random.key(0),
+                _observation(batch),
+                max_decoding_steps=config.max_decoding_steps,
             )
 
         self._sample = jax.jit(sample)
 
     def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        tokens = self._sample(self.trained, require("jax").device_put(batch.inputs, self._device))
+        """Compute tokens (B, T) int32."""
+        inputs = require("jax").device_put(batch.inputs, self._device)
+        tokens = self._sample(self.trained, inputs)
         return self.ended(np.asarray(tokens, np.int32)), {}
 
     @staticmethod
@@ -492,14 +594,15 @@ class TorchFlow(OpenPiModel):
     def __init__(
         self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation
     ) -> None:
-        self.trained, self._device = network, device
+        """Prepare the passes of openpi's model, which is on the device."""
+        self.trained = network
+        self._device = device
+        self._config = config
         self._passes = Pi0Passes(network, compilation)
-        self._config, self.noise_shape = (
-            config,
-            (network.config.action_horizon, network.config.action_dim),
-        )
+        self.noise_shape = (network.config.action_horizon, network.config.action_dim)
 
     def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Compute actions (B, H, action_dim) float32, and requested values of behaviour."""
         observation = _observation(require("jax").tree.map(self._convert, batch.inputs))
         with require("torch").inference_mode():
             return self._passes.chunks(
@@ -519,29 +622,35 @@ class TorchFlow(OpenPiModel):
 
 
 def _split(network: Any) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-    """Return the parameters of a JAX model by openpi's names, and the function that makes the
-    model of them.
+    """Return the parameters of a JAX model as nested dicts with openpi's names, and a function
+    that makes the model from them.
     """
     jax, nnx = require("jax"), require("flax.nnx")
     graph, state = nnx.split(network)
-    # Of the same leaves as the dicts, as both are sorted by their keys.
+    # The state has its leaves in the same order as the dicts, since both sort their keys.
     structure = jax.tree.structure(state)
-    return state.to_pure_dict(), lambda params: nnx.merge(
-        graph, jax.tree.unflatten(structure, jax.tree.leaves(params))
-    )
+
+    def merge(params: Any) -> Any:
+        return nnx.merge(graph, jax.tree.unflatten(structure, jax.tree.leaves(params)))
+
+    return state.to_pure_dict(), merge
 
 
 def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
-    """Load a JAX model; raises `ConfigError` if a parameter of the model or of its fine-tuning
-    is missing.
+    """Load a JAX model.
+
+    Args:
+        config: openpi's training config.
+        folder: The folder of the checkpoint.
+        settings: The settings of the policy.
+
+    Raises:
+        ConfigError: A parameter of the model or of its fine-tuning is missing, or the settings
+            request random steps.
     """
     jax, models = require("jax"), require("openpi.models.model")
     device = jax_device({"cuda": "gpu"}.get(settings.device, settings.device))
-    dtype = (
-        ("float32" if device.platform == "cpu" else "bfloat16")
-        if settings.dtype == "auto"
-        else settings.dtype
-    )
+    dtype = _dtype(settings, on_cpu=device.platform == "cpu")
     params = models.restore_params(
         folder / "params",
         dtype=getattr(jax.numpy, dtype),
@@ -557,64 +666,86 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
         ) from error
     _require_used(params, network, folder, config.name)
     network.eval()
+
     if settings.noise_level:
         raise ConfigError(
             f"noise_level: got {settings.noise_level} for a JAX checkpoint, want 0, as its "
             "compiled loop has no random steps; convert it to PyTorch with openpi's script, or "
             "leave it out"
         )
-    kind = JaxTokens if config.model.model_type is models.ModelType.PI0_FAST else JaxFlow
-    return kind(network, device, settings)
+    is_fast = config.model.model_type is models.ModelType.PI0_FAST
+    model_class = JaxTokens if is_fast else JaxFlow
+    return model_class(network, device, settings)
 
 
 def load_torch(
     config: Any, folder: Path, settings: OpenPiConfig, compilation: Compilation
 ) -> OpenPiModel:
-    """Load a PyTorch model; raises `ConfigError` if transformers lacks openpi's patch, or a
-    parameter is missing.
+    """Load a PyTorch model.
+
+    Args:
+        config: openpi's training config.
+        folder: The folder of the checkpoint.
+        settings: The settings of the policy.
+        compilation: The compilation of the policy.
+
+    Raises:
+        ConfigError: transformers lacks openpi's patch, or a parameter is missing.
     """
     device = torch_device(settings.device)
     file = folder / "model.safetensors"
-    chosen = (
-        settings.dtype
-        if settings.dtype != "auto"
-        else ("float32" if device.type == "cpu" else "bfloat16")
-    )
-    model = dataclasses.replace(config.model, pytorch_compile_mode=None, dtype=chosen)
+    dtype = _dtype(settings, on_cpu=device.type == "cpu")
+    model = dataclasses.replace(config.model, pytorch_compile_mode=None, dtype=dtype)
     config = dataclasses.replace(config, model=model)
     try:
         network = config.model.load_pytorch(config, str(file))
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"checkpoint {file}: {str(error)[:600]}") from error
-    network.paligemma_with_expert.to_bfloat16_for_selected_params(chosen)
+    network.paligemma_with_expert.to_bfloat16_for_selected_params(dtype)
     require_loaded(network, SavedTensors.open(file))
-    return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings, compilation)
+    network = network.eval().requires_grad_(False).to(device)
+    return TorchFlow(network, device, settings, compilation)
+
+
+def _dtype(settings: OpenPiConfig, *, on_cpu: bool) -> str:
+    """Return the name of the type in which the model computes."""
+    if settings.dtype != "auto":
+        return settings.dtype
+    return "float32" if on_cpu else "bfloat16"
 
 
 def _observation(batch: dict[str, Any]) -> Any:
+    """Return openpi's `Observation` of a batch of inputs."""
     data = {**batch, "image": dict(batch["image"])}  # openpi writes into it
     return require("openpi.models.model").Observation.from_dict(data)
 
 
 def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
-    """Raise `ConfigError` if the model drops LoRA tensors; other unused tensors, as in base
-    checkpoints, are logged.
+    """Raise `ConfigError` if the model does not use LoRA tensors of a checkpoint; log other unused
+    tensors, which base checkpoints have.
+
+    Args:
+        params: The parameters of the checkpoint.
+        network: The model that was made from them.
+        folder: The folder of the checkpoint, for messages.
+        name: The name of the training config, for messages.
     """
     flatten = require("flax.traverse_util").flatten_dict
-    own = set(flatten(require("flax.nnx").state(network).to_pure_dict(), sep="/"))
-    extra = sorted(set(flatten(params, sep="/")) - own)
-    if any("lora" in key for key in extra):
+    model_params = require("flax.nnx").state(network).to_pure_dict()
+    model_names = set(flatten(model_params, sep="/"))
+    unused = sorted(set(flatten(params, sep="/")) - model_names)
+    if any("lora" in key for key in unused):
         raise ConfigError(
             f"checkpoint {folder}: was fine-tuned by LoRA, which config {name!r} does not have: "
-            f"{extra[:_LISTED]}; choose the config that it was trained with, such as "
+            f"{unused[:_LISTED]}; choose the config that it was trained with, such as "
             "pi0_libero_low_mem_finetune"
         )
-    if extra:
+    if unused:
         logger.warning(
             "checkpoint %s: %d tensors have no place in the model: %s",
             folder,
-            len(extra),
-            extra[:_LISTED],
+            len(unused),
+            unused[:_LISTED],
         )
 
 
@@ -628,15 +759,15 @@ class LoadedOpenPi:
     model: OpenPiModel
     transforms: Transforms
     robot: RobotConvention
-    horizon: int
+    horizon: int  # rows of a chunk
 
 
 @dataclass(frozen=True)
-class SeenObs:
+class OpenPiFrame:
     """An observation in openpi's form, without the prompt, and the model's inputs made from it."""
 
-    raw: dict[str, Any]
-    inputs: dict[str, Any]
+    observation: dict[str, Any]  # see `RobotConvention.read`
+    inputs: dict[str, Any]  # see `Transforms.read`
 
 
 class OpenPi(ModelPolicy):
@@ -649,114 +780,147 @@ class OpenPi(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
+        """The contract of the checkpoint and its robot; empty before they are loaded."""
         if self.model is None:
             return Contract()
+
         robot = self.model.robot
-        parts = {part: dim for vector in robot.state.values() for part, dim in vector.items()}
+        dims: dict[str, int] = {}
+        for vector_parts in robot.state.values():
+            dims.update(vector_parts)
+        state = {
+            name: StateSpec(dim) for name, dim in dims.items() if name not in (GRIPPER, CLOSED)
+        }
         return self.stated(
             robot.cameras,
-            list(parts),
+            list(dims),
             self.model.horizon,
-            state={
-                part: StateSpec(dim) for part, dim in parts.items() if part not in (GRIPPER, CLOSED)
-            },
-            instruction=self.model.transforms.prompt,
+            state=state,
+            instruction=self.model.transforms.needs_prompt,
             action=robot.action,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 
     @property
     def continues_plans(self) -> bool:
-        flows = self.model is not None and self.model.model.noise_shape is not None
-        return flows and self.config.actions == "chunk"
+        is_flow = self.model is not None and self.model.model.noise_shape is not None
+        return is_flow and self.config.actions == "chunk"
 
     def load(self) -> LoadedOpenPi:
+        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)
         config = train_config(self.config.config)
         folder = self._folder()
-        transforms = Transforms.of(config, folder)
+        transforms = Transforms.from_folder(config, folder)
         robot = choose_robot(config.name, transforms.robot, self.config)
-        # A transform of the user's own may want more of an observation.
-        found = attempt(transforms.ranges, robot)
-        if isinstance(found, Exception):
+
+        # A transform that the user wrote may need more than the tried observation has.
+        statistics = attempt(transforms.ranges, robot)
+        if isinstance(statistics, Exception):
             logger.warning(
-                "the statistics of the training are not stated: %s: %s", type(found).__name__, found
+                "the statistics of the training are not stated: %s: %s",
+                type(statistics).__name__,
+                statistics,
             )
-            found = None
-        self.statistics = found
-        if (folder / "model.safetensors").is_file():
-            model = load_torch(config, folder, self.config, self.compilation)
-        elif (folder / "params").is_dir():
-            if self.config.compile not in (False, "auto"):
-                raise ConfigError("compile: openpi's JAX models always are; leave it out")
-            self.config = self.config.with_sizes(self.report.batch_sizes)
-            model = load_jax(config, folder, self.config)
-        else:
-            raise ConfigError(
-                f"checkpoint {folder}: has {sorted(p.name for p in folder.iterdir())}, want "
-                "params/ or model.safetensors; name the folder of one step, not that of the run"
-            )
+            statistics = None
+        self.statistics = statistics
+
+        model = self._load_model(config, folder)
         return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 
-    def perceive(self, obs: Obs) -> SeenObs:
+    def _load_model(self, config: Any, folder: Path) -> OpenPiModel:
+        """Load the PyTorch model of a checkpoint, or else its JAX model."""
+        if (folder / "model.safetensors").is_file():
+            return load_torch(config, folder, self.config, self.compilation)
+        if not (folder / "params").is_dir():
+            raise ConfigError(
+                f"checkpoint {folder}: has {sorted(path.name for path in folder.iterdir())}, want "
+                "params/ or model.safetensors; name the folder of one step, not that of the run"
+            )
+        if self.config.compile not in (False, "auto"):
+            raise ConfigError("compile: openpi's JAX models always are; leave it out")
+        self.config = self.config.with_sizes(self.report.batch_sizes)
+        return load_jax(config, folder, self.config)
+
+    def perceive(self, obs: Obs) -> OpenPiFrame:
+        """Convert an observation to openpi's form and to the model's inputs."""
         loaded = self.loaded()
-        seen = loaded.robot.read(obs)
-        return SeenObs(seen, loaded.transforms.read(seen, self._begun().instruction))
+        observation = loaded.robot.read(obs)
+        inputs = loaded.transforms.read(observation, self._begun().instruction)
+        return OpenPiFrame(observation, inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows that openpi's transforms accept, in one call of the
         model.
         """
-        read = [attempt(self._planned, row) for row in rows]
-        if (spare := next((one for one in read if not isinstance(one, Exception)), None)) is None:
-            return read  # errors all
-        # A valid row replaces an invalid one, so that the number of rows stays one that is
-        # compiled.
-        spare = replace(spare[0], want=()), spare[1]
-        ready, noise = zip(
-            *(spare if isinstance(one, Exception) else one for one in read), strict=True
+        planned = [attempt(self._planned, row) for row in rows]
+        valid = [entry for entry in planned if not isinstance(entry, Exception)]
+        if not valid:
+            return planned  # errors only
+
+        # A valid row replaces each invalid one, so that the batch keeps a size that is compiled.
+        spare_row, spare_noise = valid[0]
+        spare_row = replace(spare_row, want=())
+        batch_rows: list[Row] = []
+        noise: list[np.ndarray] = []
+        for entry in planned:
+            is_invalid = isinstance(entry, Exception)
+            row, row_noise = (spare_row, spare_noise) if is_invalid else entry
+            batch_rows.append(row)
+            noise.append(row_noise)
+
+        loaded = self.loaded()
+        if loaded.model.shares:
+            firsts, owners = self.observations_of(batch_rows)
+        else:
+            firsts = owners = list(range(len(batch_rows)))
+        inputs = [row.frames[-1].inputs for row in batch_rows]
+        observations = [inputs[i] for i in firsts]
+        stacked = require("jax").tree.map(lambda *leaves: np.stack(leaves), *observations)
+        outputs, behaviours = loaded.model.sample(
+            SampleBatch(stacked, batch_rows, np.stack(noise), owners, loaded.robot.action.dim)
         )
-        loaded, each = self.loaded(), list(range(len(ready)))
-        firsts, owners = self.observations_of(ready) if loaded.model.shares else (each, each)
-        inputs = [row.frames[-1].inputs for row in ready]
-        batch = require("jax").tree.map(
-            lambda *leaves: np.stack(leaves), *(inputs[i] for i in firsts)
-        )
-        flows, stated = loaded.model.sample(
-            SampleBatch(batch, ready, np.stack(noise), owners, loaded.robot.action.dim)
-        )
-        return [
-            one
-            if isinstance(one, Exception)
-            else Prediction(
-                loaded.transforms.actions(own["state"], flow), behaviour=stated.get(i, {})
-            )
-            for i, (one, own, flow) in enumerate(zip(read, inputs, flows, strict=True))
-        ]
+
+        predictions: list[Prediction | Exception] = []
+        for i, entry in enumerate(planned):
+            if isinstance(entry, Exception):
+                predictions.append(entry)
+                continue
+            actions = loaded.transforms.actions(inputs[i]["state"], outputs[i])
+            predictions.append(Prediction(actions, behaviour=behaviours.get(i, {})))
+        return predictions
 
     def _planned(self, row: Row) -> tuple[Row, np.ndarray]:
         """Return the row with its leftover actions in the model's units, and its noise."""
         loaded = self.loaded()
         if row.leftover is not None:
-            plan = loaded.transforms.plan(row.frames[-1].raw, row.instruction, row.leftover)
+            observation = row.frames[-1].observation
+            plan = loaded.transforms.plan(observation, row.instruction, row.leftover)
             row = replace(row, leftover=plan)
         return row, row.noise(*loaded.model.noise_shape or ())
 
     def _folder(self) -> Path:
+        """Return the folder of the checkpoint, which openpi downloads if it has a URL."""
         name, step = self.config.checkpoint, self.config.checkpoint_step
         if _REMOTE not in name:
             return find_checkpoint(name, step, needs=["assets"])
-        return find_checkpoint(
-            str(require("openpi.shared.download").maybe_download(name.replace(STEP, str(step))))
-        )
+        url = name.replace(STEP, str(step))
+        return find_checkpoint(str(require("openpi.shared.download").maybe_download(url)))
 
 
 SOURCE = "OPENPI_SRC"  # the variable that names a checkout; "openpi" on PyPI is another project
-FOLDERS = ("src", "packages/openpi-client/src")
+FOLDERS = ("src", "packages/openpi-client/src")  # of a checkout, from which Python imports
 
 
 def train_config(name: str) -> Any:
-    """Return openpi's `TrainConfig` named `name`, or the one at "module:NAME"."""
+    """Return openpi's `TrainConfig`.
+
+    Args:
+        name: Its name in openpi, or "module:NAME".
+
+    Raises:
+        ConfigError: There is no such config.
+    """
     configs = require("openpi.training.config")
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -766,14 +930,15 @@ def train_config(name: str) -> Any:
             raise ConfigError(
                 f"config {name!r}: not one of openpi's {sorted(configs._CONFIGS_DICT)}"
             ) from error
+
     try:
-        found = getattr(importlib.import_module(module), attribute, None)
+        config = getattr(importlib.import_module(module), attribute, None)
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"config {name!r}: no module {error.name!r}; add its folder to PYTHONPATH"
         ) from error
-    if not isinstance(found, configs.TrainConfig):
+    if not isinstance(config, configs.TrainConfig):
         raise ConfigError(
-            f"config {name!r}: got {type(found).__name__}, want an openpi TrainConfig"
+            f"config {name!r}: got {type(config).__name__}, want an openpi TrainConfig"
         )
-    return found
+    return config
