@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray_arro.parts import box_of, connected, flat, grown, make_part, overlap, split
+from vlagents_ray_arro.parts import (
+    bounding_box,
+    connected_regions,
+    grown,
+    label_flat,
+    label_linked,
+    make_part,
+    overlap,
+)
 from vlagents_ray_arro.wrapper import Background, BackgroundConfig
 
 GREY, RED, BLUE = (200, 200, 200), (220, 40, 40), (40, 60, 220)
@@ -29,7 +37,7 @@ def test_pixels_are_connected_by_chains_of_links_alone() -> None:
     spiral = np.array(
         [[1, 1, 1, 1], [0, 0, 0, 1], [1, 1, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1], [0, 0, 0, 0]], bool
     )
-    labels = connected(spiral[:, :-1] & spiral[:, 1:], spiral[:-1] & spiral[1:])
+    labels = label_linked(spiral[:, :-1] & spiral[:, 1:], spiral[:-1] & spiral[1:])
     assert len(set(labels[spiral])) == 1
     # Nothing links what is not in the mask.
     assert len(set(labels[~spiral])) == np.count_nonzero(~spiral)
@@ -41,14 +49,14 @@ def test_a_mask_splits_into_its_regions_without_the_small_ones() -> None:
         | mask_at(slice(20, 40), slice(5, 9))
         | mask_at(slice(50, 51), slice(5, 6))
     )
-    assert [int(region.sum()) for region in split(mask, smallest=2)] == [100, 80]
+    assert [int(region.sum()) for region in connected_regions(mask, smallest=2)] == [100, 80]
 
 
 def test_a_gradient_is_one_flat_region_and_a_step_divides() -> None:
     image = np.repeat(np.arange(0, 160, 2, dtype=np.uint8)[None, :, None], 60, 0).repeat(3, 2)
-    assert len(np.unique(flat(image, tolerance=2))) == 1
+    assert len(np.unique(label_flat(image, tolerance=2))) == 1
     image[:, 40:] += 20
-    assert len(np.unique(flat(image, tolerance=2))) == 2
+    assert len(np.unique(label_flat(image, tolerance=2))) == 2
 
 
 def test_a_grown_mask_is_wider_by_so_many_pixels() -> None:
@@ -90,11 +98,11 @@ def test_the_gripper_is_what_lies_wholly_in_the_circle() -> None:
     image = canvas((RED, slice(0, 8), slice(36, 44)), (BLUE, slice(30, 40), slice(36, 44)))
     regions = make_part("segmenter", "flat").propose([image])
     [chosen] = make_part("selector", "circle").select([image], regions)
-    assert [box_of(regions[0][i]).tolist() for i in chosen] == [[36, 0, 44, 8]]
+    assert [bounding_box(regions[0][i]).tolist() for i in chosen] == [[36, 0, 44, 8]]
     [elsewhere] = make_part("selector", {"circle": {"point": [0.5, 0.6], "radius": 0.2}}).select(
         [image], regions
     )
-    assert [box_of(regions[0][i]).tolist() for i in elsewhere] == [[36, 30, 44, 40]]
+    assert [bounding_box(regions[0][i]).tolist() for i in elsewhere] == [[36, 30, 44, 40]]
 
 
 def test_a_segment_is_followed_past_others_of_its_colour() -> None:
@@ -105,7 +113,7 @@ def test_a_segment_is_followed_past_others_of_its_colour() -> None:
         image = canvas((RED, slice(10, 20), slice(x, x + 10)), (RED, slice(10, 20), slice(40, 50)))
         [(masks, seen)] = tracker.follow([image], [memory])
         assert seen.all()
-        assert box_of(masks[0]).tolist() == [x, 10, x + 10, 20]
+        assert bounding_box(masks[0]).tolist() == [x, 10, x + 10, 20]
 
 
 def test_a_segment_that_is_covered_is_lost_and_seen_again_where_it_was() -> None:

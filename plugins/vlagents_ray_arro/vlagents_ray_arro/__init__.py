@@ -4,7 +4,7 @@ background.
 On the first frame a detector finds the objects, a segmenter computes their masks, and a selector
 chooses the gripper among regions of the image. A tracker follows these segments from frame to
 frame, and the rest of the image is painted over. Detector, segmenter, selector and tracker are
-exchangeable: `vlagents_ray_arro.parts`.
+exchangeable; `vlagents_ray_arro.parts` has their interfaces.
 """
 
 from vlagents_ray_arro.wrapper import Arro, ArroConfig

@@ -1,9 +1,9 @@
-"""The parts of ARRO. Each part is a class that takes an instance of its `Config`, and loads its
-weights in `load`.
+"""The parts of ARRO: detectors, segmenters, selectors and trackers.
 
-All sessions of a replica share a part, which keeps none of their state; a tracker's memory of one
-session and camera is a separate object, which can be pickled. Each part gets the images of several
-sessions at once, and its result for one must not depend on the others.
+Each part is a class that takes an instance of its `Config`, and loads its weights in `load`. All
+sessions of a replica share a part, which keeps none of their state: a tracker's memory of one
+session and camera is a separate object, which can be pickled. A part processes the images of
+several sessions at once, and its result for one image must not depend on the others.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Detection:
     phrase: str  # the requested phrase that it was detected for
     box: np.ndarray  # (4,) float32, px: left, top, right, bottom
     score: float
-    # (H, W) bool, from a detector that provides masks; else the box is segmented.
+    # (H, W) bool; None from a detector without masks, whose boxes are segmented.
     mask: np.ndarray | None = None
 
 
@@ -65,7 +65,15 @@ class Detector(Part, Protocol):
     """Detects objects by phrases."""
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Return the objects of `phrases[i]` on `images[i]`, the best first."""
+        """Detect objects on each image.
+
+        Args:
+            images: The images.
+            phrases: The phrases of the objects to detect on each image.
+
+        Returns:
+            The objects on each image, the best first.
+        """
         ...
 
 
@@ -73,13 +81,20 @@ class Segmenter(Part, Protocol):
     """Computes masks of objects."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px; all
-        False for none.
+        """Compute the mask of the object in each box.
+
+        Args:
+            images: The images.
+            boxes: The boxes on each image, (N, 4) px: left, top, right, bottom.
+
+        Returns:
+            The masks on each image, (N, H, W) bool. The mask of a box without an object is all
+            False.
         """
         ...
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """Return all regions that may be objects: (M, H, W) bool, which may overlap."""
+        """Return regions of each image that may be objects, (M, H, W) bool; some may overlap."""
         ...
 
 
@@ -87,8 +102,14 @@ class Selector(Part, Protocol):
     """Selects the gripper's fingers."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Return the indices of the regions (M, H, W) of each image that make up the gripper;
-        none if it is hidden.
+        """Select the regions that make up the gripper.
+
+        Args:
+            images: The images.
+            regions: The regions of each image, (M, H, W) bool.
+
+        Returns:
+            The indices of the selected regions of each image; none if the gripper is hidden.
         """
         ...
 
@@ -97,30 +118,52 @@ class Tracker(Part, Protocol):
     """Tracks segments from frame to frame."""
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """Return a memory of each image's segments, (N, H, W) bool with N >= 1, from which to
-        track them.
+        """Begin to track the segments of each image.
+
+        Args:
+            images: The images.
+            masks: The segments of each image, (N, H, W) bool with N >= 1.
+
+        Returns:
+            A memory for each image, from which `follow` tracks its segments.
         """
         ...
 
     def follow(
         self, images: Images, memories: Sequence[Any]
     ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return, for each next image, its segments (N, H, W) bool, and which of them are visible,
-        (N,) bool.
+        """Track segments to the next frame.
 
-        Updates the memories. The mask of a segment that is not visible is undefined.
+        Args:
+            images: The next image of each memory.
+            memories: The memories of `begin`, which are updated.
+
+        Returns:
+            For each image its segments, (N, H, W) bool, and which of them are visible, (N,) bool.
+            The mask of a segment that is not visible is undefined.
         """
         ...
 
 
 def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
-    """Create the part of a kind from a registered name or "module:Class", or {name: settings};
-    raises `ConfigError`.
+    """Create a part, without its weights.
+
+    Args:
+        kind: "detector", "segmenter", "selector" or "tracker".
+        entry: A registered name or "module:Class", or {name: settings}.
+
+    Returns:
+        The part.
+
+    Raises:
+        ConfigError: The name is unknown, or a setting is wrong.
     """
-    named = {entry: {}} if isinstance(entry, str) else dict(entry)
-    if len(named) != 1:
-        raise ConfigError(f"{kind}: got {sorted(named)}, want one name with its settings")
-    [(name, settings)] = named.items()
+    settings_by_name = {entry: {}} if isinstance(entry, str) else dict(entry)
+    if len(settings_by_name) != 1:
+        raise ConfigError(
+            f"{kind}: got {sorted(settings_by_name)}, want one name with its settings"
+        )
+    [(name, settings)] = settings_by_name.items()
     registered = PARTS[kind]
     target = registered.get(name, name)
     if ":" not in target:
@@ -162,13 +205,14 @@ class Pretrained:
         """Read the weights; raises `ConfigError` if some are missing."""
         ensure_torchvision()
         transformers, config = require("transformers"), self._config
-        model, processor = (getattr(transformers, name) for name in self.classes)
+        model_class, processor_class = (getattr(transformers, name) for name in self.classes)
         path = find_checkpoint(
             config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json")
         )
         device = torch_device(config.device)
-        loaded = from_pretrained(model, path, dtype=torch_dtype(config.dtype, device))
-        self._model, self._processor = loaded.to(device).eval(), processor.from_pretrained(path)
+        model = from_pretrained(model_class, path, dtype=torch_dtype(config.dtype, device))
+        self._model = model.to(device).eval()
+        self._processor = processor_class.from_pretrained(path)
 
 
 class Untrained:
@@ -182,73 +226,97 @@ class Untrained:
 
 
 def writable(images: Images) -> list[np.ndarray]:
-    """Return copies of the images: a server's are read-only, which torch warns about."""
+    """Return copies of the images: those of a server are read-only, which torch warns about."""
     return [image.copy() for image in images]
 
 
-def connected(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Label each pixel, (H, W) int; two pixels share a label if a chain of linked neighbours
-    connects them.
+def label_linked(right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Label pixels so that two share a label if a chain of linked neighbours connects them.
 
     Args:
         right: (H, W - 1) bool, whether a pixel is linked to the next one in its row.
         down: (H - 1, W) bool, whether a pixel is linked to the one below it.
+
+    Returns:
+        The labels, (H, W) int.
     """
     height, width = right.shape[0], down.shape[1]
     index = np.arange(height * width).reshape(height, width)
-    one = np.concatenate([index[:, :-1][right], index[:-1][down]])
-    other = np.concatenate([index[:, 1:][right], index[1:][down]])
+    # The two pixels of each link.
+    first = np.concatenate([index[:, :-1][right], index[:-1][down]])
+    second = np.concatenate([index[:, 1:][right], index[1:][down]])
+
+    # Each label is the index of a pixel with the same label or a smaller one, so that the labels
+    # form trees. Each round joins the trees of linked pixels, and then flattens all trees.
     labels = index.ravel()
     while True:
-        a, b = labels[one], labels[other]
-        apart = a != b
-        if not apart.any():
+        first_labels, second_labels = labels[first], labels[second]
+        differ = first_labels != second_labels
+        if not differ.any():
             return labels.reshape(height, width)
-        np.minimum.at(labels, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
-        while not np.array_equal(labels, jumped := labels[labels]):
-            labels = jumped
+
+        larger = np.maximum(first_labels, second_labels)[differ]
+        smaller = np.minimum(first_labels, second_labels)[differ]
+        np.minimum.at(labels, larger, smaller)
+        flattened = labels[labels]
+        while not np.array_equal(labels, flattened):
+            labels, flattened = flattened, flattened[flattened]
 
 
-def split(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
-    """Return the connected regions of `mask`, (H, W) bool each, of at least `smallest` pixels;
-    the largest first.
+def connected_regions(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
+    """Divide a mask into its connected regions.
+
+    Args:
+        mask: (H, W) bool.
+        smallest: The least number of pixels of a region.
+
+    Returns:
+        The regions, (H, W) bool each, the largest first.
     """
-    labels = connected(mask[:, :-1] & mask[:, 1:], mask[:-1] & mask[1:])
-    return [labels == label for label in largest(labels[mask], smallest)]
+    labels = label_linked(mask[:, :-1] & mask[:, 1:], mask[:-1] & mask[1:])
+    return [labels == label for label in frequent_labels(labels[mask], smallest)]
 
 
-def flat(image: np.ndarray, tolerance: int) -> np.ndarray:
-    """Label each pixel, (H, W) int; neighbours that differ by at most `tolerance` in all
-    channels share a label.
+def label_flat(image: np.ndarray, tolerance: int) -> np.ndarray:
+    """Label pixels so that similar neighbours share a label.
+
+    Args:
+        image: (H, W, 3) uint8.
+        tolerance: The largest difference of similar neighbours in any channel.
+
+    Returns:
+        The labels, (H, W) int.
     """
     signed = image.astype(np.int16)
-    return connected(*(np.abs(np.diff(signed, axis=axis)).max(-1) <= tolerance for axis in (1, 0)))
+    right = np.abs(np.diff(signed, axis=1)).max(-1) <= tolerance
+    down = np.abs(np.diff(signed, axis=0)).max(-1) <= tolerance
+    return label_linked(right, down)
 
 
-def largest(labels: np.ndarray, smallest: int) -> np.ndarray:
+def frequent_labels(labels: np.ndarray, smallest: int) -> np.ndarray:
     """Return the labels of at least `smallest` pixels, the most frequent first."""
     values, counts = np.unique(labels, return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    kept: np.ndarray = values[order[counts[order] >= smallest]]
-    return kept
+    frequent: np.ndarray = values[order[counts[order] >= smallest]]
+    return frequent
 
 
-def box_of(mask: np.ndarray) -> np.ndarray:
-    """Return the smallest box around the true pixels: (4,) float32, px: left, top, right,
-    bottom.
+def bounding_box(mask: np.ndarray) -> np.ndarray:
+    """Return the smallest box around the true pixels of a mask (H, W): (4,) float32, px: left,
+    top, right, bottom.
     """
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
 
 
-def overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the intersection over union of two masks; 0 if both are empty."""
-    union = np.count_nonzero(one | other)
-    return np.count_nonzero(one & other) / union if union else 0.0
+def overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the intersection over union of two masks (H, W) bool; 0 if both are empty."""
+    union = np.count_nonzero(first | second)
+    return np.count_nonzero(first & second) / union if union else 0.0
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """Widen the mask by `pixels` to each side."""
+    """Return a mask (H, W) bool that is wider by `pixels` to each side."""
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]
         padding[axis] = (pixels, pixels)
@@ -274,55 +342,71 @@ class ColourConfig(BaseModel, extra="forbid"):
     """The hue of each word, and which pixels count as coloured."""
 
     hues: dict[str, float] = Field(default=_HUES, description="word -> hue in degrees")
-    tolerance: float = Field(default=20.0, gt=0, le=180, description="degrees on both sides")
-    saturation: float = Field(default=0.15, ge=0, le=1, description="the least, in HSV")
-    value: float = Field(default=0.2, ge=0, le=1, description="the least, in HSV")
+    tolerance: float = Field(
+        default=20.0, gt=0, le=180, description="largest difference from a hue, in degrees"
+    )
+    saturation: float = Field(
+        default=0.15, ge=0, le=1, description="least saturation of a coloured pixel, in HSV"
+    )
+    value: float = Field(
+        default=0.2, ge=0, le=1, description="least value of a coloured pixel, in HSV"
+    )
     smallest: float = Field(
-        default=5e-4, ge=0, le=1, description="of a region, as a share of the image"
+        default=5e-4, ge=0, le=1, description="size of the smallest region, as a share of the image"
     )
 
 
 class ColourDetector(Untrained):
-    """Detects each connected region of the colours in a phrase: all that is red for "lift the
-    red puck".
+    """Detects each connected region of the colours in a phrase: all red regions for "lift the red
+    puck".
     """
 
     Config: ClassVar[type] = ColourConfig
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
+        """Return the coloured regions of each image with their masks, the largest first."""
         return [
-            self._detections(image, asked) for image, asked in zip(images, phrases, strict=True)
+            self._detections(image, image_phrases)
+            for image, image_phrases in zip(images, phrases, strict=True)
         ]
 
     def _detections(self, image: np.ndarray, phrases: Sequence[str]) -> list[Detection]:
-        hue, saturation, value = np.moveaxis(
-            np.asarray(Image.fromarray(image).convert("HSV"), np.float32), -1, 0
-        )
-        coloured = (saturation >= self._config.saturation * 255) & (
-            value >= self._config.value * 255
-        )
-        smallest = max(1, round(self._config.smallest * hue.size))
-        found = []
+        config = self._config
+        hsv = np.asarray(Image.fromarray(image).convert("HSV"), np.float32)  # 0 to 255
+        hue, saturation, value = np.moveaxis(hsv, -1, 0)
+        is_coloured = (saturation >= config.saturation * 255) & (value >= config.value * 255)
+        smallest = max(1, round(config.smallest * hue.size))
+
+        detections = []
         for phrase in phrases:
-            for word in sorted(set(re.findall(r"\w+", phrase.lower())) & set(self._config.hues)):
-                off = np.abs((hue * (360 / 256) - self._config.hues[word] + 180) % 360 - 180)
-                for mask in split(coloured & (off <= self._config.tolerance), smallest):
-                    found.append(
-                        Detection(phrase, box_of(mask), np.count_nonzero(mask) / mask.size, mask)
-                    )
-        return sorted(found, key=lambda one: -one.score)
+            words = set(re.findall(r"\w+", phrase.lower()))
+            for word in sorted(words & set(config.hues)):
+                difference = np.abs((hue * (360 / 256) - config.hues[word] + 180) % 360 - 180)
+                has_colour = is_coloured & (difference <= config.tolerance)
+                for mask in connected_regions(has_colour, smallest):
+                    share = np.count_nonzero(mask) / mask.size
+                    detections.append(Detection(phrase, bounding_box(mask), share, mask))
+        return sorted(detections, key=lambda detection: -detection.score)
 
 
 class FlatConfig(BaseModel, extra="forbid"):
     """The criteria of a region."""
 
     tolerance: int = Field(
-        default=8, ge=0, le=255, description="of neighbouring pixels, in every channel"
+        default=8,
+        ge=0,
+        le=255,
+        description="largest difference of neighbouring pixels, in every channel",
     )
     smallest: float = Field(
-        default=2e-4, ge=0, le=1, description="of a proposed region, as a share of the image"
+        default=2e-4,
+        ge=0,
+        le=1,
+        description="size of the smallest proposed region, as a share of the image",
     )
-    most: int = Field(default=256, ge=1, description="regions that are proposed, the largest first")
+    most: int = Field(
+        default=256, ge=1, description="largest number of proposed regions, the largest ones first"
+    )
 
 
 class FlatSegmenter(Untrained):
@@ -331,25 +415,31 @@ class FlatSegmenter(Untrained):
     Config: ClassVar[type] = FlatConfig
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return [self._inside(image, around) for image, around in zip(images, boxes, strict=True)]
+        """Return the regions that lie wholly in each box, as one mask for the box."""
+        return [
+            self._inside(image, image_boxes)
+            for image, image_boxes in zip(images, boxes, strict=True)
+        ]
 
     def propose(self, images: Images) -> list[np.ndarray]:
+        """Return the regions of each image, the largest first."""
         return [self._regions(image) for image in images]
 
     def _inside(self, image: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        labels = flat(image, self._config.tolerance)
+        labels = label_flat(image, self._config.tolerance)
         masks = np.zeros((len(boxes), *labels.shape), bool)
         for i, (left, top, right, bottom) in enumerate(np.rint(boxes).astype(int).clip(0)):
-            masks[i, top:bottom, left:right] = True
-            masks[i] &= ~np.isin(labels, labels[~masks[i]])
+            in_box = np.zeros(labels.shape, bool)
+            in_box[top:bottom, left:right] = True
+            extends_beyond = np.isin(labels, labels[~in_box])
+            masks[i] = in_box & ~extends_beyond
         return masks
 
     def _regions(self, image: np.ndarray) -> np.ndarray:
-        labels = flat(image, self._config.tolerance)
-        chosen = largest(labels, max(1, round(self._config.smallest * labels.size)))[
-            : self._config.most
-        ]
-        return np.asarray(labels == chosen[:, None, None])
+        labels = label_flat(image, self._config.tolerance)
+        smallest = max(1, round(self._config.smallest * labels.size))
+        proposed = frequent_labels(labels, smallest)[: self._config.most]
+        return np.asarray(labels == proposed[:, None, None])
 
 
 class CircleConfig(BaseModel, extra="forbid"):
@@ -357,30 +447,40 @@ class CircleConfig(BaseModel, extra="forbid"):
 
     point: tuple[float, float] = Field(
         default=(0.5, 0.0),
-        description="the circle's centre: x in widths of the image, y in its heights, from top "
-        "left",
+        description="the circle's centre: x in widths of the image, y in its heights, from the top "
+        "left corner",
     )
-    radius: float = Field(default=0.25, gt=0, description="in shorter sides of the image")
+    radius: float = Field(
+        default=0.25, gt=0, description="the circle's radius, in shorter sides of the image"
+    )
 
 
 class CircleSelector(Untrained):
     """Selects regions that lie wholly in a circle: for a fixed camera, and a robot that begins
-    at home.
+    each episode in its home position.
     """
 
     Config: ClassVar[type] = CircleConfig
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        chosen = []
+        """Return the indices of the regions of each image that lie wholly in the circle."""
+        selected = []
         for image, masks in zip(images, regions, strict=True):
-            height, width = image.shape[:2]
-            x, y = self._config.point[0] * width, self._config.point[1] * height
-            v, u = np.mgrid[:height, :width] + 0.5
-            outside = np.hypot(u - x, v - y) > self._config.radius * min(height, width)
-            chosen.append(
-                [i for i, mask in enumerate(masks) if mask.any() and not (mask & outside).any()]
-            )
-        return chosen
+            outside = self._outside(*image.shape[:2])
+            indices = []
+            for i, mask in enumerate(masks):
+                if mask.any() and not (mask & outside).any():
+                    indices.append(i)
+            selected.append(indices)
+        return selected
+
+    def _outside(self, height: int, width: int) -> np.ndarray:
+        """Return which pixels lie outside of the circle, (height, width) bool."""
+        centre_x = self._config.point[0] * width
+        centre_y = self._config.point[1] * height
+        y, x = np.mgrid[:height, :width] + 0.5
+        distance = np.hypot(x - centre_x, y - centre_y)
+        return np.asarray(distance > self._config.radius * min(height, width))
 
 
 _SHADES = 16  # levels of each channel
@@ -390,16 +490,21 @@ class IouConfig(BaseModel, extra="forbid"):
     """The distance that a segment may move, and the share of it that must remain visible."""
 
     reach: float = Field(
-        default=0.1, ge=0, le=1, description="to each side a frame, in shorter sides of the image"
+        default=0.1,
+        ge=0,
+        le=1,
+        description="largest motion in a frame to each side, in shorter sides of the image",
     )
     least: float = Field(
         default=0.2,
         gt=0,
         le=1,
-        description="a region with a smaller share of its first pixels: lost",
+        description="a region with a smaller share of the segment's first pixels is ignored",
     )
     most: float = Field(
-        default=3.0, ge=1, description="a region with a larger multiple of them: something else"
+        default=3.0,
+        ge=1,
+        description="a region with a larger multiple of the segment's first pixels is ignored",
     )
 
 
@@ -419,54 +524,59 @@ class IouTracker(Untrained):
     Config: ClassVar[type] = IouConfig
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        return [
-            [
-                _Segment(_own_colours(shades, mask), int(np.count_nonzero(mask)), mask.copy())
-                for mask in own
-            ]
-            for shades, own in zip(map(_shades, images), masks, strict=True)
-        ]
+        """Return the segments of each image with their colours."""
+        memories = []
+        for image, image_masks in zip(images, masks, strict=True):
+            shades = _shades(image)
+            segments = []
+            for mask in image_masks:
+                pixels = int(np.count_nonzero(mask))
+                segments.append(_Segment(_typical_colours(shades, mask), pixels, mask.copy()))
+            memories.append(segments)
+        return memories
 
     def follow(
         self, images: Images, memories: Sequence[Any]
     ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the segments of each image, and which of them are visible."""
         followed = []
         for image, segments in zip(images, memories, strict=True):
             shades = _shades(image)
-            seen = np.array([self._moved(shades, segment) for segment in segments])
-            followed.append((np.stack([segment.mask for segment in segments]), seen))
+            visible = np.array([self._move(segment, shades) for segment in segments])
+            masks = np.stack([segment.mask for segment in segments])
+            followed.append((masks, visible))
         return followed
 
-    def _moved(self, shades: np.ndarray, segment: _Segment) -> bool:
-        """Move the segment to its current position; return False if it is not visible."""
+    def _move(self, segment: _Segment, shades: np.ndarray) -> bool:
+        """Move a segment to its position on a frame; return False if it is not visible."""
         reach = round(self._config.reach * min(shades.shape))
-        left, top, right, bottom = box_of(segment.mask).astype(int)
+        left, top, right, bottom = bounding_box(segment.mask).astype(int)
         window = (
             slice(max(top - reach, 0), bottom + reach),
             slice(max(left - reach, 0), right + reach),
         )
         last = segment.mask[window]
-        alike = split(
-            segment.colours[shades[window]], max(1, round(self._config.least * segment.pixels))
-        )
-        regions = [
-            region
-            for region in alike
-            if np.count_nonzero(region) <= self._config.most * segment.pixels
-        ]
+
+        smallest = max(1, round(self._config.least * segment.pixels))
+        largest = self._config.most * segment.pixels
+        regions = []
+        for region in connected_regions(segment.colours[shades[window]], smallest):
+            if np.count_nonzero(region) <= largest:
+                regions.append(region)
         if not regions:
             return False
-        mask = np.zeros_like(segment.mask)
-        # the nearest region where none overlaps: a small object moves by more than its own size
-        mask[window] = max(
-            regions, key=lambda region: (overlap(region, last), -_distance(region, last))
-        )
-        segment.mask = mask
+
+        # If no region overlaps, the nearest one is chosen: a small object may move by more than
+        # its own size.
+        best = max(regions, key=lambda region: (overlap(region, last), -_distance(region, last)))
+        segment.mask = np.zeros_like(segment.mask)
+        segment.mask[window] = best
         return True
 
 
-def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.hypot(*(np.argwhere(one).mean(0) - np.argwhere(other).mean(0))))
+def _distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the distance between the centres of two masks (H, W) bool, px."""
+    return float(np.hypot(*(np.argwhere(first).mean(0) - np.argwhere(second).mean(0))))
 
 
 def _shades(image: np.ndarray) -> np.ndarray:
@@ -475,6 +585,8 @@ def _shades(image: np.ndarray) -> np.ndarray:
     return np.asarray((red * _SHADES + green) * _SHADES + blue)
 
 
-def _own_colours(shades: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    inside, outside = (np.bincount(shades[where], minlength=_SHADES**3) for where in (mask, ~mask))
+def _typical_colours(shades: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return which colours have a greater share inside of a mask than outside, (4096,) bool."""
+    inside = np.bincount(shades[mask], minlength=_SHADES**3)
+    outside = np.bincount(shades[~mask], minlength=_SHADES**3)
     return np.asarray(inside * outside.sum() > outside * inside.sum())

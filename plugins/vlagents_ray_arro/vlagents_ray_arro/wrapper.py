@@ -5,7 +5,7 @@ segments.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -43,14 +43,17 @@ Colour = tuple[Channel, Channel, Channel]  # RGB, 0 to 255
 
 
 class BackgroundConfig(BaseModel, extra="forbid"):
-    """A colour, optionally with a grid on it, or an image, as in the policy's training."""
+    """A colour, optionally with a grid on it, or an image; as in the policy's training."""
 
     colour: Colour = (0, 0, 0)
     grid: Colour | None = Field(
         default=None, description="colour of the grid's lines, one pixel wide; unset: no grid"
     )
     spacing: float = Field(
-        default=0.1, gt=0, le=1, description="of the grid's lines, in shorter sides of the image"
+        default=0.1,
+        gt=0,
+        le=1,
+        description="distance of the grid's lines, in shorter sides of the image",
     )
     image: Path | None = Field(
         default=None, description="a file that is stretched to each camera's size"
@@ -80,8 +83,14 @@ class Background:
         self._draw(1, 1)
 
     def behind(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return a new (H, W, 3) uint8 image: `image` where `mask`, (H, W) bool, is True, else
-        the background.
+        """Paint the background over everything outside of a mask.
+
+        Args:
+            image: (H, W, 3) uint8.
+            mask: (H, W) bool.
+
+        Returns:
+            A new image, (H, W, 3) uint8.
         """
         height, width = mask.shape
         if (height, width) not in self._drawn:
@@ -91,34 +100,35 @@ class Background:
     def _draw(self, height: int, width: int) -> np.ndarray:
         config = self._config
         if config.image is not None:
-            return _read(config.image, height, width)
-        drawn = np.full((height, width, 3), config.colour, np.uint8)
+            return _read_image(config.image, height, width)
+
+        background = np.full((height, width, 3), config.colour, np.uint8)
         if config.grid is not None:
-            step = max(2, round(config.spacing * min(height, width)))
-            drawn[step // 2 :: step] = config.grid
-            drawn[:, step // 2 :: step] = config.grid
-        return drawn
+            spacing = max(2, round(config.spacing * min(height, width)))  # px
+            background[spacing // 2 :: spacing] = config.grid
+            background[:, spacing // 2 :: spacing] = config.grid
+        return background
 
 
-def _read(path: Path, height: int, width: int) -> np.ndarray:
+def _read_image(path: Path, height: int, width: int) -> np.ndarray:
+    """Return an image file stretched to (height, width, 3) uint8."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path.expanduser()) as image:
-            return np.asarray(
-                image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)
-            )
+            rgb = image.convert("RGB")
+            return np.asarray(rgb.resize((width, height), Image.Resampling.BILINEAR))
     except (OSError, UnidentifiedImageError) as error:
         raise ConfigError(
             f"background.image {str(path)!r}: cannot be read as an image ({error}); check the path"
         ) from error
 
 
-Part = str | dict[str, dict[str, Any]]
+Part = str | dict[str, dict[str, Any]]  # a name, or {name: settings}
 
 
 class ArroConfig(BaseModel, extra="forbid"):
-    """The cameras, the parts that find objects, and the treatment of missing ones."""
+    """The cameras, the parts that find objects, and the treatment of missing objects."""
 
     cameras: list[str] | None = Field(
         default=None,
@@ -127,7 +137,7 @@ class ArroConfig(BaseModel, extra="forbid"):
     objects: list[str] | None = Field(
         default=None,
         min_length=1,
-        description="phrases of the things to show; unset: those in the instruction",
+        description="phrases of the objects to show; unset: those in the instruction",
     )
     detector: Part = Field(
         default="grounding_dino",
@@ -138,7 +148,8 @@ class ArroConfig(BaseModel, extra="forbid"):
     )
     selector: Part | None = Field(
         default="circle",
-        description="of the gripper: 'circle' or 'module:Class', or {name: settings}; null: none",
+        description="selects the gripper: 'circle' or 'module:Class', or {name: settings}; null: "
+        "the gripper is not shown",
     )
     tracker: Part = Field(
         default="sam2", description="'sam2', 'iou' or 'module:Class', or {name: settings}"
@@ -149,69 +160,103 @@ class ArroConfig(BaseModel, extra="forbid"):
     )
     missing: Literal["refuse", "hide"] = Field(
         default="refuse",
-        description="if the first frame lacks something: refuse the episode, or begin it without, "
-        "and look again "
-        "as for what is lost",
+        description="if an object is missing on the first frame: refuse the episode, or begin it "
+        "without the object and search it again as if it were lost",
     )
     keep_lost: int = Field(
         default=5,
         ge=0,
-        description="frames for which a segment that is lost is shown where it was; then, and "
-        "every so many frames, "
-        "it is looked for as on the first frame",
+        description="frames for which a lost segment is shown at its last position; after these, "
+        "and each time that as many have passed, it is searched as on the first frame",
     )
 
 
 GRIPPER = "(gripper)"  # the label of the selector's regions; never a phrase for the detector
 Segment = tuple[str, np.ndarray]  # label and mask, (H, W) bool
-_SAME = 0.5  # intersection over union above which a detected object is one that is already tracked
+# Intersection over union from which a detected object is one that is already tracked.
+_SAME = 0.5
 
 
 @dataclass(slots=True)
 class Track:
     """The segments of one session on one camera."""
 
-    wanted: tuple[str, ...]  # the phrases, and GRIPPER
+    required: tuple[str, ...]  # the phrases, and GRIPPER if there is a selector
     labels: list[str] = field(default_factory=list)  # the label of each segment
-    # (H, W) bool each, at its last visible position.
+    # The mask of each segment at its last visible position, (H, W) bool.
     masks: list[np.ndarray] = field(default_factory=list)
-    lost: list[int] = field(default_factory=list)  # frames since then, for each segment
+    lost_frames: list[int] = field(default_factory=list)  # for each segment; 0: it is visible
     memory: Any = None  # the tracker's memory
-    incomplete: int = 0  # number of frames for which a segment has been missing
+    incomplete_frames: int = 0  # consecutive frames on which a segment has been missing
     searched: bool = True  # whether this frame was searched
 
     @property
+    def visible(self) -> list[Segment]:
+        """The visible segments."""
+        segments = []
+        for label, mask, lost in zip(self.labels, self.masks, self.lost_frames, strict=True):
+            if not lost:
+                segments.append((label, mask))
+        return segments
+
+    @property
     def seen(self) -> list[str]:
-        return [label for label, lost in zip(self.labels, self.lost, strict=True) if not lost]
+        """The labels of the visible segments."""
+        return [label for label, _ in self.visible]
 
     @property
     def missing(self) -> list[str]:
-        """Labels of segments that are lost or were never found."""
-        lost = [label for label, frames in zip(self.labels, self.lost, strict=True) if frames]
-        return list(dict.fromkeys([*lost, *(one for one in self.wanted if one not in self.labels)]))
+        """The labels of segments that are lost or were never found."""
+        missing = []
+        for label, lost in zip(self.labels, self.lost_frames, strict=True):
+            if lost:
+                missing.append(label)
+        missing += [label for label in self.required if label not in self.labels]
+        return list(dict.fromkeys(missing))
 
     def shown(self, shape: tuple[int, int], keep_lost: int, grow: int) -> np.ndarray:
-        """Return the union of the segments, (H, W) bool; one lost for at most `keep_lost` frames
-        is where it was.
-        """
-        together = np.zeros(shape, bool)
-        for mask, lost in zip(self.masks, self.lost, strict=True):
-            if lost <= keep_lost:
-                together |= mask
-        return grown(together, grow)
+        """Return the union of the segments.
 
-    def move(self, masks: Iterable[np.ndarray], seen: np.ndarray) -> None:
-        self.masks = [
-            new if is_seen else old
-            for new, old, is_seen in zip(masks, self.masks, seen, strict=True)
-        ]
-        self.lost = [
-            0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)
-        ]
+        Args:
+            shape: The height and the width of the image.
+            keep_lost: For how many frames a lost segment remains at its last position.
+            grow: By how many pixels the union is widened on each side.
+
+        Returns:
+            The union, (H, W) bool.
+        """
+        union = np.zeros(shape, bool)
+        for mask, lost in zip(self.masks, self.lost_frames, strict=True):
+            if lost <= keep_lost:
+                union |= mask
+        return grown(union, grow)
+
+    def move(self, masks: Iterable[np.ndarray], visible: np.ndarray) -> None:
+        """Move the segments to their positions on the next frame.
+
+        Args:
+            masks: The mask of each segment, (H, W) bool.
+            visible: Which segments are visible, (N,) bool; the others keep their masks.
+        """
+        new_masks, lost_frames = [], []
+        for mask, last_mask, lost, is_visible in zip(
+            masks, self.masks, self.lost_frames, visible, strict=True
+        ):
+            new_masks.append(mask if is_visible else last_mask)
+            lost_frames.append(0 if is_visible else lost + 1)
+        self.masks, self.lost_frames = new_masks, lost_frames
+
+    def restart(self, segments: Sequence[Segment]) -> None:
+        """Replace all segments with visible ones."""
+        self.labels = [label for label, _ in segments]
+        self.masks = [mask for _, mask in segments]
+        self.lost_frames = [0] * len(segments)
 
 
 class Tracking:
-    """The four parts together, for any number of sessions and cameras at once."""
+    """Detector, segmenter, selector and tracker together, for any number of sessions and cameras
+    at once.
+    """
 
     def __init__(self, config: ArroConfig) -> None:
         self._detector: Detector = make_part("detector", config.detector)
@@ -223,109 +268,151 @@ class Tracking:
         self._keep_lost = config.keep_lost
 
     def load(self) -> None:
+        """Load the weights of all parts; raises `ConfigError` if some are missing."""
         for part in (self._detector, self._segmenter, self._selector, self._tracker):
             if part is not None:
                 part.load()
 
     def begin(self, images: Images, phrases: Sequence[str]) -> list[Track]:
-        """Find the requested objects on each image; those not found are in its track's
-        `missing`.
+        """Search the objects on each image.
+
+        Args:
+            images: The first images of cameras.
+            phrases: The phrases of the objects.
+
+        Returns:
+            A track for each image; its `missing` lists the objects that were not found.
         """
-        wanted = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
-        tracks = [Track(wanted) for _ in images]
+        required = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
+        tracks = [Track(required) for _ in images]
         self._search(images, tracks)
         return tracks
 
     def follow(self, images: Images, tracks: Sequence[Track]) -> None:
-        moving = [i for i, track in enumerate(tracks) if track.labels]
-        moved = self._tracker.follow(
-            [images[i] for i in moving], [tracks[i].memory for i in moving]
+        """Update tracks from their next images."""
+        tracked = [i for i, track in enumerate(tracks) if track.labels]
+        followed = self._tracker.follow(
+            [images[i] for i in tracked], [tracks[i].memory for i in tracked]
         )
-        for i, (masks, seen) in zip(moving, moved, strict=True):
-            tracks[i].move(masks, seen)
-        for track in tracks:
-            track.incomplete = track.incomplete + 1 if track.missing else 0
-            track.searched = track.incomplete > 0 and track.incomplete % (self._keep_lost + 1) == 0
-        due = [i for i, track in enumerate(tracks) if track.searched]
+        for i, (masks, visible) in zip(tracked, followed, strict=True):
+            tracks[i].move(masks, visible)
+
+        due = []
+        for i, track in enumerate(tracks):
+            frames = track.incomplete_frames + 1 if track.missing else 0
+            track.incomplete_frames = frames
+            track.searched = frames > 0 and frames % (self._keep_lost + 1) == 0
+            if track.searched:
+                due.append(i)
         if due:
             self._search([images[i] for i in due], [tracks[i] for i in due])
 
     def _search(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Search missing objects; a track that gains some begins again with these and the
-        visible ones.
+        """Search missing objects. A track for which some are found begins again with these and
+        its visible segments.
         """
-        cut = self._things(
-            images, [[label for label in track.missing if label != GRIPPER] for track in tracks]
-        )
-        grippers = self._grippers(images, [GRIPPER in track.missing for track in tracks])
-        begun = []
+        phrases = []
+        for track in tracks:
+            phrases.append([label for label in track.missing if label != GRIPPER])
+        objects = self._find_objects(images, phrases)
+        grippers = self._find_grippers(images, [GRIPPER in track.missing for track in tracks])
+
+        restarted = []
         for i, track in enumerate(tracks):
-            kept = [
-                (label, track.masks[n]) for n, label in enumerate(track.labels) if not track.lost[n]
-            ]
-            new = [
-                pair
-                for pair in cut[i] + grippers[i]
-                if all(overlap(pair[1], mask) < _SAME for _, mask in kept)
-            ]
-            if new:
-                track.labels = [label for label, _ in kept + new]
-                track.masks = [mask for _, mask in kept + new]
-                track.lost = [0] * len(track.labels)
-                begun.append(i)
-        if begun:
-            masks = [np.stack(tracks[i].masks) for i in begun]
-            for i, memory in zip(
-                begun, self._tracker.begin([images[i] for i in begun], masks), strict=True
-            ):
-                tracks[i].memory = memory
+            visible = track.visible
+            new_segments = []
+            for label, mask in objects[i] + grippers[i]:
+                if all(overlap(mask, visible_mask) < _SAME for _, visible_mask in visible):
+                    new_segments.append((label, mask))
+            if new_segments:
+                track.restart(visible + new_segments)
+                restarted.append(i)
+        if not restarted:
+            return
 
-    def _things(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Segment]]:
-        """Return the detected objects; the segmenter computes their masks if the detector does
-        not.
-        """
-        found: list[list[Detection]] = [[] for _ in images]
-        asked = [i for i, wanted in enumerate(phrases) if wanted]
-        if asked:
+        masks = [np.stack(tracks[i].masks) for i in restarted]
+        memories = self._tracker.begin([images[i] for i in restarted], masks)
+        for i, memory in zip(restarted, memories, strict=True):
+            tracks[i].memory = memory
+
+    def _find_objects(
+        self, images: Images, phrases: Sequence[Sequence[str]]
+    ) -> list[list[Segment]]:
+        """Return the objects of the phrases on each image, without those whose mask is empty."""
+        detections: list[list[Detection]] = [[] for _ in images]
+        requested = [i for i, image_phrases in enumerate(phrases) if image_phrases]
+        if requested:
             detected = self._detector.detect(
-                [images[i] for i in asked], [phrases[i] for i in asked]
+                [images[i] for i in requested], [phrases[i] for i in requested]
             )
-            for i, things in zip(asked, detected, strict=True):
-                found[i] = things
-        boxed = [i for i, things in enumerate(found) if any(thing.mask is None for thing in things)]
-        boxes = [np.stack([thing.box for thing in found[i] if thing.mask is None]) for i in boxed]
-        made = self._segmenter.segment([images[i] for i in boxed], boxes) if boxed else []
-        cut = {i: iter(masks) for i, masks in zip(boxed, made, strict=True)}
-        segments = [
-            [(thing.phrase, next(cut[i]) if thing.mask is None else thing.mask) for thing in things]
-            for i, things in enumerate(found)
-        ]
-        return [[(label, mask) for label, mask in own if mask.any()] for own in segments]
+            for i, image_detections in zip(requested, detected, strict=True):
+                detections[i] = image_detections
 
-    def _grippers(self, images: Images, wanted: Sequence[bool]) -> list[list[Segment]]:
-        """Return the gripper's regions, on the images where it is requested and visible."""
+        objects = []
+        for image_detections in self._with_masks(images, detections):
+            segments = []
+            for detection, mask in image_detections:
+                if mask.any():
+                    segments.append((detection.phrase, mask))
+            objects.append(segments)
+        return objects
+
+    def _with_masks(
+        self, images: Images, detections: Sequence[Sequence[Detection]]
+    ) -> list[list[tuple[Detection, np.ndarray]]]:
+        """Return the detections on each image with their masks, which the segmenter computes if
+        the detector does not.
+        """
+        boxes: dict[int, list[np.ndarray]] = {}  # by the index of the image
+        for i, image_detections in enumerate(detections):
+            for detection in image_detections:
+                if detection.mask is None:
+                    boxes.setdefault(i, []).append(detection.box)
+        segmented: dict[int, Iterator[np.ndarray]] = {}
+        if boxes:
+            masks = self._segmenter.segment(
+                [images[i] for i in boxes],
+                [np.stack(image_boxes) for image_boxes in boxes.values()],
+            )
+            segmented = {i: iter(image_masks) for i, image_masks in zip(boxes, masks, strict=True)}
+
+        with_masks = []
+        for i, image_detections in enumerate(detections):
+            pairs = []
+            for detection in image_detections:
+                mask = next(segmented[i]) if detection.mask is None else detection.mask
+                pairs.append((detection, mask))
+            with_masks.append(pairs)
+        return with_masks
+
+    def _find_grippers(self, images: Images, requested: Sequence[bool]) -> list[list[Segment]]:
+        """Return the gripper's regions on the images where it is requested and visible."""
         grippers: list[list[Segment]] = [[] for _ in images]
-        asked = [i for i, is_wanted in enumerate(wanted) if is_wanted]
-        if self._selector is not None and asked:
-            regions = self._segmenter.propose([images[i] for i in asked])
-            chosen = self._selector.select([images[i] for i in asked], regions)
-            for i, masks, numbers in zip(asked, regions, chosen, strict=True):
-                # copies: a view of one would keep all proposed masks in memory
-                grippers[i] = [(GRIPPER, masks[number].copy()) for number in numbers]
+        indices = [i for i, is_requested in enumerate(requested) if is_requested]
+        if self._selector is None or not indices:
+            return grippers
+
+        requested_images = [images[i] for i in indices]
+        regions = self._segmenter.propose(requested_images)
+        selected = self._selector.select(requested_images, regions)
+        for i, masks, numbers in zip(indices, regions, selected, strict=True):
+            # These are copies, since a view of one mask would keep all proposed masks in memory.
+            grippers[i] = [(GRIPPER, masks[number].copy()) for number in numbers]
         return grippers
 
 
-# In Act.info and what `reset` returns: {camera: {"seen": labels, "missing": labels, "searched":
-# bool}}.
+# Key of `Act.info` and of the result of `reset`, with {camera: {"seen": labels, "missing": labels,
+# "searched": bool}}.
 INFO = "arro"
 
 
 class Arro(Wrapper):
-    """Paints over all but the gripper and the objects of the task, on the cameras of the config.
+    """Paints over everything except the gripper and the objects of the task, on the cameras of the
+    config.
 
-    Each session tracks its own objects; detector, segmenter and tracker get the images of all
-    sessions of a batch together. `Obs.info` is not changed, so that an image in it, such as a goal,
-    must already show its own background.
+    Each session tracks its own objects; detector, segmenter and tracker process the images of all
+    sessions of a batch together. `Obs.info` is not changed, so an image in it, such as a goal, must
+    already show the virtual background.
     """
 
     Config: ClassVar[type] = ArroConfig
@@ -357,26 +444,52 @@ class Arro(Wrapper):
         )
 
     def initialize(self) -> None:
-        with used_checkpoints() as parts:
+        """Load the parts and the policy.
+
+        Raises:
+            ConfigError: Weights are missing, or a configured camera is none of the policy's.
+        """
+        with used_checkpoints() as part_files:
             self.background.load()
             self.tracking.load()
-        with used_checkpoints() as own:
+        with used_checkpoints() as policy_files:
             super().initialize()
-        self.weights_id = with_parts(self.weights_id or weights_of(own), parts)
-        stated = self.agent.contract.cameras if self.agent.contract is not None else None
-        idle = sorted(set(self.config.cameras or ()) - set(stated or ())) if stated else []
-        if idle:
+        self.weights_id = with_parts(self.weights_id or weights_of(policy_files), part_files)
+
+        policy_cameras = self._policy_cameras()
+        unused = sorted(set(self.config.cameras or ()) - set(policy_cameras or ()))
+        if policy_cameras and unused:
             raise ConfigError(
-                f"arro: cameras {idle} are none of the policy's, {sorted(stated or ())}; name some "
-                "of those"
+                f"arro: cameras {unused} are none of the policy's, {sorted(policy_cameras)}; name "
+                "some of those"
             )
 
+    def _policy_cameras(self) -> Mapping[str, CameraSpec] | None:
+        """Return the cameras in the contract of the policy; None if it declares none."""
+        contract = self.agent.contract
+        return None if contract is None else contract.cameras
+
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of both; raises `InvalidObservation` if a required object is missing."""
+        """Begin an episode of the wrapper and of the policy.
+
+        Args:
+            obs: The first observation.
+            instruction: The task in words, whose objects are searched unless the config names
+                objects.
+            kwargs: Arguments for the policy.
+
+        Returns:
+            The policy's information, and which objects were found under "arro".
+
+        Raises:
+            InvalidObservation: No objects are named, or one of them is not found.
+            MissingCamera: A camera is not in the observation.
+        """
         return {**super().reset(obs, instruction, **kwargs), INFO: self._report()}
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        names = self._names(obs)
+        """Search the objects on the first observation, and return it without the rest."""
+        names = self._camera_names(obs)
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:
             raise InvalidObservation(
@@ -396,40 +509,48 @@ class Arro(Wrapper):
     def change_batch(
         self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
     ) -> list[Obs | Exception]:
+        """Track the objects of all sessions, and return the observations with the background."""
         results: list[Obs | Exception] = list(obs)
         images: list[np.ndarray] = []
         tracks: list[Track] = []
-        for i, (one, session) in enumerate(zip(obs, sessions, strict=True)):
+        for i, (session_obs, session) in enumerate(zip(obs, sessions, strict=True)):
             try:
-                views = session._views(one)  # type: ignore[attr-defined]
+                views = session._views(session_obs)  # type: ignore[attr-defined]
             except VLAgentsError as error:
                 results[i] = error
                 continue
             images += [image for image, _ in views]
             tracks += [track for _, track in views]
         self.tracking.follow(images, tracks)
-        return [
-            one if isinstance(one, Exception) else session._changed(one)  # type: ignore[attr-defined]
-            for one, session in zip(results, sessions, strict=True)
-        ]
+
+        for i, session in enumerate(sessions):
+            if not isinstance(results[i], Exception):
+                results[i] = session._changed(obs[i])  # type: ignore[attr-defined]
+        return results
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        """Compute the policy's actions, and report the objects of each session in their info."""
         acts = super().act_batch(obs, sessions)
-        return [
-            act if isinstance(act, Exception) else session._told(act)  # type: ignore[attr-defined]
-            for act, session in zip(acts, sessions, strict=True)
-        ]
+        for i, (act, session) in enumerate(zip(acts, sessions, strict=True)):
+            if not isinstance(act, Exception):
+                acts[i] = session._with_report(act)  # type: ignore[attr-defined]
+        return acts
 
-    def _names(self, obs: Obs) -> list[str]:
-        stated = self.agent.contract.cameras if self.agent.contract is not None else None
-        names = list(self.config.cameras or stated or obs.cameras)
+    def _camera_names(self, obs: Obs) -> list[str]:
+        """Return the cameras to change; raises `MissingCamera` unless the observation has all."""
+        names = list(self.config.cameras or self._policy_cameras() or obs.cameras)
         for name in names:
             if name not in obs.cameras:
                 raise MissingCamera(name, have=obs.cameras)
         return names
 
     def _views(self, obs: Obs) -> list[tuple[np.ndarray, Track]]:
-        """Return the images to change, with their tracks; raises before any of them is changed."""
+        """Return the images to change with their tracks, all of which are unchanged.
+
+        Raises:
+            MissingCamera: An image is missing.
+            InvalidObservation: An image does not have the size that it had at the reset.
+        """
         views = []
         for name, track in self._begun().items():
             if name not in obs.cameras:
@@ -444,6 +565,7 @@ class Arro(Wrapper):
         return views
 
     def _changed(self, obs: Obs) -> Obs:
+        """Return an observation with the background on its images."""
         cameras = dict(obs.cameras)
         for name, track in self._begun().items():
             height, width = cameras[name].shape[:2]
@@ -451,27 +573,35 @@ class Arro(Wrapper):
             cameras[name] = self.background.behind(cameras[name], mask)
         return replace(obs, cameras=cameras)
 
-    def _told(self, act: Act) -> Act:
+    def _with_report(self, act: Act) -> Act:
         return replace(act, info={**act.info, INFO: self._report()})
 
     def _report(self) -> Mapping[str, Any]:
+        """Return which objects are seen on each camera, for `INFO`."""
         return {
             name: {"seen": track.seen, "missing": track.missing, "searched": track.searched}
             for name, track in self._begun().items()
         }
 
     def _begun(self) -> dict[str, Track]:
+        """Return the tracks by camera; raises `NotReset` before the first episode."""
         if self.tracks is None:
             raise NotReset("arro: act before reset; call reset(obs, instruction) first")
         return self.tracks
 
 
 def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models
-    beside its own.
+    """Return the `Agent.weights_id` of a policy that also uses files of other models.
+
+    Args:
+        policy: The policy's own `weights_id`.
+        parts: The files and folders of the other models.
+
+    Returns:
+        The policy's `weights_id`, with one digest for all files.
     """
     if not parts:
         return policy
-    own = policy or {"digest": None, "revision": None}
-    both = hashlib.sha256(f"{own['digest']} {digest(parts)}".encode()).hexdigest()
-    return {**own, "digest": f"{METHOD}:{both}"}
+    weights_id = policy or {"digest": None, "revision": None}
+    both = hashlib.sha256(f"{weights_id['digest']} {digest(parts)}".encode()).hexdigest()
+    return {**weights_id, "digest": f"{METHOD}:{both}"}
