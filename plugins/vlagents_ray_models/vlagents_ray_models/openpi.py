@@ -333,7 +333,7 @@ def _with_prompt(observation: dict[str, Any], instruction: str) -> dict[str, Any
 
 
 def _quantiles(statistics: Mapping[str, Any]) -> list[dict[str, np.ndarray]]:
-    """Return each of `_QUANTILES` by the name of what it is of; none if one is missing."""
+    """Return `_QUANTILES` of "state" and "actions", one dict each; none if one is missing."""
     quantiles = []
     for quantile in _QUANTILES:
         values = {name: getattr(norm_stats, quantile) for name, norm_stats in statistics.items()}
