@@ -1,4 +1,4 @@
-"""ARRO around policies: what they see, what they are told, and what they never notice."""
+"""ARRO around policies: the images that they get, what is reported, and errors."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ GREY, RED, BLUE = (200, 200, 200), (220, 40, 40), (40, 60, 220)
 
 
 class Watcher(Agent):
-    """Remembers the images that it is shown."""
+    """Stores the images of its observations."""
 
     contract = Contract(cameras={"front": CameraSpec()})
 
@@ -61,7 +61,7 @@ class Watcher(Agent):
 
 
 class OwnDetector:
-    """Stands in for a detector of somebody else's: boxes, no masks."""
+    """A detector from elsewhere, which returns boxes without masks."""
 
     Config = dict
 
@@ -72,10 +72,11 @@ class OwnDetector:
         pass
 
     def detect(self, images: Any, phrases: Any) -> list[list[Detection]]:
-        return [
-            [Detection(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes]
-            for asked in phrases
-        ]
+        boxes = [np.array(box, np.float32) for box in self._boxes]
+        detections = []
+        for image_phrases in phrases:
+            detections.append([Detection(image_phrases[0], box, 1.0) for box in boxes])
+        return detections
 
 
 def arro(agent: Agent | None = None, **settings: Any) -> Any:
@@ -84,15 +85,16 @@ def arro(agent: Agent | None = None, **settings: Any) -> Any:
     return wrapped
 
 
-def view(*things: tuple[tuple[int, int, int], int, int], **cameras: np.ndarray) -> Obs:
-    """Squares of 10 px on grey, each of a colour at a row and a column."""
+def view(*squares: tuple[tuple[int, int, int], int, int], **cameras: np.ndarray) -> Obs:
+    """Return squares of 10 px on grey, each with its colour, row and column."""
     image = np.full((60, 80, 3), GREY, np.uint8)
-    for colour, row, column in things:
+    for colour, row, column in squares:
         image[row : row + 10, column : column + 10] = colour
     return Obs(cameras={"front": image, **cameras})
 
 
 def shown(image: np.ndarray) -> set[tuple[int, ...]]:
+    """Return the colours of an image."""
     return {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
 
 
@@ -100,12 +102,14 @@ def test_a_policy_sees_the_things_that_are_named_and_nothing_else() -> None:
     policy = arro()
     info = policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), "lift the red cube")
     act = policy.act(view((RED, 12, 14), (BLUE, 40, 60)))
+
     report = {"front": {"seen": ["lift the red cube"], "missing": [], "searched": False}}
     assert info == {
         "told": "lift the red cube",
         "arro": {"front": {**report["front"], "searched": True}},
     }
     assert act.info == {"own": 1, "arro": report}
+
     first, second = policy.agent.seen
     for image, row, column in ((first, 10, 10), (second, 12, 14)):
         assert shown(image) == {BACKGROUND, RED}
@@ -132,7 +136,7 @@ def test_other_cameras_pass_as_they_are() -> None:
     assert policy.begin(obs, "red").cameras["wrist"] is wrist
 
 
-def test_a_detector_of_ones_own_gives_boxes_and_the_segmenter_cuts_out() -> None:
+def test_the_segmenter_computes_masks_for_a_detector_that_returns_boxes() -> None:
     policy = arro(detector={f"{__name__}:OwnDetector": {"boxes": [[5, 5, 25, 25]]}})
     policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), "it")
     assert shown(policy.agent.seen[0]) == {BACKGROUND, RED}
@@ -142,15 +146,17 @@ def test_a_lost_thing_is_shown_where_it_was_for_a_while_then_hidden_and_looked_f
     policy = arro(keep_lost=2)
     policy.reset(view((RED, 10, 10)), "red")
     policy.act(view((RED, 10, 10)))
+
     reports = [policy.act(view()).info["arro"]["front"] for _ in range(4)]
     assert [report["searched"] for report in reports] == [False, False, True, False]
     assert all(report["missing"] == ["red"] and not report["seen"] for report in reports)
     assert [shown(image) for image in policy.agent.seen[2:]] == 2 * [{BACKGROUND, GREY}] + 2 * [
         {BACKGROUND}
     ]
-    for _ in range(2):  # it is back, far from where it was: found at the next search
-        found = policy.act(view((RED, 45, 65))).info["arro"]["front"]
-    assert found == {"seen": ["red"], "missing": [], "searched": True}
+
+    for _ in range(2):  # it is back, far from its last position, and found at the next search
+        report = policy.act(view((RED, 45, 65))).info["arro"]["front"]
+    assert report == {"seen": ["red"], "missing": [], "searched": True}
     assert shown(policy.agent.seen[-1]) == {BACKGROUND, RED}
 
 
@@ -184,6 +190,7 @@ def test_a_bad_observation_fails_its_own_session_alone() -> None:
     sessions: list[Any] = [copies.make() for _ in range(3)]
     for session in sessions:
         session.reset(view((RED, 10, 10)), "red")
+
     small = Obs(cameras={"front": np.zeros((30, 40, 3), np.uint8)})
     no_camera, good, resized = policy.act_batch([Obs(), view((RED, 10, 10)), small], sessions)
     assert isinstance(no_camera, MissingCamera)
@@ -203,7 +210,7 @@ def test_the_contract_asks_for_what_it_is_to_change_and_an_instruction() -> None
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         ({"cameras": ["wirst"]}, r"cameras \['wirst'\] are none of the policy's, \['front'\]"),
         ({"background": {"image": "no/such.png"}}, "no/such.png.*cannot be read"),
@@ -215,28 +222,27 @@ def test_the_contract_asks_for_what_it_is_to_change_and_an_instruction() -> None
     ],
 )
 def test_settings_that_cannot_work_are_refused_before_serving(
-    settings: dict[str, Any], says: str
+    settings: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=f"(?s){says}"):
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
         arro(**settings)
 
 
 def test_the_package_registers_its_wrapper_by_an_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    project = tomllib.loads((ROOT / "plugins/vlagents_ray_arro/pyproject.toml").read_text())[
-        "project"
-    ]
-    [(name, target)] = project["entry-points"]["vlagents_ray.wrappers"].items()
+    pyproject = tomllib.loads((ROOT / "plugins/vlagents_ray_arro/pyproject.toml").read_text())
+    entry_points = pyproject["project"]["entry-points"]
+    [(name, target)] = entry_points["vlagents_ray.wrappers"].items()
     info = tmp_path / "vlagents_ray_arro-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: vlagents_ray_arro\nVersion: 1\n")
     (info / "entry_points.txt").write_text(f"[vlagents_ray.wrappers]\n{name} = {target}\n")
     monkeypatch.syspath_prepend(tmp_path)
+
     assert wrapper_class("arro") is Arro
-    assert [(one.kind, one.what[:11]) for one in policies_and_wrappers() if one.name == "arro"] == [
-        ("wrapper", "ARRO (arXiv")
-    ]
+    [listed] = [entry for entry in policies_and_wrappers() if entry.name == "arro"]
+    assert (listed.kind, listed.what[:11]) == ("wrapper", "ARRO (arXiv")
     with pytest.raises(UnknownWrapper, match=r"'aro' is not registered.*did you mean 'arro'"):
         wrapper_class("aro")
 
@@ -311,39 +317,43 @@ class Stored(OwnDetector):
 
 
 class StoredPolicy(Watcher):
-    """A policy with a file, or with an identity that it states itself."""
+    """A policy with a file, or with an identity that it declares itself."""
 
-    stated: dict[str, Any] | None = None
+    declared_id: dict[str, Any] | None = None
 
     def initialize(self) -> None:
         find_checkpoint("policy.pt")
-        self.weights_id = self.stated
+        self.weights_id = self.declared_id
 
 
-@pytest.mark.parametrize("stated", [None, {"digest": "mine", "revision": "c0ffee", "adapters": {}}])
+@pytest.mark.parametrize(
+    "declared_id", [None, {"digest": "mine", "revision": "c0ffee", "adapters": {}}]
+)
 def test_the_weights_are_those_of_the_policy_and_of_the_parts(
-    stated: dict[str, Any] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    declared_id: dict[str, Any] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(StoredPolicy, "stated", stated)
-    found = []
+    monkeypatch.setattr(StoredPolicy, "declared_id", declared_id)
+    ids = []
     for policy, detector in ((b"1", b"1"), (b"1", b"1"), (b"1", b"2"), (b"2", b"1")):
         Path("policy.pt").write_bytes(policy)
         Path("detector.pt").write_bytes(detector)
         detector_settings = {f"{__name__}:Stored": {"boxes": [[10, 10, 20, 20]]}}
-        found.append(arro(StoredPolicy(), detector=detector_settings).weights_id)
-    assert found[0] == found[1] != found[2]
-    assert (found[0] == found[3]) == (stated is not None)  # the policy's own word counts
-    assert {**found[0], "digest": ""} == {"revision": None, **(stated or {}), "digest": ""}
+        ids.append(arro(StoredPolicy(), detector=detector_settings).weights_id)
+
+    assert ids[0] == ids[1] != ids[2]
+    # A declared identity replaces that of the file.
+    assert (ids[0] == ids[3]) == (declared_id is not None)
+    assert {**ids[0], "digest": ""} == {"revision": None, **(declared_id or {}), "digest": ""}
 
 
 def test_other_parts_beside_a_policy_are_other_weights(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).write_text(name)
-    own = {"digest": digest([tmp_path]), "revision": "c0ffee"}
-    assert with_parts(own, []) == own
-    both = with_parts(own, [tmp_path / "a"])
+    policy = {"digest": digest([tmp_path]), "revision": "c0ffee"}
+    assert with_parts(policy, []) == policy
+    both = with_parts(policy, [tmp_path / "a"])
     assert both is not None
-    assert both["digest"] not in (own["digest"], digest([tmp_path / "a"]))
+    assert both["digest"] not in (policy["digest"], digest([tmp_path / "a"]))
     assert both["revision"] == "c0ffee"
     assert with_parts(None, [tmp_path / "a"]) != with_parts(None, [tmp_path / "b"])

@@ -1,4 +1,4 @@
-"""ARRO's learned parts on small random models: shapes, company, memory, loading."""
+"""ARRO's learned parts on small random models: shapes, batches, memory, loading."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def grounding_dino(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def part(kind: str, name: str, checkpoint: Path, **settings: Any) -> Any:
-    made = make_part(kind, {name: {"checkpoint": str(checkpoint), **settings}})
-    made.load()
-    return made
+    loaded = make_part(kind, {name: {"checkpoint": str(checkpoint), **settings}})
+    loaded.load()
+    return loaded
 
 
 def images(seed: int = 0) -> list[np.ndarray]:
-    """Read-only, as a server's are."""
+    """Return images that are read-only, as those of a server are."""
     rng = np.random.default_rng(seed)
     views = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in SIZES]
     for view in views:
@@ -59,16 +59,14 @@ def test_boxes_lie_on_the_image_and_go_by_the_phrases_that_were_asked_for(
     grounding_dino: Path,
 ) -> None:
     detector = part("detector", "grounding_dino", grounding_dino, threshold=0.0)
-    for found, asked, (height, width) in zip(
-        detector.detect(images(), PHRASES), PHRASES, SIZES, strict=True
-    ):
-        assert found
-        assert {thing.phrase for thing in found} <= set(asked)
-        assert [thing.score for thing in found] == sorted(
-            (thing.score for thing in found), reverse=True
-        )
-        for thing in found:
-            left, top, right, bottom = thing.box
+    detected = detector.detect(images(), PHRASES)
+    for detections, phrases, (height, width) in zip(detected, PHRASES, SIZES, strict=True):
+        assert detections
+        assert {detection.phrase for detection in detections} <= set(phrases)
+        scores = [detection.score for detection in detections]
+        assert scores == sorted(scores, reverse=True)
+        for detection in detections:
+            left, top, right, bottom = detection.box
             assert 0 <= left <= right <= width
             assert 0 <= top <= bottom <= height
 
@@ -80,20 +78,21 @@ def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) ->
     detector = part(
         "detector", "grounding_dino", grounding_dino, threshold=0.3, overlap=1.0, most=100
     )
-    [image], [asked] = images()[:1], PHRASES[:1]
-    inputs = detector._processor(images=image.copy(), text=[asked], return_tensors="pt")
+    image, phrases = images()[0], PHRASES[0]
+    inputs = detector._processor(images=image.copy(), text=[phrases], return_tensors="pt")
     with torch.no_grad():
         outputs = detector._model(**inputs)
     [theirs] = detector._processor.post_process_grounded_object_detection(
         outputs, threshold=0.3, target_sizes=[image.shape[:2]]
     )
-    [ours] = detector.detect([image], [asked])
+
+    [ours] = detector.detect([image], [phrases])
     height, width = image.shape[:2]
     boxes = theirs["boxes"].numpy().clip(0, [width, height, width, height])
     assert ours
-    for thing in ours:  # theirs also has boxes that stand for the dots between phrases
-        [same] = np.nonzero(np.abs(boxes - thing.box).max(1) < 1e-4)[0]
-        assert float(theirs["scores"][same]) >= thing.score - 1e-6
+    for detection in ours:  # theirs also has boxes for the dots between phrases
+        [same] = np.nonzero(np.abs(boxes - detection.box).max(1) < 1e-4)[0]
+        assert float(theirs["scores"][same]) >= detection.score - 1e-6
         if theirs["text_labels"][same]:
             assert set(theirs["text_labels"][same].split()) & {"red", "cube", "the", "bowl", "."}
 
@@ -102,16 +101,13 @@ def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) ->
 def test_what_is_found_does_not_depend_on_other_images_and_texts(grounding_dino: Path) -> None:
     detector = part("detector", "grounding_dino", grounding_dino, threshold=0.0)
     together = detector.detect(images(), PHRASES)
-    for one, asked, found in zip(images(), PHRASES, together, strict=True):
-        [alone] = detector.detect([one], [asked])
-        assert [thing.phrase for thing in alone] == [thing.phrase for thing in found]
-        # px.
-        assert np.allclose(
-            [thing.box for thing in alone], [thing.box for thing in found], atol=1e-3
-        )
-        assert np.allclose(
-            [thing.score for thing in alone], [thing.score for thing in found], atol=1e-5
-        )
+    for image, phrases, in_batch in zip(images(), PHRASES, together, strict=True):
+        [alone] = detector.detect([image], [phrases])
+        assert len(alone) == len(in_batch)
+        for expected, detection in zip(alone, in_batch, strict=True):
+            assert detection.phrase == expected.phrase
+            np.testing.assert_allclose(detection.box, expected.box, atol=1e-3)  # px
+            np.testing.assert_allclose(detection.score, expected.score, atol=1e-5)
 
 
 @pytest.mark.verifies("batches")
@@ -119,10 +115,11 @@ def test_a_segment_for_each_box_and_the_same_in_any_company(sam2: Path) -> None:
     segmenter = part("segmenter", "sam2", sam2)
     boxes = [np.array([[5, 5, 30, 30], [10, 10, 40, 40]], np.float32)[: i + 1] for i in (0, 1, 1)]
     masks = segmenter.segment(images(), boxes)
-    for one, own, mask, size in zip(images(), boxes, masks, SIZES, strict=True):
-        assert mask.shape == (len(own), *size)
-        assert mask.dtype == bool
-        assert np.array_equal(segmenter.segment([one], [own])[0], mask)
+    for image, image_boxes, image_masks, size in zip(images(), boxes, masks, SIZES, strict=True):
+        assert image_masks.shape == (len(image_boxes), *size)
+        assert image_masks.dtype == bool
+        [alone] = segmenter.segment([image], [image_boxes])
+        assert np.array_equal(alone, image_masks)
 
 
 def test_regions_are_proposed_without_repetitions(sam2: Path) -> None:
@@ -130,46 +127,44 @@ def test_regions_are_proposed_without_repetitions(sam2: Path) -> None:
     for regions, size in zip(segmenter.propose(images()), SIZES, strict=True):
         assert 1 < len(regions) < 4 * 4 * 3
         assert regions.shape[1:] == size
+
     certain = part("segmenter", "sam2", sam2, points=4, confidence=1.0)
-    assert all(
-        regions.shape == (0, *size)
-        for regions, size in zip(certain.propose(images()), SIZES, strict=True)
-    )
+    for regions, size in zip(certain.propose(images()), SIZES, strict=True):
+        assert regions.shape == (0, *size)
 
 
 @pytest.mark.verifies("parity")
 def test_segments_are_followed_as_transformers_does_with_all_frames_kept(sam2: Path) -> None:
-    """Here three cameras are followed in one batch, and what they no longer need is forgotten."""
+    """Three cameras are followed in one batch, and features that are no longer needed are
+    deleted.
+    """
     import torch
 
     tracker = part("tracker", "sam2", sam2)
     memories = tracker.begin(images(), squares(2))
     model, processor = tracker._model, tracker._processor
-    whole = [processor.init_video_session() for _ in SIZES]
-    for i, session in enumerate(whole):
+
+    def pixels(image: np.ndarray) -> Any:
+        return processor.image_processor(image.copy(), return_tensors="pt").pixel_values[0]
+
+    complete_sessions = [processor.init_video_session() for _ in SIZES]
+    for i, session in enumerate(complete_sessions):
         processor.add_inputs_to_inference_session(
             session, 0, [0, 1], input_masks=list(squares(2)[i])
         )
-        model(
-            session,
-            frame_idx=0,
-            frame=processor.image_processor(images()[i].copy(), return_tensors="pt").pixel_values[
-                0
-            ],
-        )
+        model(session, frame_idx=0, frame=pixels(images()[i]))
+
     for frame in range(1, 10):
         views = images(frame)
-        for i, (masks, seen) in enumerate(tracker.follow(views, memories)):
-            pixels = processor.image_processor(views[i].copy(), return_tensors="pt").pixel_values[0]
-            theirs = model(whole[i], frame_idx=frame, frame=pixels)
+        for i, (masks, visible) in enumerate(tracker.follow(views, memories)):
+            theirs = model(complete_sessions[i], frame_idx=frame, frame=pixels(views[i]))
             logits = torch.nn.functional.interpolate(
                 theirs.pred_masks[:, 0][None], size=SIZES[i], mode="bilinear"
             )[0]
             unsure = logits.abs().numpy() < 1e-3  # on the very edge of a mask
             assert np.array_equal(masks | unsure, (logits.numpy() > 0) | unsure)
-            assert np.array_equal(
-                seen, (theirs.object_score_logits.flatten() > 0).numpy() & masks.any((1, 2))
-            )
+            their_visible = (theirs.object_score_logits.flatten() > 0).numpy()
+            assert np.array_equal(visible, their_visible & masks.any((1, 2)))
 
 
 def test_a_memory_stops_growing_and_can_be_moved(sam2: Path) -> None:
@@ -186,7 +181,7 @@ def test_a_memory_stops_growing_and_can_be_moved(sam2: Path) -> None:
 
 
 class Watcher(Agent):
-    """Remembers what it is shown."""
+    """Stores the images of its observations."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.seen = [obs.cameras["front"]]
@@ -215,25 +210,26 @@ def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: P
 
     def begun() -> list[Any]:
         sessions: list[Any] = [copies.make() for _ in SIZES]
-        for session, image, asked in zip(sessions, images(), PHRASES, strict=True):
-            session.reset(Obs(cameras={"front": image}), " ".join(asked))
+        for session, image, phrases in zip(sessions, images(), PHRASES, strict=True):
+            session.reset(Obs(cameras={"front": image}), " ".join(phrases))
         return sessions
 
     together, alone = begun(), begun()
     for frame in range(1, 5):
         views = [Obs(cameras={"front": image}) for image in images(frame)]
         acts = policy.act_batch(views, together)
-        for obs, one, act in zip(views, alone, acts, strict=True):
+        for obs, session, act in zip(views, alone, acts, strict=True):
             assert isinstance(act, Act)
-            assert one.act(obs).info == act.info
-    for one, other in zip(together, alone, strict=True):
-        for here, there in zip(one.agent.seen, other.agent.seen, strict=True):
-            assert (here != there).any(-1).mean() < 0.01  # a pixel on the edge of a mask
+            assert session.act(obs).info == act.info
+
+    for in_batch, by_itself in zip(together, alone, strict=True):
+        for image, expected in zip(in_batch.agent.seen, by_itself.agent.seen, strict=True):
+            assert (image != expected).any(-1).mean() < 0.01  # a pixel on the edge of a mask
 
 
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
-    ("kind", "name", "file", "says"),
+    ("kind", "name", "file", "message"),
     [
         ("segmenter", "sam2", "model.safetensors", "misses .*safetensors"),
         ("tracker", "sam2", "processor_config.json", "misses .*processor_config"),
@@ -241,12 +237,18 @@ def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: P
     ],
 )
 def test_a_checkpoint_that_is_not_whole_is_refused(
-    kind: str, name: str, file: str, says: str, sam2: Path, grounding_dino: Path, tmp_path: Path
+    kind: str,
+    name: str,
+    file: str,
+    message: str,
+    sam2: Path,
+    grounding_dino: Path,
+    tmp_path: Path,
 ) -> None:
     for source in (sam2 if name == "sam2" else grounding_dino).iterdir():
         if source.name != file:
             (tmp_path / source.name).write_bytes(source.read_bytes())
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         part(kind, name, tmp_path)
 
 
