@@ -1,4 +1,4 @@
-"""Checkpoints of the families: asked for by their commit, and unpickled only where that is
+"""Checkpoints of the families: requested with their commit, and unpickled only where that is
 allowed.
 """
 
@@ -26,8 +26,8 @@ from vlagents_ray_models.diffusion_policy import (
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NAMED = f"org/name@{COMMIT}"
 POLICIES = entries("policies")
-# What needs the family's packages, and comes before the checkpoint is looked for.
-BEFORE = {
+# Functions that need the family's packages, and are called before the search for the checkpoint.
+CALLED_BEFORE = {
     "gr00t": ["vlagents_ray_models.gr00t._use_checkout"],
     "octo": ["vlagents_ray_models.octo.octo_model_class"],
     "openpi": [f"vlagents_ray_models.openpi.{name}" for name in ("use_source", "train_config")],
@@ -35,33 +35,32 @@ BEFORE = {
 
 
 def families() -> list[Any]:
-    with_checkpoints = [
-        name
-        for name, one in POLICIES.items()
-        if "checkpoint" in getattr(named_class(one.target).Config, "model_fields", ())
-    ]
-    return [
-        pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ())
-        for name in with_checkpoints
-    ]
+    params = []
+    for name, entry in POLICIES.items():
+        config = named_class(entry.target).Config
+        if "checkpoint" in getattr(config, "model_fields", ()):
+            marks = pytest.mark.torch if name == "vjepa2_ac" else ()
+            params.append(pytest.param(name, marks=marks))
+    return params
 
 
 @pytest.mark.parametrize("family", families())
 def test_a_family_asks_for_the_commit(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = empty_hub(monkeypatch)
-    for function in BEFORE.get(family, ()):
+    requested = empty_hub(monkeypatch)
+    for function in CALLED_BEFORE.get(family, ()):
         monkeypatch.setattr(function, lambda *_args, **_options: None)
     cls = named_class(POLICIES[family].target)
     fields = cls.Config.model_fields
-    settings = {name: "any" for name, field in fields.items() if field.is_required()} | {
-        "checkpoint": NAMED
+    settings: dict[str, Any] = {
+        name: "any" for name, field in fields.items() if field.is_required()
     }
-    policy = cls.from_config(
-        settings | ({"trust_checkpoint": True} if "trust_checkpoint" in fields else {})
-    )
+    settings["checkpoint"] = NAMED
+    if "trust_checkpoint" in fields:
+        settings["trust_checkpoint"] = True
+    policy = cls.from_config(settings)
     with pytest.raises(ConfigError, match="nor to be had from the hub"):
         policy.initialize()
-    assert asked == [("org/name", COMMIT)]
+    assert requested == [("org/name", COMMIT)]
 
 
 def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
@@ -75,18 +74,21 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
     (snapshot / "big.mp4").touch()
     hub = SimpleNamespace(snapshot_download=lambda *_args, **_options: str(snapshot))
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+
     config = DiffusionPolicyConfig(checkpoint=NAMED, trust_checkpoint=True)
-    with used_checkpoints() as found:
+    with used_checkpoints() as used:
         assert checkpoint_file(config) == snapshot / "checkpoints" / "latest.ckpt"
-    assert found == [snapshot / "checkpoints" / "latest.ckpt"]
-    weights = weights_of(found)
+    assert used == [snapshot / "checkpoints" / "latest.ckpt"]
+    weights = weights_of(used)
     assert weights is not None
     assert weights["revision"] == COMMIT
+
     branch = DiffusionPolicyConfig(checkpoint="org/name@main", trust_checkpoint=True)
     with pytest.raises(
         ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"
     ):
         checkpoint_file(branch)
+
     (snapshot / "other.ckpt").touch()
     with pytest.raises(
         ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"
@@ -95,7 +97,7 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
 
 
 class Touch:
-    """A pickle that makes a file when it is loaded."""
+    """A pickle that creates a file when it is loaded."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -113,4 +115,4 @@ def test_nothing_is_unpickled_unless_it_is_trusted(tmp_path: Path) -> None:
         DiffusionPolicy.from_config({"checkpoint": str(checkpoint)}).initialize()
     assert not trace.exists()
     pickle.loads(checkpoint.read_bytes())  # noqa: S301 - the danger, shown on our own file
-    assert trace.exists()  # what would have happened
+    assert trace.exists()

@@ -1,5 +1,5 @@
-"""Where model code comes from that is no package: installed, a checkout that is named, or one of
-the environment.
+"""The source of a model's code: an installation, or a checkout that a setting or an environment
+variable names.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def test_a_checkout_is_imported_from(
 def test_a_checkout_that_is_named_is_taken_though_a_folder_elsewhere_has_the_packages_name(
     checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the checkout itself has, seen from the folder that it lies in; Python takes any folder
-    for a package.
+    """The folder of the checkout itself may have that name, and Python imports any folder as a
+    package.
     """
     (checkout / "here" / NAME).mkdir(parents=True)
     monkeypatch.syspath_prepend(str(checkout / "here"))
@@ -53,13 +53,13 @@ def test_a_checkout_that_is_named_is_taken_though_a_folder_elsewhere_has_the_pac
     assert importlib.import_module(NAME).__file__ == str(checkout / "src" / NAME / "__init__.py")
 
 
-def test_what_is_installed_needs_no_checkout() -> None:
+def test_an_installed_package_needs_no_checkout() -> None:
     before = list(sys.path)
     use_source("json", VARIABLE)
     assert sys.path == before
 
 
-def test_nothing_to_import_from_is_said_with_both_ways_to_name_it(checkout: Path) -> None:
+def test_a_missing_package_is_an_error_with_both_ways_to_name_a_checkout(checkout: Path) -> None:
     with pytest.raises(
         ConfigError, match=rf"\${VARIABLE}, which is not set.*source_dir or in {VARIABLE}"
     ):

@@ -1,5 +1,5 @@
-"""What a checkpoint of LeRobot or of Octo has made is decided from its JSON, before anything of
-it is imported.
+"""The classes that a checkpoint of LeRobot or of Octo names are checked in its JSON, before
+anything is imported.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def spec(): ...
 
 @pytest.fixture(autouse=True)
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Stand-ins for LeRobot and Octo, whose modules import others as any module does."""
+    """Install stand-ins for LeRobot and Octo, whose modules import others as any module does."""
     for name, source in SOURCE.items():
         file = tmp_path / "site" / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -100,12 +100,12 @@ def test_a_step_that_is_not_lerobots_is_refused_with_the_cure(name: object, tmp_
         require_known_steps(file)
 
 
-def test_a_step_that_says_nothing_of_its_class_is_refused(tmp_path: Path) -> None:
+def test_a_step_without_a_class_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="None"):
         require_known_steps(pipeline(tmp_path, {"config": {}}))
 
 
-def test_what_would_be_imported_is_not_when_it_is_refused(tmp_path: Path) -> None:
+def test_a_refused_step_is_not_imported(tmp_path: Path) -> None:
     (tmp_path / "site" / "evil.py").write_text("raise SystemExit('was imported')")
     with pytest.raises(ConfigError, match="evil"):
         require_known_steps(pipeline(tmp_path, {"class": "evil.Step"}))
@@ -113,7 +113,7 @@ def test_what_would_be_imported_is_not_when_it_is_refused(tmp_path: Path) -> Non
 
 def test_registered_steps_and_lerobots_own_pass(tmp_path: Path) -> None:
     require_known_steps(pipeline(tmp_path))
-    # LeRobot looks at the class only where there is no registered name.
+    # LeRobot reads the class only if there is no registered name.
     both = {"registry_name": "device_processor", "class": "subprocess.Popen"}
     require_known_steps(
         pipeline(tmp_path, REGISTERED, both, {"class": "lerobot.processor.Unregistered"})
@@ -161,7 +161,7 @@ FOREIGN = [
 ]
 
 
-@pytest.mark.parametrize("foreign", FOREIGN, ids=lambda one: f"{one['module']}:{one['name']}")
+@pytest.mark.parametrize("foreign", FOREIGN, ids=lambda named: f"{named['module']}:{named['name']}")
 def test_anything_else_is_refused_at_every_depth_with_the_cure(
     foreign: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -176,7 +176,7 @@ def test_anything_else_is_refused_at_every_depth_with_the_cure(
             require_own_classes(config(tmp_path, **changed))
 
 
-def test_nothing_is_imported_for_what_is_refused(tmp_path: Path) -> None:
+def test_a_refused_class_is_not_imported(tmp_path: Path) -> None:
     (tmp_path / "site" / "evil.py").write_text("raise SystemExit('was imported')")
     with pytest.raises(ConfigError, match="evil"):
         require_own_classes(config(tmp_path, text=spec("evil", "Evil")))
@@ -184,16 +184,16 @@ def test_nothing_is_imported_for_what_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"model": {}}'])
-def test_what_is_no_configuration_is_said(text: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_configuration_is_an_error(text: str, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ConfigError, match="not a configuration of Octo's"):
         require_own_classes(tmp_path / "config.json")
 
 
-def test_octo_loads_nothing_before_the_look(
+def test_octo_loads_nothing_before_the_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unless it is told to trust the checkpoint."""
+    """This is different if the checkpoint is trusted."""
     loaded: list[str] = []
 
     class OctoModel:

@@ -1,4 +1,4 @@
-"""The transformer of GR00T's action head as a core, with a stand-in of NVIDIA's class."""
+"""The transformer of GR00T's action head as a core, with a stand-in for NVIDIA's class."""
 
 from __future__ import annotations
 
@@ -37,11 +37,12 @@ class Transformer(torch.nn.Module):
             if image_mask is None
             else [image_mask & backbone_attention_mask, backbone_attention_mask]
         )
-        seen = hidden_states + timestep[:, None, None]
+        hidden = hidden_states + timestep[:, None, None]
+        context = encoder_hidden_states
         for mask in masks:
-            allowed = None if mask is None else mask[:, None].expand(-1, seen.shape[1], -1)
-            seen = attention(seen, encoder_hidden_states, encoder_hidden_states, attn_mask=allowed)
-        return seen
+            allowed = None if mask is None else mask[:, None].expand(-1, hidden.shape[1], -1)
+            hidden = attention(hidden, context, context, attn_mask=allowed)
+        return hidden
 
 
 @pytest.fixture
@@ -51,18 +52,16 @@ def compiler() -> Iterator[CountingCompiler]:
 
 
 def inputs(rows: int, tokens: int, *, masked: bool) -> dict[str, Any]:
-    found = {
+    arguments = {
         "hidden_states": torch.randn(rows, 2, DIM),
         "encoder_hidden_states": torch.randn(rows, tokens, DIM),
         "timestep": torch.full((rows,), 500),
     }
     if masked:
-        there = torch.arange(tokens).expand(rows, -1) < tokens - 1
-        found |= {
-            "image_mask": torch.arange(tokens).expand(rows, -1) < 2,
-            "backbone_attention_mask": there,
-        }
-    return found
+        positions = torch.arange(tokens).expand(rows, -1)
+        arguments["image_mask"] = positions < 2
+        arguments["backbone_attention_mask"] = positions < tokens - 1
+    return arguments
 
 
 @pytest.mark.parametrize("masked", [True, False])
@@ -74,23 +73,27 @@ def test_prompts_of_other_lengths_use_the_same_program_if_padding_is_masked(
     with torch.inference_mode():
         compilation.add_size(2, lambda: transformer(**inputs(2, 5, masked=masked)))
         for rows, tokens in ((2, 5), (1, 5), (2, 8), (1, 6), (2, 9), (3, 5)):
-            calls, given = compiler.calls, inputs(rows, tokens, masked=masked)
-            torch.testing.assert_close(transformer(**given, kv_cache={}), plain(**given))
+            calls, arguments = compiler.calls, inputs(rows, tokens, masked=masked)
+            torch.testing.assert_close(transformer(**arguments, kv_cache={}), plain(**arguments))
             fits = rows <= 2 and tokens <= (5 + SPARE if masked else 5)
             assert compiler.calls == calls + (fits and (masked or tokens == 5))
     assert compiler.rows == [2]
 
 
-def test_without_compilation_it_is_called_as_ever() -> None:
-    transformer, kept, compilation = Transformer(), {}, Compilation("auto")
-    given = inputs(2, 5, masked=True)
-    wanted = transformer(**given)
-    seen: list[Any] = []
+def test_without_compilation_it_is_called_with_all_arguments() -> None:
+    transformer, compilation = Transformer(), Compilation("auto")
+    arguments = inputs(2, 5, masked=True)
+    expected = transformer(**arguments)
+    caches: list[Any] = []
     forward = transformer.forward
-    transformer.forward = lambda *args, **named: (
-        seen.append(named["kv_cache"]) or forward(*args, **named)
-    )
+
+    def noting_cache(*args: Any, **options: Any) -> Any:
+        caches.append(options["kv_cache"])
+        return forward(*args, **options)
+
+    transformer.forward = noting_cache
     compile_with(transformer, SPARE, compilation)
     compilation.mode = False
-    torch.testing.assert_close(transformer(**given, kv_cache=kept), wanted)
-    assert seen[0] is kept
+    cache: dict[str, Any] = {}
+    torch.testing.assert_close(transformer(**arguments, kv_cache=cache), expected)
+    assert caches[0] is cache

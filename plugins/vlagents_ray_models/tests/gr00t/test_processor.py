@@ -1,4 +1,4 @@
-"""NVIDIA's processor keeps state in its transforms, so that one thread at a time uses it."""
+"""NVIDIA's processor keeps state in its transforms, so only one thread at a time may use it."""
 
 from __future__ import annotations
 
@@ -15,24 +15,22 @@ from vlagents_ray_models.gr00t import Gr00tNetwork
 
 
 class Processor:
-    """Keeps the observation that it reads, as a transform keeps its parameters."""
+    """Stores the observation that it reads, as a transform stores its parameters."""
 
-    seen: Any = None
+    text: Any = None
 
     def __call__(self, messages: list[dict[str, Any]]) -> Any:
-        self.seen = messages[0]["content"].text
+        self.text = messages[0]["content"].text
         time.sleep(1e-3)  # another thread may call it
-        return self.seen
+        return self.text
 
 
 def test_each_observation_is_read_by_itself_on_several_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     types: Any = ModuleType("gr00t.data.types")
-    types.VLAStepData, types.MessageType = (
-        SimpleNamespace,
-        SimpleNamespace(EPISODE_STEP=SimpleNamespace(value="step")),
-    )
+    types.VLAStepData = SimpleNamespace
+    types.MessageType = SimpleNamespace(EPISODE_STEP=SimpleNamespace(value="step"))
     for name, module in {
         "gr00t": ModuleType("gr00t"),
         "gr00t.data": ModuleType("gr00t.data"),

@@ -1,5 +1,5 @@
-"""Policies from ONNX files: where each input comes from, what an act returns, and whose memory
-it is.
+"""Policies from ONNX files: the source of each input, the result of a call, and the memory of each
+session.
 """
 
 from __future__ import annotations
@@ -63,28 +63,30 @@ def loaded(file: Path, **settings: Any) -> Onnx:
 
 
 def acts(
-    policy: Onnx, seen: list[Obs], instruction: str | None = None, **options: Any
+    policy: Onnx, observations: list[Obs], instruction: str | None = None, **options: Any
 ) -> list[Act]:
-    """The acts of a session of its own."""
+    """Return the results for the observations of a new session."""
     session = AgentCopies(policy).make()
-    session.reset(seen[0], instruction, **options)
-    return [session.act(one) for one in seen]
+    session.reset(observations[0], instruction, **options)
+    return [session.act(obs) for obs in observations]
 
 
 def action(policy: Onnx, obs: Obs, instruction: str | None = None) -> np.ndarray:
-    """The first action of a session, (D,)."""
+    """Return the first action of a new session, (D,)."""
     return acts(policy, [obs], instruction)[0].action[0]
 
 
-def of(**parts: Any) -> Obs:
-    return Obs(
-        state={name: np.atleast_1d(np.asarray(part, np.float32)) for name, part in parts.items()}
-    )
+def state_obs(**state: Any) -> Obs:
+    """Return an observation of the state alone."""
+    arrays = {}
+    for name, values in state.items():
+        arrays[name] = np.atleast_1d(np.asarray(values, np.float32))
+    return Obs(state=arrays)
 
 
-def vectors(count: int, length: int = 4, seed: int = 1) -> list[Obs]:
+def random_joints(count: int, length: int = 4, seed: int = 1) -> list[Obs]:
     rng = np.random.default_rng(seed)
-    return [of(joints=rng.normal(size=length)) for _ in range(count)]
+    return [state_obs(joints=rng.normal(size=length)) for _ in range(count)]
 
 
 @pytest.fixture
@@ -97,10 +99,11 @@ MEMORY = {"state": ["joints"], "recurrent": {"h": "h_out"}}
 
 def test_a_session_acts_to_the_bit_as_onnx_runtime_called_directly(recurrent: Path) -> None:
     runtime, hidden = onnxruntime.InferenceSession(recurrent), np.zeros((2, 1, 8), np.float32)
-    seen = vectors(20)
-    for obs, act in zip(seen, acts(loaded(recurrent, **MEMORY), seen), strict=True):
-        wanted, hidden = runtime.run(None, {"x": obs.state["joints"][None], "h": hidden})
-        np.testing.assert_array_equal(act.action, wanted)
+    observations = random_joints(20)
+    results = acts(loaded(recurrent, **MEMORY), observations)
+    for obs, act in zip(observations, results, strict=True):
+        expected, hidden = runtime.run(None, {"x": obs.state["joints"][None], "h": hidden})
+        np.testing.assert_array_equal(act.action, expected)
 
 
 def test_sessions_of_a_batch_keep_their_own_memory_also_where_some_begin_again(
@@ -108,52 +111,56 @@ def test_sessions_of_a_batch_keep_their_own_memory_also_where_some_begin_again(
 ) -> None:
     policy, steps = loaded(recurrent, **MEMORY), 12
     assert policy.model.batched
-    begins = [{0} | ({5 + i % 3} if i % 4 == 0 else set()) for i in range(SESSIONS)]
-    seen = [vectors(steps, seed=i) for i in range(SESSIONS)]
+    # The steps at which a session begins an episode.
+    begins = [[0, 5 + i % 3] if i % 4 == 0 else [0] for i in range(SESSIONS)]
+    observations = [random_joints(steps, seed=i) for i in range(SESSIONS)]
     copies = AgentCopies(policy)
     sessions = [copies.make() for _ in range(SESSIONS)]
+
     for step in range(steps):
         for i in range(SESSIONS):
             if step in begins[i]:
                 sessions[i] = copies.make()
-                sessions[i].reset(seen[i][step], None)
-        together = policy.act_batch([one[step] for one in seen], sessions)
+                sessions[i].reset(observations[i][step], None)
+        together = policy.act_batch([of_session[step] for of_session in observations], sessions)
         for i, act in enumerate(together):
             assert isinstance(act, Act)
-            begun = max(one for one in begins[i] if one <= step)
-            alone = acts(policy, seen[i][begun : step + 1])[-1]
+            last_begin = max(begin for begin in begins[i] if begin <= step)
+            alone = acts(policy, observations[i][last_begin : step + 1])[-1]
             np.testing.assert_allclose(act.action, alone.action, atol=1e-6)
 
 
 def test_a_session_that_moves_takes_its_memory_along_and_a_lost_one_computes_it_anew(
     recurrent: Path,
 ) -> None:
-    seen = vectors(10)
-    wanted = [act.action for act in acts(loaded(recurrent, **MEMORY), seen)]
+    observations = random_joints(10)
+    expected = [act.action for act in acts(loaded(recurrent, **MEMORY), observations)]
     settings = {"checkpoint": str(recurrent), **MEMORY, "burn_in": 9}
     replicas = Replicas([Onnx.from_config(settings) for _ in range(3)])
     try:
         agent = replicas.agent()
-        agent.reset(seen[0], None)
-        found = [agent.act(one) for one in seen[:4]]
+        agent.reset(observations[0], None)
+        results = [agent.act(obs) for obs in observations[:4]]
+
         assert replicas.hand_over(0) == 1
         replicas.dead.add(0)
-        found += [agent.act(one) for one in seen[4:7]]
-        assert not any("resumed" in act.info for act in found)
+        results += [agent.act(obs) for obs in observations[4:7]]
+        assert not any("resumed" in act.info for act in results)
+
         replicas.dead.add(1)
-        found += [agent.act(one) for one in seen[7:]]
-        assert "resumed" in found[7].info
+        results += [agent.act(obs) for obs in observations[7:]]
+        assert "resumed" in results[7].info
         agent.close()
     finally:
         replicas.close()
-    np.testing.assert_array_equal([act.action for act in found], wanted)
+    np.testing.assert_array_equal([act.action for act in results], expected)
 
 
 def test_a_padded_or_sampled_row_leaves_the_memory_as_it_is(recurrent: Path) -> None:
-    policy, seen = loaded(recurrent, **MEMORY, batch_sizes=[4]), vectors(5)
-    sampled = [Obs(state=one.state, info={"samples": 3}) for one in seen]
-    for plain, other in zip(acts(policy, seen), acts(policy, sampled), strict=True):
-        np.testing.assert_allclose(plain.action, other.action, atol=1e-6)
+    policy, observations = loaded(recurrent, **MEMORY, batch_sizes=[4]), random_joints(5)
+    with_samples = [Obs(state=obs.state, info={"samples": 3}) for obs in observations]
+    for plain, sampled in zip(acts(policy, observations), acts(policy, with_samples), strict=True):
+        np.testing.assert_allclose(plain.action, sampled.action, atol=1e-6)
 
 
 def test_a_suite_of_the_interface_accepts_it(recurrent: Path) -> None:
@@ -171,7 +178,7 @@ PIXELS = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "option", "convert"),
+    ("graph", "option", "convert"),
     [
         ("NCHW", {}, lambda image: image.transpose(2, 0, 1) / np.float32(255)),
         ("NHWC", {"range": [-1, 1]}, lambda image: image * np.float32(2) / np.float32(255) - 1),
@@ -192,17 +199,14 @@ PIXELS = {
     ],
 )
 def test_an_image_gets_the_models_layout_and_range(
-    tmp_path: Path, kind: str, option: Any, convert: Any
+    tmp_path: Path, graph: str, option: Any, convert: Any
 ) -> None:
-    policy = loaded(
-        exported(tmp_path, PIXELS[kind]), cameras={"image": "front"}, inputs={"image": option}
-    )
+    file = exported(tmp_path, PIXELS[graph])
+    policy = loaded(file, cameras={"image": "front"}, inputs={"image": option})
     image = RNG.integers(0, 256, (4, 6, 3), np.uint8)
     assert policy.contract.cameras == {"front": CameraSpec(4, 6)}
-    found = action(policy, Obs({"front": image}))
-    np.testing.assert_array_equal(
-        found, convert(image.astype(np.float32)).astype(np.float32).ravel()
-    )
+    expected = convert(image.astype(np.float32)).astype(np.float32).ravel()
+    np.testing.assert_array_equal(action(policy, Obs({"front": image})), expected)
 
 
 def test_an_image_of_another_size_is_refused_or_padded_as_set(tmp_path: Path) -> None:
@@ -212,6 +216,7 @@ def test_an_image_of_another_size_is_refused_or_padded_as_set(tmp_path: Path) ->
         match=r"'front': got 12x12, want 4x6; .* `resize: true` for the input 'image'",
     ):
         action(loaded(file, cameras={"image": "front"}), Obs({"front": image}))
+
     policy = loaded(file, cameras={"image": "front"}, inputs={"image": {"resize": True}})
     assert policy.contract.cameras == {"front": CameraSpec()}
     np.testing.assert_array_equal(
@@ -223,7 +228,7 @@ SAME = "g (float[N, {0}] x) => (float[N, {0}] action) {{ action = Identity(x) }}
 
 
 @pytest.mark.parametrize(
-    ("option", "wanted"),
+    ("option", "expected"),
     [
         ({}, [1, 2, 3, 0.5]),
         ({"mean": 1, "std": 2}, [0, 0.5, 1, -0.25]),
@@ -234,36 +239,33 @@ SAME = "g (float[N, {0}] x) => (float[N, {0}] action) {{ action = Identity(x) }}
     ],
 )
 def test_the_state_is_put_together_in_order_and_scaled(
-    tmp_path: Path, option: Any, wanted: list[float]
+    tmp_path: Path, option: Any, expected: list[float]
 ) -> None:
-    parts = ["joints", "speed", "gripper"]
-    policy = loaded(exported(tmp_path, SAME.format(4)), state=parts, inputs={"x": option})
-    obs = Obs(state=of(joints=[1, 2], speed=3).state, gripper=0.5)
-    assert (set(policy.contract.state or {}), policy.contract.gripper) == (
-        {"joints", "speed"},
-        True,
-    )
-    np.testing.assert_array_equal(action(policy, obs), np.float32(wanted))
+    state = ["joints", "speed", "gripper"]
+    policy = loaded(exported(tmp_path, SAME.format(4)), state=state, inputs={"x": option})
+    assert set(policy.contract.state or {}) == {"joints", "speed"}
+    assert policy.contract.gripper
+    obs = Obs(state=state_obs(joints=[1, 2], speed=3).state, gripper=0.5)
+    np.testing.assert_array_equal(action(policy, obs), np.float32(expected))
 
 
 def test_the_previous_output_is_that_before_offset_and_scale(tmp_path: Path) -> None:
-    graph = """g (float[1, 5] obs) => (float[1, 2] action) <float[5, 2] w> { action = MatMul(obs, w) }"""
-    w = RNG.normal(size=(5, 2)).astype(np.float32)
+    graph = "g (float[1, 5] obs) => (float[1, 2] action) { action = MatMul(obs, w) }"
+    weights = RNG.normal(size=(5, 2)).astype(np.float32)
     policy = loaded(
-        exported(tmp_path, graph.replace("<float[5, 2] w>", ""), w=w),
+        exported(tmp_path, graph, w=weights),
         state=["speed", "previous_output", "joints"],
         action={"mean": [0.5, -0.5], "std": 0.25, "clip": [-1, 1]},
     )
-    previous, speed = np.zeros(2, np.float32), np.float32([3.0])
-    for obs, act in zip(
-        seen := [of(speed=speed, joints=RNG.normal(size=2)) for _ in range(6)],
-        acts(policy, seen),
-        strict=True,
-    ):
-        previous = (np.concatenate([speed, previous, obs.state["joints"]])[None] @ w).clip(-1, 1)[0]
-        np.testing.assert_allclose(
-            act.action[0], np.float32([0.5, -0.5]) + np.float32(0.25) * previous, rtol=1e-6
-        )
+    speed = np.float32([3.0])
+    observations = [state_obs(speed=speed, joints=RNG.normal(size=2)) for _ in range(6)]
+
+    previous = np.zeros(2, np.float32)
+    for obs, act in zip(observations, acts(policy, observations), strict=True):
+        vector = np.concatenate([speed, previous, obs.state["joints"]])
+        previous = (vector[None] @ weights).clip(-1, 1)[0]
+        expected = np.float32([0.5, -0.5]) + np.float32(0.25) * previous
+        np.testing.assert_allclose(act.action[0], expected, rtol=1e-6)
 
 
 def test_constants_and_a_counter_of_steps_are_inputs(tmp_path: Path) -> None:
@@ -280,17 +282,17 @@ def test_constants_and_a_counter_of_steps_are_inputs(tmp_path: Path) -> None:
         action={"output": "action"},
         info=["target"],
     )
-    found = acts(policy, [of(x=1)] * 3)
-    assert [float(act.action[0, 0]) for act in found] == [1011, 1012, 1013]
-    assert [float(act.info["target"][0, 0]) for act in found] == [10, 11, 12]
+    results = acts(policy, [state_obs(x=1)] * 3)
+    assert [float(act.action[0, 0]) for act in results] == [1011, 1012, 1013]
+    assert [float(act.info["target"][0, 0]) for act in results] == [10, 11, 12]
 
 
 def test_a_history_begins_with_the_first_observation_again(tmp_path: Path) -> None:
     graph = "g (float[N, 3, 2] x) => (float[N, 6] action) { action = Flatten(x) }"
     policy = loaded(exported(tmp_path, graph), state=["joints"], inputs={"x": {"history": 3}})
     assert (policy.contract.history, policy.contract.state) == (3, {"joints": StateSpec(2)})
-    found = acts(policy, [of(joints=[i, i]) for i in range(4)])
-    assert [act.action[0, ::2].tolist() for act in found] == [
+    results = acts(policy, [state_obs(joints=[i, i]) for i in range(4)])
+    assert [act.action[0, ::2].tolist() for act in results] == [
         [0, 0, 0],
         [0, 0, 1],
         [0, 1, 2],
@@ -307,8 +309,8 @@ def test_a_history_has_the_previous_output_of_each_observation(tmp_path: Path) -
     policy = loaded(
         exported(tmp_path, graph), state=["speed", "previous_output"], inputs={"x": {"history": 2}}
     )
-    found = acts(policy, [of(speed=1)] * 4)
-    assert [float(act.action[0, 0]) for act in found] == [
+    results = acts(policy, [state_obs(speed=1)] * 4)
+    assert [float(act.action[0, 0]) for act in results] == [
         2,
         1 + 0 + 1 + 2,
         1 + 2 + 1 + 4,
@@ -331,15 +333,11 @@ def test_a_chunk_of_actions_is_one_act(tmp_path: Path) -> None:
         },
     )
     contract = policy.contract
-    assert (contract.chunk, contract.action.dim, contract.action.space, contract.control_hz) == (
-        3,
-        2,
-        "joint",
-        20,
-    )
+    assert (contract.chunk, contract.control_hz) == (3, 20)
+    assert (contract.action.dim, contract.action.space) == (2, "joint")
     assert contract.state == {"joints": StateSpec(6, "rad")}
-    assert action(policy, of(joints=range(6))).tolist() == [0, 1]
-    assert acts(policy, [of(joints=range(6))])[0].action.tolist() == [[0, 1], [2, 3], [4, 5]]
+    assert action(policy, state_obs(joints=range(6))).tolist() == [0, 1]
+    assert acts(policy, [state_obs(joints=range(6))])[0].action.tolist() == [[0, 1], [2, 3], [4, 5]]
 
 
 def test_the_instruction_is_a_string_or_its_tokens(tmp_path: Path) -> None:
@@ -349,12 +347,14 @@ def test_the_instruction_is_a_string_or_its_tokens(tmp_path: Path) -> None:
     policy = loaded(exported(tmp_path, text), inputs={"task": {"instruction": "text"}})
     assert policy.contract.instruction
     assert action(policy, Obs(), "push") == 2
+
     from tokenizers import Tokenizer, models, pre_tokenizers
 
     words = Tokenizer(models.WordLevel({"[PAD]": 7, "lift": 1, "push": 2}, unk_token="[PAD]"))  # noqa: S106
     words.pre_tokenizer = pre_tokenizers.Whitespace()
     words.enable_padding(pad_id=7, pad_token="[PAD]", length=8)  # noqa: S106
     words.save(str(tmp_path / "tokenizer.json"))
+
     ids = """g (int64[N, 4] ids, int64[N, 4] mask) => (float[N, 8] action) {
         both = Concat <axis = 1> (ids, mask)
         action = Cast <to = 1> (both)
@@ -364,6 +364,7 @@ def test_the_instruction_is_a_string_or_its_tokens(tmp_path: Path) -> None:
     assert action(policy, Obs(), "lift push").tolist() == [1, 2, 7, 7, 1, 1, 0, 0]
     with pytest.raises(InvalidObservation, match="got 5 tokens, want at most 4"):
         action(policy, Obs(), "lift lift lift lift lift")
+
     (tmp_path / "tokenizer.json").unlink()
     with pytest.raises(ConfigError, match=r"tokenizer.json: is missing"):
         loaded(tmp_path / "policy.onnx", inputs=inputs)
@@ -374,10 +375,11 @@ def test_noise_is_the_sessions_own_and_samples_differ(tmp_path: Path) -> None:
         "g (float[N, 2] x, float[N, 2] noise) => (float[N, 2] action) { action = Add(x, noise) }"
     )
     policy = loaded(exported(tmp_path, graph), state=["joints"], inputs={"noise": {"noise": True}})
-    [obs] = vectors(1, 2)
-    first, again, other = (acts(policy, [obs], seed=seed)[0].action for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
+    [obs] = random_joints(1, 2)
+    first, repeated, different = (acts(policy, [obs], seed=seed)[0].action for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, repeated)
+    assert (first != different).all()
+
     sampled = acts(policy, [Obs(state=obs.state, info={"samples": 2})], seed=1)[0]
     np.testing.assert_array_equal(sampled.action, first)
     assert len(np.unique(sampled.info["distribution"]["samples"])) == 4
@@ -407,7 +409,7 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
 
 
 @pytest.mark.parametrize(
-    ("graph", "settings", "said"),
+    ("graph", "settings", "message"),
     [
         (TWO, {"state": ["joints"]}, r"inputs without a source: \['x', 'y', 'h'\]"),
         (TWO, {"cameras": {"rgb": "front"}}, r"unknown: \['rgb'\]"),
@@ -495,14 +497,14 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
     ],
 )
 def test_a_wrong_mapping_says_what_the_file_has(
-    tmp_path: Path, graph: str, settings: Any, said: str
+    tmp_path: Path, graph: str, settings: Any, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         loaded(exported(tmp_path, graph), **settings)
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ({"inputs": {"x": {"step": 0, "constant": 1}}}, "want one source of an input"),
         ({"inputs": {"x": {"min": 0}}}, "want min and max, or mean and std"),
@@ -510,8 +512,8 @@ def test_a_wrong_mapping_says_what_the_file_has(
         ({"inputs": {"x": {"scale": 2}}}, "scale"),
     ],
 )
-def test_contradictory_settings_are_refused(settings: Any, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_contradictory_settings_are_refused(settings: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         Onnx.from_config({"checkpoint": "policy.onnx", **settings})
 
 
@@ -519,15 +521,15 @@ def test_an_open_length_is_that_of_the_settings(tmp_path: Path) -> None:
     policy = loaded(exported(tmp_path, OPEN), state=["joints"], inputs={"x": {"shape": [-1, 3]}})
     assert policy.contract.state == {"joints": StateSpec(3)}
     with pytest.raises(InvalidObservation, match=r"got 4 numbers .* want 3"):
-        action(policy, of(joints=range(4)))
+        action(policy, state_obs(joints=range(4)))
 
 
 def test_a_statistic_that_no_part_fits_fails_that_act_alone(tmp_path: Path) -> None:
     file = exported(tmp_path, SAME.format(4))
     policy = loaded(file, state=["a", "b"], inputs={"x": {"mean": {"a": [1, 2, 3]}}})
-    assert action(policy, of(a=[1, 2, 3], b=4)).tolist() == [0, 0, 0, 4]
+    assert action(policy, state_obs(a=[1, 2, 3], b=4)).tolist() == [0, 0, 0, 4]
     with pytest.raises(InvalidObservation, match="statistics of 'x' do not fit"):
-        action(policy, of(a=[1, 2], b=[3, 4]))
+        action(policy, state_obs(a=[1, 2], b=[3, 4]))
 
 
 def test_a_device_that_the_runtime_lacks_is_an_error_with_its_cure(
@@ -539,26 +541,29 @@ def test_a_device_that_the_runtime_lacks_is_an_error_with_its_cure(
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     with pytest.raises(ConfigError, match=r"or set device: cpu with resources: \{num_gpus: 0\}"):
         loaded(recurrent, **MEMORY)
-    assert action(loaded(recurrent, **MEMORY, device="cpu"), vectors(1)[0]).shape == (3,)
+    assert action(loaded(recurrent, **MEMORY, device="cpu"), random_joints(1)[0]).shape == (3,)
 
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """A runtime that claims to have CUDA; `providers` are those it was started with, and
-    `started` what runs then.
+    """Make a runtime that claims to have CUDA.
+
+    Returns:
+        The `providers` that a session was created with, and those that it reports as `started`.
     """
-    real, found = onnxruntime.InferenceSession, {"started": ["CUDAExecutionProvider"]}
+    inference_session = onnxruntime.InferenceSession
+    providers_by_kind: dict[str, Any] = {"started": ["CUDAExecutionProvider"]}
 
     def session(path: str, options: Any, providers: Any) -> Any:
-        found["providers"] = providers
-        computing = real(path, options, providers=["CPUExecutionProvider"])
-        computing.get_providers = lambda: found["started"]
-        return computing
+        providers_by_kind["providers"] = providers
+        on_cpu = inference_session(path, options, providers=["CPUExecutionProvider"])
+        on_cpu.get_providers = lambda: providers_by_kind["started"]
+        return on_cpu
 
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider"])
     monkeypatch.setattr(onnxruntime, "InferenceSession", session)
     monkeypatch.setattr(accelerator, "driver_version", lambda: "580.65.06")
-    return found
+    return providers_by_kind
 
 
 def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(
@@ -567,7 +572,7 @@ def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(
     policy = loaded(recurrent, **MEMORY, max_rows=4)
     assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "0", "use_tf32": "1"})]
     assert (policy.report.accelerated, set(policy.report.pass_s)) == (True, {1, 4})
-    assert action(policy, vectors(1)[0]).shape == (3,)
+    assert action(policy, random_joints(1)[0]).shape == (3,)
     loaded(recurrent, **MEMORY, device="cuda:1", matmul="highest")
     assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "1", "use_tf32": "0"})]
 
@@ -583,7 +588,7 @@ def test_a_gpu_that_does_not_start_is_not_replaced_by_the_cpu(
 
 
 def large(folder: Path, location: str) -> Path:
-    """A model whose weights are in a file beside it."""
+    """Write a model whose weights are in a file next to it, and return its file."""
     file = exported(
         folder,
         "g (float[N, 64] x) => (float[N, 64] action) { action = MatMul(x, w) }",
@@ -595,12 +600,12 @@ def large(folder: Path, location: str) -> Path:
 
 def test_weights_beside_the_file_count_for_its_digest(tmp_path: Path) -> None:
     file = large(tmp_path, "policy.onnx.data")
-    with used_checkpoints() as found:
+    with used_checkpoints() as used:
         loaded(file, state=["x"])
-    assert {path.name for path in found} == {"policy.onnx", "policy.onnx.data"}
-    with used_checkpoints() as found:
+    assert {path.name for path in used} == {"policy.onnx", "policy.onnx.data"}
+    with used_checkpoints() as used:
         loaded(tmp_path, state=["x"])
-    assert found == [tmp_path]
+    assert used == [tmp_path]
 
 
 def test_a_file_reads_no_other_folder(tmp_path: Path) -> None:
@@ -616,16 +621,16 @@ def test_a_file_reads_no_other_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("policy.onnx", "ONNX Runtime cannot read it"),
         ("policy.pt", "trust_checkpoint"),
         ("policy.bin", r"one file with"),
     ],
 )
-def test_a_file_that_is_no_model_is_refused(tmp_path: Path, name: str, said: str) -> None:
+def test_a_file_that_is_no_model_is_refused(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / name).write_bytes(b"PK nothing")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         loaded(tmp_path / name, state=["x"])
     (tmp_path / name).unlink()
     with pytest.raises(ConfigError, match=r"got \[\], want one file"):

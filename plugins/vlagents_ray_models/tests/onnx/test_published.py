@@ -40,7 +40,7 @@ STAND = np.linspace(-0.4, 0.6, 29).astype(np.float32)  # rad, default joint angl
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the packages alone, as all that is needed of them are files."""
+    """Install the packages without what they depend on, since only their files are needed."""
     folder = tmp_path_factory.mktemp("packages")
     install(Path(sys.executable), ["--no-deps", "--target", str(folder), *PACKAGES])
     return folder
@@ -63,9 +63,9 @@ class Walk:
         self._session, self._last = session, np.zeros((1, 29), np.float32)
 
     def act(self, obs: Obs) -> np.ndarray:
-        parts = {**obs.state, "actions": self._last[0]}
-        parts["dof_pos"] = parts["dof_pos"] - STAND
-        scaled = [parts[name] / np.float32(STD.get(name, 1)) for name in WALK]
+        values = {**obs.state, "actions": self._last[0]}
+        values["dof_pos"] = values["dof_pos"] - STAND
+        scaled = [values[name] / np.float32(STD.get(name, 1)) for name in WALK]
         [action] = self._session.run(None, {"actor_obs": np.concatenate(scaled)[None]})
         self._last = np.clip(action, -100, 100)
         return self._last * np.float32(0.25) + STAND
@@ -75,7 +75,8 @@ class Dance:
     """Holosoma's whole-body tracking policies, whose motion is a function of the time step."""
 
     def __init__(self, file: str) -> None:
-        self.file, self.lengths = f"holosoma_inference/models/wbt/{file}.onnx", {"actor_obs": 154}
+        self.file = f"holosoma_inference/models/wbt/{file}.onnx"
+        self.lengths = {"actor_obs": 154}
         self.settings = {
             "state": ["actor_obs"],
             "inputs": {"time_step": {"step": 0}},
@@ -96,16 +97,14 @@ class Dance:
 
 
 class Speech:
-    """Silero's voice activity detector, no robot's, but recurrent: its state has the batch in
-    its second dimension.
+    """Silero's voice activity detector. It is no policy of a robot, but recurrent, and its state
+    has the batch in its second dimension.
     """
 
     def __init__(self, file: str, *, one_row: bool = False) -> None:
-        self.file, self.lengths, self._rate = (
-            f"silero_vad/data/{file}.onnx",
-            {"audio": 576},
-            not one_row,
-        )
+        self.file = f"silero_vad/data/{file}.onnx"
+        self.lengths = {"audio": 576}
+        self._has_rate = not one_row
         inputs = {"input": {"shape": [-1, 576]}, "sr": {"constant": 16000}}
         self.settings = {
             "state": ["audio"],
@@ -117,10 +116,10 @@ class Speech:
         self._session, self._state = session, np.zeros((2, 1, 128), np.float32)
 
     def act(self, obs: Obs) -> np.ndarray:
-        rate = {"sr": np.array(16000)} if self._rate else {}
+        rate = {"sr": np.array(16000)} if self._has_rate else {}
         feed = {"input": obs.state["audio"][None], "state": self._state, **rate}
-        found, self._state = self._session.run(None, feed)
-        return found
+        probability, self._state = self._session.run(None, feed)
+        return probability
 
 
 MODELS = [
@@ -141,50 +140,58 @@ def test_the_table_states_as_many_as_there_are() -> None:
     assert RATES["onnx"]["equal"] == len(MODELS)
 
 
-def seen(model: Any, seed: int) -> list[Obs]:
+def random_observations(model: Any, seed: int) -> list[Obs]:
     rng = np.random.default_rng(seed)
-    state = lambda: {  # noqa: E731
-        name: rng.normal(size=n).astype(np.float32) / 4 for name, n in model.lengths.items()
-    }
-    return [Obs(state=state()) for _ in range(STEPS)]
+    observations = []
+    for _ in range(STEPS):
+        state = {}
+        for name, length in model.lengths.items():
+            state[name] = rng.normal(size=length).astype(np.float32) / 4
+        observations.append(Obs(state=state))
+    return observations
 
 
 def called_directly(model: Any, file: Path, views: list[Obs]) -> list[np.ndarray]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 1, 3
     model.begin(onnxruntime.InferenceSession(file, options))
-    return [model.act(one) for one in views]
+    return [model.act(obs) for obs in views]
 
 
 @pytest.mark.parametrize(("make", "batched"), MODELS)
 def test_a_published_model_is_served_to_the_bit(packages: Path, make: Any, batched: bool) -> None:
     model = make()
-    views, settings = seen(model, 0), {"checkpoint": str(packages / model.file), **model.settings}
+    views = random_observations(model, 0)
+    settings = {"checkpoint": str(packages / model.file), **model.settings}
     replicas = Replicas([Onnx.from_config(settings)])
     try:
         agent = replicas.agent()
         agent.reset(views[0], None)
-        found = [agent.act(one).action for one in views]
+        actions = [agent.act(obs).action for obs in views]
         agent.close()
     finally:
         replicas.close()
-    np.testing.assert_array_equal(found, called_directly(model, packages / model.file, views))
+    np.testing.assert_array_equal(actions, called_directly(model, packages / model.file, views))
 
 
 @pytest.mark.parametrize(("make", "batched"), MODELS)
 def test_sessions_share_a_batch_of_it(packages: Path, make: Any, batched: bool) -> None:
     model = make()
-    views = [seen(model, seed) for seed in range(SESSIONS)]
+    views = [random_observations(model, seed) for seed in range(SESSIONS)]
     policy = Onnx.from_config({"checkpoint": str(packages / model.file), **model.settings})
     policy.initialize()
     assert policy.model.batched == batched
+
     copies = AgentCopies(policy)
     sessions = [copies.make() for _ in range(SESSIONS)]
-    for session, own in zip(sessions, views, strict=True):
-        session.reset(own[0], None)
-    wanted = [called_directly(model, packages / model.file, own) for own in views]
+    expected = []
+    for session, session_views in zip(sessions, views, strict=True):
+        session.reset(session_views[0], None)
+        expected.append(called_directly(model, packages / model.file, session_views))
+
     for step in range(STEPS):
-        acts = policy.act_batch([own[step] for own in views], sessions)
-        for act, own in zip(acts, wanted, strict=True):
+        acts = policy.act_batch([session_views[step] for session_views in views], sessions)
+        for act, actions in zip(acts, expected, strict=True):
             assert isinstance(act, Act)
-            np.testing.assert_allclose(act.action, own[step], rtol=0, atol=1e-6 if batched else 0)
+            tolerance = 1e-6 if batched else 0
+            np.testing.assert_allclose(act.action, actions[step], rtol=0, atol=tolerance)

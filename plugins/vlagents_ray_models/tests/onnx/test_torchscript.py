@@ -27,8 +27,8 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A GRU whose state is an input and an output, and one that keeps it in a buffer, as rsl_rl
-    exports it.
+    """Write a GRU whose state is an input and an output, and one that keeps its state in a buffer,
+    as rsl_rl exports it.
     """
     import torch
 
@@ -38,8 +38,8 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
             self.gru, self.head = torch.nn.GRU(4, 8), torch.nn.Linear(8, 3)
 
         def forward(self, x: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            out, h = self.gru(x.unsqueeze(0), h)
-            return self.head(out[0]), h
+            output, next_h = self.gru(x.unsqueeze(0), h)
+            return self.head(output[0]), next_h
 
     class Hidden(Explicit):
         def __init__(self) -> None:
@@ -47,9 +47,9 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
             self.register_buffer("hidden", torch.zeros(1, 1, 8))
 
         def forward(self, x: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
-            out, h = self.gru(x.unsqueeze(0), self.hidden)
-            self.hidden[:] = h
-            return self.head(out[0])
+            output, next_hidden = self.gru(x.unsqueeze(0), self.hidden)
+            self.hidden[:] = next_hidden
+            return self.head(output[0])
 
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("archives")
@@ -59,29 +59,32 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def policy(file: Path, **settings: Any) -> Onnx:
-    made = Onnx.from_config({"checkpoint": str(file), **SETTINGS, **settings})
-    made.initialize()
-    return made
+    loaded = Onnx.from_config({"checkpoint": str(file), **SETTINGS, **settings})
+    loaded.initialize()
+    return loaded
 
 
 def test_sessions_of_a_batch_act_as_the_archive_alone(archives: Path) -> None:
     import torch
 
     module = torch.jit.load(str(archives / "explicit.pt"))
-    served, rng = policy(archives / "explicit.pt"), np.random.default_rng(0)
+    served = policy(archives / "explicit.pt")
     assert (served.model.batched, served.contract.action.dim) == (True, 3)
     copies = AgentCopies(served)
-    sessions, hidden = [copies.make() for _ in range(32)], [torch.zeros(1, 1, 8) for _ in range(32)]
+    sessions = [copies.make() for _ in range(32)]
     for session in sessions:
         session.reset(Obs(), None)
+
+    rng = np.random.default_rng(0)
+    hidden = [torch.zeros(1, 1, 8) for _ in sessions]
     for _ in range(10):
-        seen = rng.normal(size=(32, 4)).astype(np.float32)
-        found = served.act_batch([Obs(state={"joints": one}) for one in seen], sessions)
-        for i, act in enumerate(found):
+        joints = rng.normal(size=(32, 4)).astype(np.float32)
+        observations = [Obs(state={"joints": row}) for row in joints]
+        for i, act in enumerate(served.act_batch(observations, sessions)):
             assert isinstance(act, Act)
             with torch.inference_mode():
-                wanted, hidden[i] = module(torch.from_numpy(seen[i : i + 1]), hidden[i])
-            np.testing.assert_allclose(act.action, wanted.numpy(), atol=1e-6)
+                expected, hidden[i] = module(torch.from_numpy(joints[i : i + 1]), hidden[i])
+            np.testing.assert_allclose(act.action, expected.numpy(), atol=1e-6)
 
 
 def test_a_suite_of_the_interface_accepts_it(archives: Path) -> None:
@@ -89,7 +92,7 @@ def test_a_suite_of_the_interface_accepts_it(archives: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "settings", "said"),
+    ("file", "settings", "message"),
     [
         (
             "explicit.pt",
@@ -118,10 +121,10 @@ def test_a_suite_of_the_interface_accepts_it(archives: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_served_is_refused_at_the_start(
-    archives: Path, file: str, settings: Any, said: str
+def test_an_archive_that_cannot_be_served_is_refused_at_the_start(
+    archives: Path, file: str, settings: Any, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         policy(archives / file, **settings)
 
 
