@@ -1,4 +1,4 @@
-"""The authors' own code, asked through the policy: the same actions, in any company, and with
+"""The authors' own code, called through the policy: the same actions, in any batch, and with
 compiled cores.
 """
 
@@ -36,19 +36,19 @@ KINDS = ["unet", "transformer", "image", "hybrid"]
 
 @pytest.fixture(scope="module")
 def policies(checkpoint: Checkpoint) -> Callable[[str], DiffusionPolicy]:
-    """The loaded policy of a kind, whole chunks."""
-    kept: dict[str, DiffusionPolicy] = {}
+    """Return a function that loads the policy of a kind once, with whole chunks."""
+    by_kind: dict[str, DiffusionPolicy] = {}
 
-    def of(kind: str) -> DiffusionPolicy:
-        if kind not in kept:
-            kept[kind] = loaded(checkpoint(kind), actions="chunk")
-        return kept[kind]
+    def load(kind: str) -> DiffusionPolicy:
+        if kind not in by_kind:
+            by_kind[kind] = loaded(checkpoint(kind), actions="chunk")
+        return by_kind[kind]
 
-    return of
+    return load
 
 
 class TorchDraws:
-    """Stands for a session's generator: draws as torch does after `torch.manual_seed(0)`."""
+    """Replaces a session's generator, and draws as torch does after `torch.manual_seed(0)`."""
 
     def __init__(self) -> None:
         import torch
@@ -70,22 +70,21 @@ def test_gives_what_the_authors_code_gives(
     policy = policies(kind)
     views = [seen(1), seen(2)]
     frames = tuple(policy.perceive(view) for view in views)
-    [found] = policy.predict([Row(frames, "", TorchDraws())])  # type: ignore[arg-type]
+    [prediction] = policy.predict([Row(frames, "", TorchDraws())])  # type: ignore[arg-type]
 
-    stacked: dict[str, np.ndarray] = {
-        "obs": np.stack([view.state["state"] for view in views])[None]
-    }
-    if kind in ("image", "hybrid"):
+    if kind in ("unet", "transformer"):
+        stacked = {"obs": np.stack([view.state["state"] for view in views])[None]}
+    else:
         pictures = np.stack([view.cameras["front"] for view in views]).astype(np.float32) / 255
         positions = np.stack([view.state["agent_pos"] for view in views])[None]
         stacked = {"image": np.moveaxis(pictures, -1, 1)[None], "agent_pos": positions}
     torch.manual_seed(0)
     monkeypatch.delattr(policy.model.module, "conditional_sample")  # ours, in the place of theirs
     with torch.no_grad():
-        wanted = policy.model.module.predict_action(
-            {name: torch.from_numpy(x) for name, x in stacked.items()}
+        expected = policy.model.module.predict_action(
+            {name: torch.from_numpy(array) for name, array in stacked.items()}
         )
-    np.testing.assert_allclose(found.actions, wanted["action"][0].numpy(), atol=ATOL)
+    np.testing.assert_allclose(prediction.actions, expected["action"][0].numpy(), atol=ATOL)
 
 
 @pytest.mark.parametrize("kind", ["unet", "image"])
@@ -102,8 +101,8 @@ def test_a_session_gets_the_same_in_any_company(
     views = [seen(i) for i in range(8)]
     alone = [begun(policy, seed=i).act(view).action for i, view in enumerate(views)]
     for size in (2, 3, 8):
-        company = [begun(policy, seed=i) for i in range(size)]
-        for i, act in enumerate(policy.act_batch(views[:size], company)):
+        sessions = [begun(policy, seed=i) for i in range(size)]
+        for i, act in enumerate(policy.act_batch(views[:size], sessions)):
             np.testing.assert_allclose(act.action, alone[i], atol=ATOL)
     assert np.ptp(np.stack(alone), axis=0).min() > 100 * ATOL  # eight answers, not one
 
@@ -115,9 +114,9 @@ def test_an_image_of_another_size_is_made_as_the_authors_make_it(
     from diffusion_policy.real_world.real_inference_util import get_real_obs_dict
 
     shapes = {"obs": {"image": {"shape": [3, 48, 48], "type": "rgb"}}}
-    wanted = get_real_obs_dict({"image": view.cameras["front"][None]}, shapes)["image"][0]
-    found = policy.perceive(view)["image"]
-    np.testing.assert_array_equal(np.moveaxis(found, -1, 0).astype(np.float32) / 255, wanted)
+    expected = get_real_obs_dict({"image": view.cameras["front"][None]}, shapes)["image"][0]
+    image = policy.perceive(view)["image"]
+    np.testing.assert_array_equal(np.moveaxis(image, -1, 0).astype(np.float32) / 255, expected)
 
 
 def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
@@ -131,7 +130,7 @@ def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_acts_with_pushed_weights(kind: str, checkpoint: Checkpoint) -> None:
     policy = loaded(checkpoint(kind))  # of this test alone
-    # Those of the authors' training.
+    # The names are those of the authors' training.
     assert policy.parameters().keys() == policy.model.module.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(seen(0)).action)
 
@@ -147,54 +146,56 @@ def test_a_missing_camera_fails_its_own_session_alone(
     assert not isinstance(good, Exception)
 
 
-# A step from noise, and what is seen in images.
+# How many cores each kind has: a denoising step, and the image encoder if there are images.
 CORES = {"unet": 1, "transformer": 1, "image": 2, "hybrid": 2}
 SIZE = 3
 
 
 @pytest.fixture(scope="module")
 def compiler() -> Iterator[CountingCompiler]:
-    with counting_compiler() as made:
-        yield made
+    with counting_compiler() as counting:
+        yield counting
 
 
 @pytest.fixture(scope="module", params=CORES)
 def both(
     request: pytest.FixtureRequest, checkpoint: Checkpoint, compiler: CountingCompiler
 ) -> tuple[DiffusionPolicy, DiffusionPolicy]:
-    """A policy, and the same one compiled."""
-    file, before = checkpoint(request.param), len(compiler.rows)
+    """Load a policy, and the same one with compiled cores."""
+    file, programs = checkpoint(request.param), len(compiler.rows)
     compiled = loaded(file, actions="chunk", compile="require", batch_sizes=[SIZE])
-    assert compiler.rows[before:] == [SIZE] * CORES[request.param]
+    assert compiler.rows[programs:] == [SIZE] * CORES[request.param]
     return loaded(file, actions="chunk"), compiled
 
 
 def acts(policy: DiffusionPolicy, views: list[Obs]) -> list[Act]:
-    found = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
-    assert all(isinstance(act, Act) for act in found)
-    return found  # type: ignore[return-value]
+    results = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
+    assert all(isinstance(act, Act) for act in results)
+    return results  # type: ignore[return-value]
 
 
 def test_batches_of_any_size_are_those_without_compilation(
     both: tuple[DiffusionPolicy, DiffusionPolicy], compiler: CountingCompiler
 ) -> None:
-    made = len(compiler.rows)
+    programs = len(compiler.rows)
     for size in (1, 2, SIZE, SIZE + 1):
-        before = compiler.calls
+        calls = compiler.calls
         plain, compiled = (acts(policy, [seen(i) for i in range(size)]) for policy in both)
-        for one, other in zip(plain, compiled, strict=True):
-            np.testing.assert_allclose(one.action, other.action, atol=ATOL)
-        assert compiler.calls > before
-    assert len(compiler.rows) == made
+        for expected, act in zip(plain, compiled, strict=True):
+            np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
+        assert compiler.calls > calls
+    assert len(compiler.rows) == programs
 
 
 def test_samples_are_those_without_compilation(
     both: tuple[DiffusionPolicy, DiffusionPolicy], compiler: CountingCompiler
 ) -> None:
-    made = len(compiler.rows)
+    programs = len(compiler.rows)
     views = [seen(0), seen(1, **{SAMPLES: 2})]
-    for one, other in zip(*(acts(policy, views) for policy in both), strict=True):
-        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+    plain, compiled = (acts(policy, views) for policy in both)
+    for expected, act in zip(plain, compiled, strict=True):
+        np.testing.assert_allclose(act.action, expected.action, atol=ATOL)
+
     samples = [acts(policy, views)[1].info[DISTRIBUTION]["samples"] for policy in both]
     np.testing.assert_allclose(*samples, atol=ATOL)
-    assert len(compiler.rows) == made
+    assert len(compiler.rows) == programs

@@ -40,7 +40,7 @@ UNET = {"diffusion_step_embed_dim": 16, "down_dims": [16, 32], "kernel_size": 3,
 def save(
     folder: Path, kind: str = "unet", *, normalizer: bool = True, use_ema: bool = True
 ) -> Path:
-    """Write `folder`/checkpoints/latest.ckpt as the workspaces of the training do; returns the
+    """Write `folder`/checkpoints/latest.ckpt as the workspaces of the training do, and return the
     file.
     """
     ensure_torchvision()
@@ -50,7 +50,7 @@ def save(
     from diffusion_policy.workspace.base_workspace import BaseWorkspace
     from omegaconf import OmegaConf
 
-    # The models are too small for more: threads would wait for one another.
+    # The models are too small for several threads, which would wait for one another.
     torch.set_num_threads(1)
     torch.manual_seed(0)
     settings = OmegaConf.create(
@@ -82,7 +82,8 @@ def _policy(kind: str) -> dict[str, Any]:
             **UNET,
         }
         target = module.format("unet_lowdim", "UnetLowdim")
-        own = {"model": model, "obs_dim": OBS, "action_dim": ACTION, "obs_as_global_cond": True}
+        settings = {"obs_dim": OBS, "action_dim": ACTION, "obs_as_global_cond": True}
+        specific = {"model": model, **settings}
     elif kind == "transformer":
         model = {
             "_target_": "diffusion_policy.model.diffusion.transformer_for_diffusion.TransformerForDiffusion",
@@ -98,7 +99,8 @@ def _policy(kind: str) -> dict[str, Any]:
             "obs_as_cond": True,
         }
         target = module.format("transformer_lowdim", "TransformerLowdim")
-        own = {"model": model, "obs_dim": OBS, "action_dim": ACTION, "obs_as_cond": True}
+        settings = {"obs_dim": OBS, "action_dim": ACTION, "obs_as_cond": True}
+        specific = {"model": model, **settings}
     elif kind == "image":
         encoder = {
             "_target_": "diffusion_policy.model.vision.multi_image_obs_encoder.MultiImageObsEncoder",
@@ -114,12 +116,12 @@ def _policy(kind: str) -> dict[str, Any]:
             "imagenet_norm": True,
         }
         target = module.format("unet_image", "UnetImage")
-        own = {"obs_encoder": encoder, "shape_meta": SHAPES, **UNET}
+        specific = {"obs_encoder": encoder, "shape_meta": SHAPES, **UNET}
     else:
         target = module.format("unet_hybrid_image", "UnetHybridImage")
         crop = {"crop_shape": [40, 40], "eval_fixed_crop": kind == "hybrid"}
-        own = {"shape_meta": SHAPES, "obs_encoder_group_norm": True, **crop, **UNET}
-    return {"_target_": target, **common, **own}
+        specific = {"shape_meta": SHAPES, "obs_encoder_group_norm": True, **crop, **UNET}
+    return {"_target_": target, **common, **specific}
 
 
 def _normalizer(kind: str) -> Any:

@@ -1,4 +1,4 @@
-"""NVIDIA's own code, asked through the policy: the actions of `Gr00tPolicy`, in any company."""
+"""NVIDIA's own code, called through the policy: the actions of `Gr00tPolicy`, in any batch."""
 
 from __future__ import annotations
 
@@ -36,20 +36,21 @@ ROBOTS = {"relative": "new_embodiment", "libero": tiny.LIBERO, "history": "new_e
 
 
 def view(number: int, kind: str = "relative", size: tuple[int, int] = (72, 96), **info: Any) -> Obs:
-    """What session `number` sees."""
+    """Return the observation of session `number`."""
     rng = np.random.default_rng(number)
     names = ("front", "wrist") if kind == "libero" else ("ego_view",)
     images = {name: rng.integers(0, 256, (*size, 3), dtype=np.uint8) for name in names}
-    widths = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1) | {"gripper_qpos": 2}
-    state = {
-        name: rng.uniform(-0.5, 0.5, width).astype(np.float32)
-        for name, width in (widths if kind == "libero" else {"arm": 5}).items()
-    }
+    widths = {"arm": 5}
+    if kind == "libero":
+        widths = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1) | {"gripper_qpos": 2}
+    state = {}
+    for name, width in widths.items():
+        state[name] = rng.uniform(-0.5, 0.5, width).astype(np.float32)
     return Obs(images, None if kind == "libero" else float(rng.uniform()), state, info)
 
 
 def begun(policy: Gr00t, number: int = 0, kind: str = "relative") -> Gr00t:
-    """Session `number` of a loaded policy, whose seed is its number."""
+    """Begin session `number` of a loaded policy, with its number as the seed."""
     session = copy.copy(policy)
     session.reset(view(number, kind), TASKS[number % 3], seed=number)
     return session
@@ -67,11 +68,8 @@ class Theirs:
         with built_without_flash_attention():
             self.policy = gr00t_policy.Gr00tPolicy(EmbodimentTag(robot), str(folder), device="cpu")
             if dtype != torch.bfloat16:  # to which the class rounds weights, buffers and inputs
-                model = (
-                    gr00t_policy.AutoModel.from_pretrained(folder, torch_dtype=dtype)
-                    .to(dtype)
-                    .eval()
-                )
+                model = gr00t_policy.AutoModel.from_pretrained(folder, torch_dtype=dtype)
+                model = model.to(dtype).eval()
                 model.load_state_dict(load_file(folder / "model.safetensors"), strict=False)
                 self.policy.model = model
                 patch.setattr(gr00t_policy, "_rec_to_dtype", lambda value, **_: value)
@@ -79,23 +77,21 @@ class Theirs:
             stand_in(patch, self.policy.model)
 
     def act(self, frames: list[Obs], kind: str, task: str) -> np.ndarray:
-        """The chunk of one robot, (horizon, D), of frames at each moment that the model reads."""
+        """Return the chunk of one robot, (horizon, D), for the frames that the model reads."""
         configs, last = self.policy.modality_configs, frames[-1]
         cameras = dict(zip(configs["video"].modality_keys, last.cameras, strict=True))
         state = {**last.state, "gripper": np.float32([last.gripper or 0])}
         if kind == "libero":
             state["gripper"] = last.state["gripper_qpos"]
-        found, _ = self.policy.get_action(
-            {
-                "video": {
-                    key: np.stack([one.cameras[ours] for one in frames])[None]
-                    for key, ours in cameras.items()
-                },
-                "state": {key: state[key][None, None] for key in configs["state"].modality_keys},
-                "language": {configs["language"].modality_keys[0]: [[task]]},
-            }
+        videos = {}
+        for key, camera in cameras.items():
+            videos[key] = np.stack([frame.cameras[camera] for frame in frames])[None]
+        states = {key: state[key][None, None] for key in configs["state"].modality_keys}
+        language = {configs["language"].modality_keys[0]: [[task]]}
+        actions, _ = self.policy.get_action(
+            {"video": videos, "state": states, "language": language}
         )
-        return np.concatenate([found[key][0] for key in configs["action"].modality_keys], axis=-1)
+        return np.concatenate([actions[key][0] for key in configs["action"].modality_keys], axis=-1)
 
 
 @pytest.fixture
@@ -110,7 +106,7 @@ def upstream(
 
 
 def draws_of(number: int) -> np.random.Generator:
-    """What session `number` draws from, as a copy."""
+    """Return a copy of the generator of session `number`."""
     return np.random.default_rng([0, number])
 
 
@@ -128,10 +124,10 @@ def test_its_actions_are_theirs_from_the_same_seed(
     for number in (0, 1):
         ours = begun(policy, number, kind).act(view(number, kind)).action
         torch.manual_seed(int(draws_of(number).integers(2**63)))
-        wanted = theirs.act([view(number, kind)], kind, TASKS[number])
-        np.testing.assert_allclose(ours, wanted, atol=ATOL)
-        assert wanted.shape == (tiny.HORIZON, 6 if kind == "relative" else 7)
-        assert wanted.std(axis=0).min() > 10 * ATOL  # no column is the bound of what it may be
+        expected = theirs.act([view(number, kind)], kind, TASKS[number])
+        np.testing.assert_allclose(ours, expected, atol=ATOL)
+        assert expected.shape == (tiny.HORIZON, 6 if kind == "relative" else 7)
+        assert expected.std(axis=0).min() > 10 * ATOL  # no column is clipped to its bound
 
 
 @pytest.mark.verifies("parity")
@@ -139,11 +135,11 @@ def test_earlier_frames_are_theirs(policy_of: Policy, upstream: Callable[..., Th
     policy, theirs = policy_of("history"), upstream("history")
     assert policy.contract.history == 3
     frames, session = [view(number) for number in (0, 3, 6)], begun(policy)
-    for moment, seen in enumerate(frames):
+    for step, obs in enumerate(frames):
         draws = copy.deepcopy(session.episode.rng)
         torch.manual_seed(int(draws.integers(2**63)))
-        wanted = theirs.act([frames[max(0, moment - 2)], seen], "history", TASKS[0])
-        np.testing.assert_allclose(session.act(seen).action, wanted, atol=ATOL)
+        expected = theirs.act([frames[max(0, step - 2)], obs], "history", TASKS[0])
+        np.testing.assert_allclose(session.act(obs).action, expected, atol=ATOL)
 
 
 @pytest.mark.verifies("parity")
@@ -152,17 +148,17 @@ def test_in_bfloat16_its_actions_are_those_of_their_class_as_it_is(
 ) -> None:
     policy, theirs = policy_of("relative", dtype="bfloat16"), upstream("relative", torch.bfloat16)
     ours = begun(policy).act(view(0)).action
-    with RowDraws([draws_of(0)]):  # torch's own numbers of a seed are others in bfloat16
-        wanted = theirs.act([view(0)], "relative", TASKS[0])
-    # Of 2, the width of an action's range; its steps are of 2**-8.
-    np.testing.assert_allclose(ours, wanted, atol=0.05)
-    other = begun(policy, 3).act(view(3)).action
-    assert np.abs(other - wanted).max() > 0.3
+    with RowDraws([draws_of(0)]):  # torch itself draws different numbers in bfloat16
+        expected = theirs.act([view(0)], "relative", TASKS[0])
+    # The range of an action is 2 wide, and bfloat16 has steps of 2**-8 in it.
+    np.testing.assert_allclose(ours, expected, atol=0.05)
+    different = begun(policy, 3).act(view(3)).action
+    assert np.abs(different - expected).max() > 0.3
 
 
 def test_it_acts_with_pushed_weights(policy_of: Policy) -> None:
     policy = policy_of("relative", seed=1)  # of this test alone
-    # Those of NVIDIA's trainer.
+    # The names are those of NVIDIA's trainer.
     assert policy.parameters().keys() == policy.model.model.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(view(0)).action)
 
@@ -170,17 +166,15 @@ def test_it_acts_with_pushed_weights(policy_of: Policy) -> None:
 @pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", ["relative", "history"])
 def test_a_session_gets_the_same_in_any_company(policy_of: Policy, kind: str) -> None:
-    """Those of other tasks have prompts of other lengths, those of other sizes more tokens of an
-    image.
-    """
+    """Different tasks have prompts of different lengths, and larger images have more tokens."""
     policy = policy_of(kind)
     views = [view(0), view(1), view(2), view(3, size=(48, 120)), view(4), view(5)]
-    alone = [begun(policy, number).act(one).action for number, one in enumerate(views)]
-    for company in ([1, 0], [2, 3, 4], [5, 4, 3, 2, 1, 0]):
+    alone = [begun(policy, number).act(obs).action for number, obs in enumerate(views)]
+    for batch in ([1, 0], [2, 3, 4], [5, 4, 3, 2, 1, 0]):
         acts = policy.act_batch(
-            [views[number] for number in company], [begun(policy, number) for number in company]
+            [views[number] for number in batch], [begun(policy, number) for number in batch]
         )
-        for number, act in zip(company, acts, strict=True):
+        for number, act in zip(batch, acts, strict=True):
             assert isinstance(act, Act), act
             np.testing.assert_allclose(act.action, alone[number], atol=ATOL)
     assert np.ptp(np.stack(alone), axis=0).mean() > 100 * ATOL  # six answers, not one
@@ -190,15 +184,18 @@ def test_a_session_gets_the_same_in_any_company(policy_of: Policy, kind: str) ->
 def test_rows_share_a_pass_unless_padding_would_change_them(
     policy_of: Policy, monkeypatch: pytest.MonkeyPatch, kind: str, sizes: list[int]
 ) -> None:
-    policy, found = policy_of(kind), list[int]()
+    policy, rows_of_passes = policy_of(kind), list[int]()
     model = policy.model.model
-    act = model.get_action
-    monkeypatch.setattr(
-        model, "get_action", lambda inputs: found.append(len(inputs["state"])) or act(inputs)
-    )
+    get_action = model.get_action
+
+    def counting(inputs: Any) -> Any:
+        rows_of_passes.append(len(inputs["state"]))
+        return get_action(inputs)
+
+    monkeypatch.setattr(model, "get_action", counting)
     sessions = [begun(policy, number) for number in (0, 1, 3, 4, 6)]  # TASKS[0], [1], [0], [1], [0]
     policy.act_batch([view(number) for number in range(5)], sessions)
-    assert sorted(found) == ([2, 3] if tiny.N17 else sizes)  # N1.7 attends to padding
+    assert sorted(rows_of_passes) == ([2, 3] if tiny.N17 else sizes)  # N1.7 attends to padding
 
 
 @pytest.mark.verifies("isolation")
@@ -213,14 +210,14 @@ def test_a_missing_camera_fails_its_own_session_alone(policy_of: Policy) -> None
 
 @pytest.mark.verifies("isolation")
 def test_a_neighbour_changes_no_action(policy_of: Policy) -> None:
-    policy, found = policy_of("relative"), []
-    for other in (view(2), view(3, size=(50, 90), **{SAMPLES: 3})):
+    policy, actions = policy_of("relative"), []
+    for neighbour_obs in (view(2), view(3, size=(50, 90), **{SAMPLES: 3})):
         session, neighbour = begun(policy, 1), begun(policy, 4)
-        policy.act_batch([view(1), other], [session, neighbour])
-        [_, act] = policy.act_batch([other, view(5)], [neighbour, session])
+        policy.act_batch([view(1), neighbour_obs], [session, neighbour])
+        [_, act] = policy.act_batch([neighbour_obs, view(5)], [neighbour, session])
         assert isinstance(act, Act)
-        found.append(act.action)
-    np.testing.assert_allclose(*found, atol=ATOL)
+        actions.append(act.action)
+    np.testing.assert_allclose(*actions, atol=ATOL)
 
 
 def test_samples_are_draws_of_their_own(policy_of: Policy) -> None:
@@ -232,26 +229,22 @@ def test_samples_are_draws_of_their_own(policy_of: Policy) -> None:
 
 
 def test_the_checkpoints_metadata_are_the_contract(policy_of: Policy) -> None:
-    relative, libero = (
-        policy_of("relative").contract,
-        policy_of("libero", embodiment=tiny.LIBERO).contract,
-    )
-    stated = Trained.from_statistics(policy_of("relative").statistics)
-    assert stated.parts == ("arm", "gripper")
-    assert stated.state is not None
-    assert [len(low) for low in stated.state] == [6, 6]
+    trained = Trained.from_statistics(policy_of("relative").statistics)
+    assert trained.parts == ("arm", "gripper")
+    assert trained.state is not None
+    assert [len(bound) for bound in trained.state] == [6, 6]
+
+    relative = policy_of("relative").contract
     assert relative.cameras == {"ego_view": CameraSpec()}
-    assert (relative.state, relative.gripper, relative.instruction) == (
-        {"arm": StateSpec(5)},
-        True,
-        True,
-    )
+    assert relative.state == {"arm": StateSpec(5)}
+    assert (relative.gripper, relative.instruction) == (True, True)
     assert relative.action == ActionSpec(dim=6, space="joint", delta=False)
     assert (relative.chunk, relative.history) == (tiny.HORIZON, 1)
+
+    libero = policy_of("libero", embodiment=tiny.LIBERO).contract
     assert set(libero.cameras) == {"front", "wrist"}
-    assert libero.state == dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), StateSpec(1)) | {
-        "gripper_qpos": StateSpec(2)
-    }
+    pose = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), StateSpec(1))
+    assert libero.state == pose | {"gripper_qpos": StateSpec(2)}
     assert (libero.gripper, libero.action) == (False, ActionSpec(dim=7))
 
 
@@ -264,24 +257,24 @@ def test_parts_of_a_state_with_other_names_are_set(
         "source_dir": str(checkout),
         "embodiment": tiny.LIBERO,
     }
-    other = Gr00t.from_config({**settings, "state": ["xyz_axis_angle", "gripper_qpos"]})
-    other.model = policy.model
-    seen = view(0, "libero")
-    pose = np.concatenate([seen.state[axis] for axis in ("x", "y", "z", "roll", "pitch", "yaw")])
-    named = Obs(
-        seen.cameras, None, {"xyz_axis_angle": pose, "gripper_qpos": seen.state["gripper_qpos"]}
-    )
-    ours = begun(policy, 0, "libero").act(seen).action
-    session = copy.copy(other)
-    session.reset(named, TASKS[0], seed=0)
-    np.testing.assert_allclose(session.act(named).action, ours, atol=ATOL)
+    renamed = Gr00t.from_config({**settings, "state": ["xyz_axis_angle", "gripper_qpos"]})
+    renamed.model = policy.model
+
+    obs = view(0, "libero")
+    pose = np.concatenate([obs.state[axis] for axis in ("x", "y", "z", "roll", "pitch", "yaw")])
+    state = {"xyz_axis_angle": pose, "gripper_qpos": obs.state["gripper_qpos"]}
+    renamed_obs = Obs(obs.cameras, None, state)
+    expected = begun(policy, 0, "libero").act(obs).action
+    session = copy.copy(renamed)
+    session.reset(renamed_obs, TASKS[0], seed=0)
+    np.testing.assert_allclose(session.act(renamed_obs).action, expected, atol=ATOL)
 
 
 def test_the_whole_folder_is_the_policys_identity(
     checkpoint: Checkpoint, checkout: Path, tmp_path: Path
 ) -> None:
-    """Also where the processor's files are in a folder of their own, as the training of N1.7
-    leaves them.
+    """This includes the processor's files in a separate folder, where the training of N1.7 saves
+    them.
     """
     folder = Path(shutil.copytree(checkpoint("relative"), tmp_path / "trained"))
     (folder / "processor").mkdir()
@@ -305,6 +298,6 @@ def test_packed_images_do_not_see_each_other(lengths: list[int]) -> None:
         3, 1, 2, sum(lengths), 8, generator=torch.Generator().manual_seed(0)
     )
     image = torch.repeat_interleave(torch.arange(3), torch.tensor(lengths))
-    wanted = attend(query, key, value, 0.3, image[:, None] == image[None, :]).transpose(1, 2)
-    found, _ = packed_attention(None, query, key, value, scaling=0.3, seq_len_list=lengths)
-    torch.testing.assert_close(found, wanted)
+    expected = attend(query, key, value, 0.3, image[:, None] == image[None, :]).transpose(1, 2)
+    attended, _ = packed_attention(None, query, key, value, scaling=0.3, seq_len_list=lengths)
+    torch.testing.assert_close(attended, expected)

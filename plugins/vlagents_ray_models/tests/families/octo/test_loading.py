@@ -1,4 +1,4 @@
-"""What of a checkpoint or its settings does not fit is said before anything is served."""
+"""Checkpoints and settings that do not fit are errors before anything is served."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_settings_that_do_not_fit_the_checkpoint(
         load(pretrained, **config)
 
 
-def test_a_checkpoint_that_reads_a_state_wants_its_parts(finetuned: Path) -> None:
+def test_a_checkpoint_that_reads_a_state_needs_its_parts(finetuned: Path) -> None:
     with pytest.raises(ConfigError, match="reads a state of 3 numbers"):
         load(finetuned, dataset=None)
 
@@ -126,7 +126,7 @@ def test_images_are_as_octos_own_wrapper_makes_them(
             self.spaces = spaces
 
     spaces = types.SimpleNamespace(Dict=Dict, Box=lambda **_: None)
-    gym: Any = types.ModuleType("gym")  # of which Octo's wrapper uses just this
+    gym: Any = types.ModuleType("gym")  # with the names that Octo's wrapper uses
     gym.Wrapper = gym.ObservationWrapper = Wrapper
     gym.spaces, gym.Env, gym.Space = spaces, object, object
     monkeypatch.setitem(sys.modules, "gym", gym)
@@ -136,31 +136,25 @@ def test_images_are_as_octos_own_wrapper_makes_them(
     env = types.SimpleNamespace(observation_space=Dict({}))
     wrapper = ResizeImageWrapper(env, {"primary": (256, 256), "wrist": (128, 128)})
     rng = np.random.default_rng(0)
-    images = {
-        f"image_{name}": rng.integers(0, 256, (90, 160, 3), np.uint8)
-        for name in ("primary", "wrist")
-    }
-    wanted = wrapper.observation(dict(images))
-    assert np.array_equal(
-        resized(images["image_primary"], 256, 256, crop=True), wanted["image_primary"]
-    )
-    assert np.array_equal(
-        resized(images["image_wrist"], 128, 128, crop=False), wanted["image_wrist"]
-    )
+    front = rng.integers(0, 256, (90, 160, 3), np.uint8)
+    wrist = rng.integers(0, 256, (90, 160, 3), np.uint8)
+    expected = wrapper.observation({"image_primary": front, "image_wrist": wrist})
+    assert np.array_equal(resized(front, 256, 256, crop=True), expected["image_primary"])
+    assert np.array_equal(resized(wrist, 128, 128, crop=False), expected["image_wrist"])
 
 
-def test_an_image_of_the_right_size_is_kept_as_it_is_in_memory_of_its_own() -> None:
+def test_an_image_of_the_right_size_is_copied() -> None:
     image = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
-    kept = resized(image, 128, 128, crop=False)
-    assert np.array_equal(kept, image)
-    assert not np.shares_memory(kept, image)
+    copied = resized(image, 128, 128, crop=False)
+    assert np.array_equal(copied, image)
+    assert not np.shares_memory(copied, image)
 
 
-def test_bounds_are_turned_back_into_units() -> None:
+def test_normalised_bounds_are_converted_to_units() -> None:
     statistics = {
         "p01": np.array([-2.0, 0.0]),
         "p99": np.array([4.0, 1.0]),
         "mask": np.array([True, False]),
     }
-    found = real_actions(np.array([[-1.0, 0.7], [1.0, 0.2]]), statistics, "bounds")
-    np.testing.assert_allclose(found, [[-2.0, 0.7], [4.0, 0.2]])
+    actions = real_actions(np.array([[-1.0, 0.7], [1.0, 0.2]]), statistics, "bounds")
+    np.testing.assert_allclose(actions, [[-2.0, 0.7], [4.0, 0.2]])

@@ -1,4 +1,4 @@
-"""Octo's own code, asked through the policy: the same actions, in any company."""
+"""Octo's own code, called through the policy: the same actions, in any batch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vlagents_ray_models.octo import Octo
 
 pytestmark = MARKS
 
-# float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs.
+# float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify differences.
 ATOL = 1e-4
 INSTRUCTIONS = ["pick up the cube", "push the cube", "open the drawer"]
 
@@ -40,8 +40,10 @@ def policy(pretrained: Path) -> Octo:
 
 def seen(seed: int, size: tuple[int, int] = (48, 64), **info: Any) -> Obs:
     rng = np.random.default_rng(seed)
-    image = lambda: rng.integers(0, 256, (*size, 3), dtype=np.uint8)  # noqa: E731 - a line, used twice
-    return Obs(cameras={"front": image(), "wrist": image()}, info=info)
+    cameras = {}
+    for name in ("front", "wrist"):
+        cameras[name] = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    return Obs(cameras=cameras, info=info)
 
 
 def begun(policy: Octo, obs: Obs, instruction: str | None = "push the cube", seed: int = 0) -> Octo:
@@ -53,19 +55,20 @@ def begun(policy: Octo, obs: Obs, instruction: str | None = "push the cube", see
 def upstream(
     policy: Octo, frames: list[Obs], mask: list[bool], tasks: dict[str, Any], seed: int
 ) -> np.ndarray:
-    """What Octo's `sample_actions` gives for one robot, with the key that a session of this seed
-    draws first.
+    """Return the result of Octo's `sample_actions` for one robot, with the key that a session of
+    this seed draws first.
     """
-    model, perceived = policy.model.model, [policy.perceive(obs) for obs in frames]
-    observations = {
-        name: np.stack([frame[name] for frame in perceived])[None] for name in perceived[0]
-    }
+    perceived = [policy.perceive(obs) for obs in frames]
+    observations = {}
+    for name in perceived[0]:
+        observations[name] = np.stack([frame[name] for frame in perceived])[None]
     observations["timestep_pad_mask"] = np.array([mask])
     key = np.random.default_rng([0, seed]).integers(2**32, size=2, dtype=np.uint32)
     statistics = policy.model.statistics(policy.config.dataset, "action")
-    return np.asarray(
-        model.sample_actions(observations, tasks, unnormalization_statistics=statistics, rng=key)[0]
+    actions = policy.model.model.sample_actions(
+        observations, tasks, unnormalization_statistics=statistics, rng=key
     )
+    return np.asarray(actions[0])
 
 
 def test_keeps_the_contract(pretrained: Path) -> None:
@@ -77,28 +80,24 @@ def test_an_instruction_gives_what_octo_gives_and_only_real_frames_count(policy:
     first, second = seen(1), seen(2)
     tasks = policy.model.model.create_tasks(texts=["push the cube"])
     session = begun(policy, first, seed=5)
-    wanted = upstream(policy, [first, first], [False, True], tasks, seed=5)
-    np.testing.assert_allclose(session.act(first).action, wanted, atol=ATOL)
+    expected = upstream(policy, [first, first], [False, True], tasks, seed=5)
+    np.testing.assert_allclose(session.act(first).action, expected, atol=ATOL)
 
-    moved = begun(policy, first, seed=6)
-    moved.observe(first)
-    wanted = upstream(policy, [first, second], [True, True], tasks, seed=6)
-    np.testing.assert_allclose(moved.act(second).action, wanted, atol=ATOL)
+    later = begun(policy, first, seed=6)
+    later.observe(first)
+    expected = upstream(policy, [first, second], [True, True], tasks, seed=6)
+    np.testing.assert_allclose(later.act(second).action, expected, atol=ATOL)
 
 
 @pytest.mark.verifies("parity")
 def test_a_goal_image_gives_what_octo_gives(policy: Octo) -> None:
     goal = seen(9).cameras["front"]
     obs = seen(1, **{GOAL_IMAGE: goal})
-    as_seen = policy.perceive(Obs(cameras={"front": goal, "wrist": goal}))["image_primary"]
-    wanted = upstream(
-        policy,
-        [obs, obs],
-        [False, True],
-        policy.model.model.create_tasks(goals={"image_primary": as_seen[None]}),
-        3,
-    )
-    np.testing.assert_allclose(begun(policy, obs, None, seed=3).act(obs).action, wanted, atol=ATOL)
+    resized_goal = policy.perceive(Obs(cameras={"front": goal, "wrist": goal}))["image_primary"]
+    tasks = policy.model.model.create_tasks(goals={"image_primary": resized_goal[None]})
+    expected = upstream(policy, [obs, obs], [False, True], tasks, 3)
+    action = begun(policy, obs, None, seed=3).act(obs).action
+    np.testing.assert_allclose(action, expected, atol=ATOL)
 
 
 @pytest.mark.verifies("batches")
@@ -111,21 +110,20 @@ def test_a_session_gets_the_same_in_any_company(policy: Octo) -> None:
 
     alone = [session.act(view).action for session, view in zip(sessions(8), views, strict=True)]
     for size in (2, 3, 8):
-        company = sessions(size)
-        for i, act in enumerate(policy.act_batch(views[:size], company)):
+        for i, act in enumerate(policy.act_batch(views[:size], sessions(size))):
             np.testing.assert_allclose(act.action, alone[i], atol=ATOL)
     assert np.ptp(np.stack(alone), axis=0).mean() > 100 * ATOL  # eight answers, not one
 
 
 def test_samples_are_draws_of_their_own(policy: Octo) -> None:
-    plain, asked = begun(policy, seen(1)), begun(policy, seen(1))
-    wanted = plain.act(seen(1)).action
-    act = asked.act(seen(1, **{SAMPLES: 10}))
-    np.testing.assert_allclose(act.action, wanted, atol=ATOL)
-    found = act.info[DISTRIBUTION]
-    assert found["samples"].shape == (10, 4, 7)
-    assert found["std"].mean() > 100 * ATOL
-    np.testing.assert_allclose(found["mean"], found["samples"].mean(0), atol=ATOL)
+    expected = begun(policy, seen(1)).act(seen(1)).action
+    act = begun(policy, seen(1)).act(seen(1, **{SAMPLES: 10}))
+    np.testing.assert_allclose(act.action, expected, atol=ATOL)
+
+    distribution = act.info[DISTRIBUTION]
+    assert distribution["samples"].shape == (10, 4, 7)
+    assert distribution["std"].mean() > 100 * ATOL
+    np.testing.assert_allclose(distribution["mean"], distribution["samples"].mean(0), atol=ATOL)
 
 
 def test_a_camera_that_is_left_out_has_no_tokens_as_in_octo(pretrained: Path) -> None:
@@ -133,8 +131,8 @@ def test_a_camera_that_is_left_out_has_no_tokens_as_in_octo(pretrained: Path) ->
     policy.initialize()
     obs = Obs(cameras={"front": seen(1).cameras["front"]})
     tasks = policy.model.model.create_tasks(texts=["push the cube"])
-    wanted = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
-    np.testing.assert_allclose(begun(policy, obs).act(obs).action, wanted, atol=ATOL)
+    expected = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
+    np.testing.assert_allclose(begun(policy, obs).act(obs).action, expected, atol=ATOL)
 
 
 def test_a_finetuned_checkpoint_reads_the_state(finetuned: Path) -> None:
@@ -144,14 +142,15 @@ def test_a_finetuned_checkpoint_reads_the_state(finetuned: Path) -> None:
     assert contract.state is not None
     assert contract.state["joints"].dim == 3
     assert list(contract.cameras or {}) == ["front"]
+
     obs = Obs(
         cameras={"front": seen(1).cameras["front"]},
         state={"joints": np.array([2, 1, -4], np.float32)},
     )
     np.testing.assert_allclose(policy.perceive(obs)["proprio"], [1, 0, -3], atol=1e-6)
     tasks = policy.model.model.create_tasks(texts=["push the cube"])
-    wanted = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
-    np.testing.assert_allclose(begun(policy, obs).act(obs).action, wanted, atol=ATOL)
+    expected = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
+    np.testing.assert_allclose(begun(policy, obs).act(obs).action, expected, atol=ATOL)
 
 
 @pytest.mark.parametrize(
@@ -185,13 +184,13 @@ def test_no_act_compiles_a_program(pretrained: Path) -> None:
     policy = made(pretrained, batch_sizes=[1, 2, 4])
     policy.initialize()
     batches: list[list[dict[str, Any]]] = [[{}] * count for count in range(1, 7)]
-    batches += [[{SAMPLES: count}, *[{}] * others] for count in (1, 2, 3, 5) for others in range(3)]
+    for samples in (1, 2, 3, 5):
+        batches += [[{SAMPLES: samples}, *[{}] * neighbours] for neighbours in range(3)]
     with jax_compiles() as compiled:
         for batch in batches:
             views = [seen(i, **info) for i, info in enumerate(batch)]
-            acts = policy.act_batch(
-                views, [begun(policy, view, seed=i) for i, view in enumerate(views)]
-            )
+            sessions = [begun(policy, view, seed=i) for i, view in enumerate(views)]
+            acts = policy.act_batch(views, sessions)
             assert all(isinstance(act, Act) for act in acts)
     assert compiled == []
 
@@ -201,7 +200,7 @@ def test_it_acts_with_pushed_weights(pretrained: Path) -> None:
 
     policy = made(pretrained, batch_sizes=[1])
     policy.initialize()
-    # Those of OctoModel.
+    # The names are those of OctoModel.
     assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()
     obs = seen(1)
     check_pushed_weights(policy, lambda: begun(policy, obs).act(obs).action)

@@ -26,7 +26,7 @@ ACTION = {
 
 def save(folder: Path, kind: str = "pretrained", head: str = "DiffusionActionHead") -> Path:
     """Write the checkpoint of step 7, with the language encoder's configuration and tokenizer
-    beside it.
+    next to it.
     """
     model_class = octo_model_class(None)
     from octo.data.utils.text_processing import HFTokenizer
@@ -53,7 +53,9 @@ def save(folder: Path, kind: str = "pretrained", head: str = "DiffusionActionHea
 
 
 def _language(folder: Path) -> Path:
-    """Configuration and tokenizer of a T5 of 32 dimensions; its weights are the policy's own."""
+    """Write configuration and tokenizer of a T5 of 32 dimensions, whose weights are the policy's
+    own.
+    """
     from tokenizers import Tokenizer, models, pre_tokenizers
     from transformers import PreTrainedTokenizerFast, T5Config
 
@@ -83,15 +85,14 @@ def _model(encoder: str, head: str, finetuned: bool) -> dict[str, Any]:
     from octo.utils.spec import ModuleSpec
 
     stem = ModuleSpec.create(SmallStem32, features=(32, 32, 32, 32), num_features=EMBEDDING)
-    observations = {
-        camera: ModuleSpec.create(
+    observations = {}
+    for camera in ["primary"] if finetuned else ["primary", "wrist"]:
+        observations[camera] = ModuleSpec.create(
             ImageTokenizer,
             obs_stack_keys=[f"image_{camera}"],
             task_stack_keys=[f"image_{camera}"],
             encoder=stem,
         )
-        for camera in (["primary"] if finetuned else ["primary", "wrist"])
-    }
     if finetuned:
         observations["proprio"] = ModuleSpec.create(LowdimObsTokenizer, obs_keys=["proprio"])
     discrete = (
@@ -126,7 +127,7 @@ def _model(encoder: str, head: str, finetuned: bool) -> dict[str, Any]:
 
 
 def _example(finetuned: bool) -> dict[str, Any]:
-    """One batch as the data loader of training gives it: the shapes that the model takes."""
+    """Return a batch as the data loader of training does, with the shapes of the model's inputs."""
     images = {"image_primary": 64} if finetuned else {"image_primary": 64, "image_wrist": 32}
     observation: dict[str, Any] = {
         name: np.zeros((1, WINDOW, side, side, 3), np.uint8) for name, side in images.items()
