@@ -22,10 +22,11 @@ from vlagents_ray.testing import check_agent
 pytestmark = MARKS
 
 WORDS = ("pick up the cube", "push", "open the upper drawer")
-BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
+# Largest difference between the actions of a row in a batch and alone, in float32 on a CPU.
+BATCHED = 1e-5
 KINDS = ("pi0", "pi05", "aloha")
 PROGRAMS = {"pi0": ("_encode", "_follow"), "fast": ("_sample",)}
-# openpi's observation -> ours, as a client of each would send it
+# The mapping of the client of each policy, from openpi's observation to ours.
 MAPPINGS = {
     "pi0": "openpi-libero",
     "pi05": "openpi-droid",
@@ -35,7 +36,7 @@ MAPPINGS = {
 
 
 def theirs(kind: str, seed: int) -> dict[str, Any]:
-    """What openpi's own client would send."""
+    """Return the observation that openpi's own client would send."""
     rng = np.random.default_rng(seed)
 
     def picture() -> np.ndarray:
@@ -66,7 +67,7 @@ def theirs(kind: str, seed: int) -> dict[str, Any]:
 
 
 def seen(kind: str, seed: int, **info: Any) -> Obs:
-    """The same, as it reaches the policy: through the mapping of that client."""
+    """Return the same observation as the policy gets it, through the mapping of that client."""
     obs, _ = presets()[MAPPINGS[kind]].obs({**theirs(kind, seed), "prompt": "as reset says"})
     obs.info.update(info)
     return obs
@@ -89,10 +90,10 @@ def test_actions_are_those_of_openpis_own_policy(
         noise = np.random.default_rng([0, i]).standard_normal(
             policy.model.model.noise_shape, dtype=np.float32
         )
-        want = theirs_policy.infer({**theirs(kind, i), "prompt": WORDS[i]}, noise=noise)["actions"]
-        np.testing.assert_allclose(
-            begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4
-        )
+        theirs_obs = {**theirs(kind, i), "prompt": WORDS[i]}
+        expected = theirs_policy.infer(theirs_obs, noise=noise)["actions"]
+        action = begun(policy, kind, i).act(seen(kind, i)).action
+        np.testing.assert_allclose(action, expected, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -119,8 +120,8 @@ def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
         acts = policy.act_batch(
             [seen(kind, i) for i in range(size)], [begun(policy, kind, i) for i in range(size)]
         )
-        for one, act in zip(alone, acts, strict=False):
-            np.testing.assert_allclose(act.action, one, atol=BATCHED, rtol=1e-5)
+        for expected, act in zip(alone, acts, strict=False):
+            np.testing.assert_allclose(act.action, expected, atol=BATCHED, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["pi0", "pi05"])
@@ -129,27 +130,28 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
 ) -> None:
     policy = type(loaded(kind))(loaded(kind).config.model_copy(update={"batch_sizes": [2, 8]}))
     policy.initialize()
-    model, read = policy.model.model, []
+    model, encoded_rows = policy.model.model, []
     encode, follow = model._encode, model._follow
 
     def counted(state: Any, batch: Any) -> Any:
-        read.append(len(batch["state"]))
+        encoded_rows.append(len(batch["state"]))
         return encode(state, batch)
 
     monkeypatch.setattr(model, "_encode", counted)
     plan = begun(policy, kind, 1).act(seen(kind, 1)).action[1:]
-    # seven rows, of which the last follow a plan, and one of padding
+    # There are seven rows, of which the last two follow a plan, and one row of padding.
     views = [seen(kind, 0, **{SAMPLES: 4}), seen(kind, 1, **{SAMPLES: 1, LEFTOVER: plan, DELAY: 2})]
-    read.clear()
+    encoded_rows.clear()
     shared = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
     monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
-    each = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
-    assert read == [2, 8]
-    for one, other in zip(shared, each, strict=True):
-        np.testing.assert_allclose(one.action, other.action, atol=BATCHED, rtol=1e-5)
-        samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+    separate = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
+    assert encoded_rows == [2, 8]
+
+    for act, expected in zip(shared, separate, strict=True):
+        np.testing.assert_allclose(act.action, expected.action, atol=BATCHED, rtol=1e-5)
+        samples = [result.info[DISTRIBUTION]["samples"] for result in (act, expected)]
         np.testing.assert_allclose(*samples, atol=BATCHED, rtol=1e-5)
-    # Of the two sizes, from the start.
+    # The programs of both sizes are compiled at the start.
     assert (encode._cache_size(), follow._cache_size()) == (2, 2)
 
 
@@ -158,7 +160,8 @@ def test_no_act_compiles_a_program(loaded: Any) -> None:
     policy.initialize()
     plan = begun(policy, "pi0", 1).act(seen("pi0", 1)).action[1:]
     batches = [[{}] * count for count in range(1, 7)]
-    batches += [[{SAMPLES: count}, *[{}] * others] for count in (1, 2, 3, 5) for others in range(3)]
+    for samples in (1, 2, 3, 5):
+        batches += [[{SAMPLES: samples}, *[{}] * neighbours] for neighbours in range(3)]
     batches += [[{LEFTOVER: plan, DELAY: 2}, {SAMPLES: 1}]]
     with jax_compiles() as compiled:
         for batch in batches:
@@ -168,7 +171,8 @@ def test_no_act_compiles_a_program(loaded: Any) -> None:
             )
             assert all(isinstance(act, Act) for act in acts)
     assert compiled == []
-    with jax_compiles() as compiled:  # the count sees other sizes
+
+    with jax_compiles() as compiled:  # the count includes other sizes
         policy.config = policy.config.model_copy(update={"batch_sizes": None})
         policy.act_batch(
             [seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)]
@@ -189,12 +193,9 @@ def test_its_programs_never_call_the_host(loaded: Any, monkeypatch: pytest.Monke
         monkeypatch.setattr(model, name, lowered)
     begun(policy, "pi0", 0).act(seen("pi0", 0))
     assert len(texts) == 2
-    assert not [
-        word
-        for text in texts
-        for word in ("callback", "infeed", "outfeed", "send(")
-        if word in text
-    ]
+    for text in texts:
+        for word in ("callback", "infeed", "outfeed", "send("):
+            assert word not in text
 
 
 def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:
@@ -212,13 +213,13 @@ def test_contracts_fit_the_mappings_of_their_clients(loaded: Any) -> None:
 @pytest.mark.verifies("isolation")
 def test_a_session_that_fails_leaves_its_neighbours_alone(loaded: Any) -> None:
     policy = loaded("pi0")
-    bad = seen("pi0", 0)
-    del bad.cameras["wrist"]
-    long = copy.copy(policy)
-    long.reset(seen("pi0", 1), "pick up the cube " * 50, seed=1)
+    without_wrist = seen("pi0", 0)
+    del without_wrist.cameras["wrist"]
+    long_instruction = copy.copy(policy)
+    long_instruction.reset(seen("pi0", 1), "pick up the cube " * 50, seed=1)
     acts = policy.act_batch(
-        [bad, seen("pi0", 1), seen("pi0", 2)],
-        [begun(policy, "pi0", 0), long, begun(policy, "pi0", 2)],
+        [without_wrist, seen("pi0", 1), seen("pi0", 2)],
+        [begun(policy, "pi0", 0), long_instruction, begun(policy, "pi0", 2)],
     )
     assert isinstance(acts[0], MissingCamera)
     assert isinstance(acts[1], InvalidObservation)
@@ -243,13 +244,12 @@ def test_frozen_rows_come_back_as_planned_also_where_actions_are_relative(
 def test_a_config_with_its_own_prompt_needs_no_instruction(loaded: Any) -> None:
     policy = loaded("aloha")
     assert policy.contract.instruction is False
-    session = copy.copy(policy)
-    session.reset(seen("aloha", 0), None, seed=0)
-    told = copy.copy(policy)
-    told.reset(seen("aloha", 0), "uncap", seed=0)
-    np.testing.assert_array_equal(
-        session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action
-    )
+    actions = []
+    for instruction in (None, "uncap"):
+        session = copy.copy(policy)
+        session.reset(seen("aloha", 0), instruction, seed=0)
+        actions.append(session.act(seen("aloha", 0)).action)
+    np.testing.assert_array_equal(*actions)
 
 
 @pytest.mark.verifies("parity")
@@ -257,16 +257,14 @@ def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
     loaded: Any, upstream: Any, checkpoint: Any
 ) -> None:
     policy, theirs_policy = loaded("fast"), upstream("fast", checkpoint("fast"))
-    want = [
-        theirs_policy.infer({**theirs("fast", i), "prompt": WORDS[i]})["actions"] for i in range(3)
-    ]
-    alone = [begun(policy, "fast", i).act(seen("fast", i)).action for i in range(3)]
     acts = policy.act_batch(
         [seen("fast", i) for i in range(3)], [begun(policy, "fast", i) for i in range(3)]
     )
-    for i in range(3):
-        np.testing.assert_allclose(alone[i], want[i], rtol=1e-5)
-        np.testing.assert_array_equal(acts[i].action, alone[i])
+    for i, act in enumerate(acts):
+        expected = theirs_policy.infer({**theirs("fast", i), "prompt": WORDS[i]})["actions"]
+        alone = begun(policy, "fast", i).act(seen("fast", i)).action
+        np.testing.assert_allclose(alone, expected, rtol=1e-5)
+        np.testing.assert_array_equal(act.action, alone)
 
 
 def test_what_a_row_says_after_its_end_is_dropped() -> None:
@@ -282,14 +280,12 @@ def test_it_acts_with_pushed_weights(kind: str, loaded: Any, checkpoint: Any) ->
     from openpi.models.model import restore_params
 
     policy = loaded(kind)
-    assert (
-        policy.parameters().keys()
-        == flatten_dict(restore_params(checkpoint(kind) / "params"), sep="/").keys()
-    )
+    params = restore_params(checkpoint(kind) / "params")
+    assert policy.parameters().keys() == flatten_dict(params, sep="/").keys()
     programs = [getattr(policy.model.model, name) for name in PROGRAMS[kind]]
-    compiled = [one._cache_size() for one in programs]
+    compiled_sizes = [program._cache_size() for program in programs]
     check_pushed_weights(policy, lambda: begun(policy, kind, 0).act(seen(kind, 0)).action)
-    assert [one._cache_size() for one in programs] == compiled
+    assert [program._cache_size() for program in programs] == compiled_sizes
 
 
 def test_a_learner_of_adapters_pushes_these_alone(loaded: Any) -> None:

@@ -1,5 +1,5 @@
-"""openpi's PyTorch port, where transformers is patched as openpi wants it; without that it is
-refused.
+"""openpi's PyTorch port, which needs a transformers that is patched as openpi describes; without
+the patch it is refused.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ patched = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def port(tiny: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint of the port, small by the same means as the JAX one."""
+    """Write a checkpoint of the port, as small as that of the JAX model."""
     return tiny.save_torch(tmp_path_factory.mktemp("torch"))
 
 
@@ -80,8 +80,9 @@ def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(
     for i, act in enumerate(acts):
         noise = np.random.default_rng([0, i]).standard_normal((8, 32), dtype=np.float32)
         with torch.inference_mode():
-            want = upstream.infer({**theirs("pi0", i), "prompt": WORDS[i]}, noise=noise)["actions"]
-        np.testing.assert_allclose(act.action, want, atol=10 * BATCHED)
+            theirs_obs = {**theirs("pi0", i), "prompt": WORDS[i]}
+            expected = upstream.infer(theirs_obs, noise=noise)["actions"]
+        np.testing.assert_allclose(act.action, expected, atol=10 * BATCHED)
 
 
 @patched
@@ -89,24 +90,22 @@ def test_compiled_passes_act_as_without(port: Path) -> None:
     plain = made(port)
     with counting_compiler() as programs:
         compiled = made(port, compile="require", batch_sizes=[2])
-        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
-        for size in (1, 2, 3):
+        assert programs.rows == [2, 2]  # the encoding, and a step of the flow
+
+        def act(policy: OpenPi, size: int) -> list[Any]:
             views = [seen("pi0", i) for i in range(size)]
-            for one, other in zip(
-                *(
-                    p.act_batch(views, [begun(p, "pi0", i) for i in range(size)])
-                    for p in (plain, compiled)
-                ),
-                strict=True,
-            ):
-                np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+            return policy.act_batch(views, [begun(policy, "pi0", i) for i in range(size)])
+
+        for size in (1, 2, 3):
+            for expected, result in zip(act(plain, size), act(compiled, size), strict=True):
+                np.testing.assert_allclose(result.action, expected.action, atol=BATCHED)
         assert programs.rows == [2, 2]
 
 
 @patched
 def test_it_acts_with_pushed_weights(port: Path) -> None:
     policy = made(port)
-    # Those of openpi's trainer.
+    # The names are those of openpi's trainer.
     assert policy.parameters().keys() == policy.model.model.trained.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action)
 
@@ -117,9 +116,11 @@ def test_frozen_rows_come_back_as_planned(port: Path) -> None:
     plan = begun(policy, "pi0", 1).act(seen("pi0", 1)).action[1:]
     guided = begun(policy, "pi0", 0).act(seen("pi0", 0, **{LEFTOVER: plan, DELAY: 2})).action
     np.testing.assert_allclose(guided[:2], plan[:2], atol=1e-4)
-    again = copy.copy(policy)  # what guided one call is gone with it
-    again.reset(seen("pi0", 0), WORDS[0], seed=0)
-    assert np.abs(again.act(seen("pi0", 0)).action[:2] - plan[:2]).max() > 0.01
+
+    # The next call is not guided.
+    session = copy.copy(policy)
+    session.reset(seen("pi0", 0), WORDS[0], seed=0)
+    assert np.abs(session.act(seen("pi0", 0)).action[:2] - plan[:2]).max() > 0.01
 
 
 LEVEL = 0.5
@@ -135,43 +136,44 @@ def test_the_log_probability_is_that_of_the_network_itself(
     policy = made(port, noise_level=LEVEL)
     assert policy.contract.behaviour == tuple(ALL)
     act = begun(policy, "pi0", 0).act(seen("pi0", 0, **{WANT: ALL, SAMPLES: 2}))
-    network, seen_velocities = policy.model.model.trained, []
+
+    network, velocities = policy.model.model.trained, []
     session = begun(policy, "pi0", 0)
     inputs = session.perceive(seen("pi0", 0)).inputs
     observation = _observation({key: _tensors(value) for key, value in inputs.items()})
-    plain = network._preprocess_observation
+    preprocess = network._preprocess_observation
     monkeypatch.setattr(
-        network, "_preprocess_observation", lambda one, **_: plain(one, train=False)
+        network, "_preprocess_observation", lambda obs, **_: preprocess(obs, train=False)
     )
     hook = network.action_out_proj.register_forward_hook(
-        lambda _module, _inputs, out: seen_velocities.append(out)
+        lambda _module, _inputs, output: velocities.append(output)
     )
 
     def velocity(noisy: Any, time: float) -> Any:
-        """The network's in training: noise and actions are the same, and so is what is between
-        them.
+        """Return the velocity of the network's training pass, whose noisy actions are `noisy` at
+        any time, because noise and actions are equal.
         """
         with torch.no_grad():
             network.forward(
                 observation, noisy, noise=noisy, time=torch.tensor([time], dtype=torch.float32)
             )
-        return seen_velocities[-1]
+        return velocities[-1]
 
-    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
-    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
-    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
-        np.testing.assert_allclose(
-            logprob, logprob_of_steps(velocity, chain, LEVEL)[:, :7], atol=5e-3
-        )
+    behaviour, distribution = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [behaviour["replay"]["chain"], *distribution["replay"]["chain"]]
+    logprobs = [behaviour["logprob"], *distribution["logprob"]]
+    for chain, logprob in zip(chains, logprobs, strict=True):
+        expected = logprob_of_steps(velocity, chain, LEVEL)[:, :7]
+        np.testing.assert_allclose(logprob, expected, atol=5e-3)
     hook.remove()
 
 
 def _tensors(value: Any) -> Any:
-    """Inputs of one row as a batch of one."""
+    """Convert the inputs of one row to a batch of one."""
     import torch
 
     if isinstance(value, dict):
-        return {key: _tensors(one) for key, one in value.items()}
+        return {key: _tensors(nested) for key, nested in value.items()}
     return torch.from_numpy(np.array(value))[None]
 
 
@@ -179,35 +181,35 @@ def _tensors(value: Any) -> Any:
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(
     port: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, read = made(port, noise_level=LEVEL), []
+    policy, encoded_rows = made(port, noise_level=LEVEL), []
     network = policy.model.model.trained
     embed = network.embed_prefix
 
-    def counted(images: Any, *rest: Any) -> Any:
-        read.append(len(images[0]))
-        return embed(images, *rest)
+    def counted(images: Any, *args: Any) -> Any:
+        encoded_rows.append(len(images[0]))
+        return embed(images, *args)
 
     monkeypatch.setattr(network, "embed_prefix", counted)
     views = [seen("pi0", 0), seen("pi0", 1, **{SAMPLES: 8, WANT: ALL}), seen("pi0", 2)]
 
-    def acted() -> list[Any]:
+    def act() -> list[Any]:
         sessions = [begun(policy, "pi0", i) for i in range(3)]
-        # Too long, so that it is not computed.
+        # The first instruction is too long, so this row is not computed.
         sessions[0].reset(views[0], "pick up the cube " * 50)
         return policy.act_batch(views, sessions)
 
-    shared = acted()
+    shared = act()
     monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
-    each = acted()
-    assert read == [2, 10]
+    separate = act()
+    assert encoded_rows == [2, 10]
     assert isinstance(shared[0], InvalidObservation)
+
     alone = begun(policy, "pi0", 1).act(views[1]).info[BEHAVIOUR]["replay"]["chain"]
-    np.testing.assert_allclose(
-        shared[1].info[BEHAVIOUR]["replay"]["chain"], alone, atol=10 * BATCHED
-    )
-    for one, other in zip(shared[1:], each[1:], strict=True):
-        np.testing.assert_allclose(one.action, other.action, atol=10 * BATCHED)
-    samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
+    chain = shared[1].info[BEHAVIOUR]["replay"]["chain"]
+    np.testing.assert_allclose(chain, alone, atol=10 * BATCHED)
+    for result, expected in zip(shared[1:], separate[1:], strict=True):
+        np.testing.assert_allclose(result.action, expected.action, atol=10 * BATCHED)
+    samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, separate)]
     np.testing.assert_allclose(*samples, atol=10 * BATCHED)
 
 
