@@ -64,43 +64,46 @@ def save(folder: Path, kind: str = "relative") -> Path:
 
     [(config_class, pipeline)] = MODEL_REGISTRY.items()
     model_class, processor_class = pipeline.model_class, pipeline.processor_class
-    own = {"model_name": _qwen(folder / "nvidia/Cosmos-Reason2-2B")} if N17 else {}
-    # As in the published N1.7.
-    over = {"vl_self_attention_cfg": {**_HEAD, "num_layers": 1}} if N17 else {}
+    backbone = {"model_name": _qwen(folder / "nvidia/Cosmos-Reason2-2B")} if N17 else {}
+    # The published N1.7 also has layers above the language model.
+    upper_layers = {"vl_self_attention_cfg": {**_HEAD, "num_layers": 1}} if N17 else {}
+    transformer = {
+        **_HEAD,
+        "norm_type": "ada_norm",
+        "final_dropout": True,
+        "interleave_self_attention": True,
+        "output_dim": 32,
+        "num_layers": 4,
+    }
     with built_without_flash_attention(), no_init_weights():
-        model = model_class(
-            config_class(
-                **own,
-                **over,
-                select_layer=1,
-                backbone_embedding_dim=32,
-                hidden_size=32,
-                input_embedding_dim=32,
-                max_state_dim=WIDTH,
-                max_action_dim=WIDTH,
-                action_horizon=ROWS,
-                max_num_embodiments=32,
-                max_seq_len=64,
-                use_alternate_vl_dit=kind != "history",
-                diffusion_model_cfg={
-                    **_HEAD,
-                    "norm_type": "ada_norm",
-                    "final_dropout": True,
-                    "interleave_self_attention": True,
-                    "output_dim": 32,
-                    "num_layers": 4,
-                },
-            )
-        ).float()
+        config = config_class(
+            **backbone,
+            **upper_layers,
+            select_layer=1,
+            backbone_embedding_dim=32,
+            hidden_size=32,
+            input_embedding_dim=32,
+            max_state_dim=WIDTH,
+            max_action_dim=WIDTH,
+            action_horizon=ROWS,
+            max_num_embodiments=32,
+            max_seq_len=64,
+            use_alternate_vl_dit=kind != "history",
+            diffusion_model_cfg=transformer,
+        )
+        model = model_class(config).float()
+
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for name, values in model.named_parameters():
             drawn = torch.randn(values.shape, generator=generator)
-            one = values.ndim == 1 and name.endswith("weight")  # of a norm
-            values.copy_(
-                float(one) + 0.1 * drawn if values.ndim == 1 else drawn * _scale(name, values)
-            )
+            if values.ndim > 1:
+                values.copy_(drawn * _scale(name, values))
+            else:
+                mean = 1.0 if name.endswith("weight") else 0.0  # weights of norms, or biases
+                values.copy_(mean + 0.1 * drawn)
     model.save_pretrained(folder)
+
     configs, statistics = _robots(kind)
     processor_class(
         configs,
@@ -112,14 +115,14 @@ def save(folder: Path, kind: str = "relative") -> Path:
         max_action_dim=WIDTH,
         max_action_horizon=ROWS,
         use_relative_action=True,
-        **own,
+        **backbone,
     ).save_pretrained(folder)
     return folder
 
 
 def _scale(name: str, values: Any) -> float:
-    """The size of random weights with which a signal keeps its own, and actions stay within
-    their bounds.
+    """Return the standard deviation of random weights with which a signal keeps its size, and
+    actions stay within their bounds.
     """
     if name.endswith(("embed_tokens.weight", "position_embedding.weight")):
         return 1.0
@@ -128,7 +131,7 @@ def _scale(name: str, values: Any) -> float:
 
 
 def _qwen(folder: Path) -> str:
-    """Write the backbone of N1.7, whose name its code looks for in the folder's."""
+    """Write the backbone of N1.7, whose name must be in the path of its folder."""
     import torch
     import transformers
 
@@ -143,20 +146,21 @@ def _qwen(folder: Path) -> str:
 
 
 def _robots(kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The metadata and the statistics of a kind's robots."""
+    """Return the metadata and the statistics of the robots of a checkpoint."""
     rng = np.random.default_rng(1)
 
     def bounds(*shape: int) -> dict[str, Any]:
         low, width = rng.uniform(-1, 0, shape), rng.uniform(1, 2, shape)
-        found = {
+        high = low + width
+        statistics = {
             "min": low,
-            "max": low + width,
+            "max": high,
             "mean": low,
             "std": width,
             "q01": low,
-            "q99": low + width,
+            "q99": high,
         }
-        return {name: value.tolist() for name, value in found.items()}
+        return {name: values.tolist() for name, values in statistics.items()}
 
     def config(cameras: list[str], groups: list[str], **action: Any) -> dict[str, Any]:
         return {
@@ -186,10 +190,10 @@ def _robots(kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
     if kind == "libero":
         axes = ["x", "y", "z", "roll", "pitch", "yaw"]
         configs[LIBERO] = config(["image", "wrist_image"], [*axes, "gripper"])
-        own = {axis: bounds(1) for axis in axes}
+        pose = {axis: bounds(1) for axis in axes}
         statistics[LIBERO] = {
-            "state": {**own, "gripper": bounds(2)},
-            "action": {**own, "gripper": bounds(1)},
+            "state": {**pose, "gripper": bounds(2)},
+            "action": {**pose, "gripper": bounds(1)},
         }
     return configs, statistics
 

@@ -40,26 +40,26 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
 
 @pytest.fixture(scope="session")
 def checkpoint(tiny: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The checkpoint of a kind, to be read only."""
-    made: dict[str, Path] = {}
+    """Return a function that writes the checkpoint of a kind once. Tests must not change it."""
+    folders: dict[str, Path] = {}
 
     def get(kind: str) -> Path:
-        if kind not in made:
-            made[kind] = tiny.save(tmp_path_factory.mktemp(kind), kind)
-        return made[kind]
+        if kind not in folders:
+            folders[kind] = tiny.save(tmp_path_factory.mktemp(kind), kind)
+        return folders[kind]
 
     return get
 
 
 @pytest.fixture(scope="session")
 def loaded(checkpoint: Callable[[str], Path]) -> Made:
-    """The policy of a kind, initialized once; float32."""
+    """Return a function that loads the policy of a kind once, in float32."""
     from vlagents_ray_models.openpi import OpenPi
 
-    made: dict[str, OpenPi] = {}
+    policies: dict[str, OpenPi] = {}
 
     def get(kind: str) -> OpenPi:
-        if kind not in made:
+        if kind not in policies:
             settings = {
                 "checkpoint": str(checkpoint(kind)),
                 "config": f"plugins.vlagents_ray_models.tests.families.openpi.tiny:{kind.upper()}",
@@ -68,16 +68,18 @@ def loaded(checkpoint: Callable[[str], Path]) -> Made:
             }
             policy = OpenPi.from_config(settings)
             policy.initialize()
-            made[kind] = policy
-        return made[kind]
+            policies[kind] = policy
+        return policies[kind]
 
     return get
 
 
 @pytest.fixture
 def upstream(tiny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Made:
-    """openpi's own policy of a checkpoint, made by its `create_trained_policy`, in float32."""
-    # Only training reads data, for which openpi imports a LeRobot of a certain commit.
+    """Return a function that makes openpi's own policy of a checkpoint in float32, with
+    `create_trained_policy`.
+    """
+    # openpi imports a LeRobot of a certain commit to read data, which only its training does.
     monkeypatch.setitem(sys.modules, "openpi.training.data_loader", ModuleType("data_loader"))
     sys.modules["openpi.training.data_loader"].DataLoader = object  # type: ignore[attr-defined]
     from openpi.policies import policy_config
@@ -92,9 +94,8 @@ def upstream(tiny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Made:
 
     def make(kind: str, folder: Path) -> Any:
         config = tiny.CONFIGS[kind]
-        config = dataclasses.replace(
-            config, model=dataclasses.replace(config.model, dtype="float32")
-        )
+        model = dataclasses.replace(config.model, dtype="float32")
+        config = dataclasses.replace(config, model=model)
         settings = {} if kind == "fast" else {"num_steps": 4}
         return policy_config.create_trained_policy(config, folder, sample_kwargs=settings)
 
