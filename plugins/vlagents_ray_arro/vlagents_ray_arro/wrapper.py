@@ -349,9 +349,9 @@ class Tracking:
                 detections[i] = image_detections
 
         objects = []
-        for image_detections in self._with_masks(images, detections):
+        for pairs in self._with_masks(images, detections):
             segments = []
-            for detection, mask in image_detections:
+            for detection, mask in pairs:
                 if mask.any():
                     segments.append((detection.phrase, mask))
             objects.append(segments)

@@ -139,7 +139,7 @@ class DiffusionPolicy(ModelPolicy):
         network: DiffusionNetwork = self.model
         torch = require("torch")
         steps = self.history
-        frames = []
+        frames: list[StagedRow] = []
         for row in rows:
             frames += row.history(steps)
         batch = network.staging.stack(frames, keep=steps > 1)

@@ -877,10 +877,10 @@ class Onnx(ModelPolicy):
 
         # This raises an error if the observation does not fit.
         state_vector(obs, [part for part in parts if part != PREVIOUS], length)
-        blocks = []
+        blocks: list[np.ndarray] = []
         for part in parts:
             if part == PREVIOUS:
-                frame.gaps[name] = sum(map(len, blocks))
+                frame.gaps[name] = sum(len(block) for block in blocks)
                 blocks.append(network.zero_output)
             else:
                 blocks.append(state_vector(obs, [part]))
