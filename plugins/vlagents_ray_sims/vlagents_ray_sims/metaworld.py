@@ -39,16 +39,16 @@ _UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts upside down; the o
 class MetaWorld(SimulatorEnv):
     """One environment of one Meta-World task, e.g. "reach-v3".
 
-    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in
-    the world frame, and `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation
-    including the goal, which its oracles need bit for bit.
+    Observation: the cameras, by default "corner2", whose images are upright; `state["xyz"]` (3,) m,
+    the hand in the world frame; and `gripper`. `info["sim_state"]`, (39,) float64, is Meta-World's
+    observation including the goal, which its oracles need bit for bit.
 
-    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m per unit, x, y, z in the world frame;
-    the last is the gripper's effort: -1 opens, 1 closes.
+    Action: (4,) in [-1, 1]. The hand's target moves by 0.01 m per unit along x, y and z of the
+    world frame. The last value is the gripper's effort: -1 opens it, 1 closes it.
 
-    The seed draws the positions of the object and the goal, as Meta-World's own generator of tasks
-    does. With `goals_seed` the initial states are the 50 that MT1 draws with that seed, in order.
-    Success ends the episode unless `ends_on_success` is False.
+    The seed determines the positions of the object and the goal, which are drawn as by Meta-World's
+    own generator of tasks. With `goals_seed`, the initial states are the 50 that MT1 draws with
+    that seed, in order. Success ends the episode unless `ends_on_success` is False.
     """
 
     suite, title = "metaworld", "Meta-World"
@@ -74,16 +74,16 @@ class MetaWorld(SimulatorEnv):
         `SimulatorEnv`.
 
         Args:
-            task: Meta-World's name.
-            cameras: MuJoCo's names, e.g. "corner2", "gripperPOV".
+            task: Meta-World's name of the task.
+            cameras: MuJoCo's names of the cameras, e.g. "corner2", "gripperPOV".
             instruction: None selects the task's name in words.
-            max_steps: 500 at most.
-            goals_seed: The seed of MT1, whose 50 initial states are used; None: the seed of each
-                episode draws one.
-            camera_positions: Name -> (x, y, z) m, of cameras that are moved from their place in
-                Meta-World.
-            shadows: Whether images have shadows, reflections and smooth edges as in Meta-World;
-                they take ten times as long without a GPU.
+            max_steps: The step limit, 500 at most.
+            goals_seed: The seed of MT1, whose 50 initial states are used. If it is None, the seed
+                of each episode draws an initial state.
+            camera_positions: Name -> (x, y, z) m in the world frame, for cameras that do not have
+                their position of Meta-World.
+            shadows: Whether images have shadows, reflections and smooth edges as in Meta-World.
+                Without a GPU, such images take ten times as long.
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(
@@ -94,11 +94,12 @@ class MetaWorld(SimulatorEnv):
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
         self._goals: list[Any] | None = None
+
         simulator = require("metaworld")
         with self._making():
             env = self._env = simulator.ALL_V3_ENVIRONMENTS[task]()
             self._resources.callback(env.close)
-            # as Meta-World does for its classes with an observable goal, but with our seed
+            # As in Meta-World's classes with an observable goal, but with our seed.
             env._partially_observable = False
             del env.sawyer_observation_space  # it is cached, and clips the goal away
             env._freeze_rand_vec = False
@@ -107,10 +108,12 @@ class MetaWorld(SimulatorEnv):
             if goals_seed is not None:
                 self._goals = simulator.MT1(task, seed=goals_seed).train_tasks
                 self.init_states = len(self._goals)
-            moved = camera_positions or {}
-            require_cameras(self._name, moved, camera_names(env.model))
-            for name, position in moved.items():
+
+            positions = camera_positions or {}
+            require_cameras(self._name, positions, camera_names(env.model))
+            for name, position in positions.items():
                 env.model.camera(name).pos = position
+
             self._cameras = MujocoCameras(
                 self._name,
                 env.model,
@@ -120,17 +123,16 @@ class MetaWorld(SimulatorEnv):
                 shadows=shadows,
             )
             self._resources.callback(self._cameras.close)
-        stated = self.known_contract({"cameras": cameras, "width": width, "height": height})
-        self._contract = replace(stated, control_hz=1.0 / self._env.dt)
+
+        contract = self.known_contract({"cameras": cameras, "width": width, "height": height})
+        self._contract = replace(contract, control_hz=1.0 / self._env.dt)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         """Return the contract without the control rate, which only the simulator knows."""
+        image = CameraSpec(arguments["height"], arguments["width"])
         return Contract(
-            cameras={
-                name: CameraSpec(arguments["height"], arguments["width"])
-                for name in arguments["cameras"]
-            },
+            cameras=dict.fromkeys(arguments["cameras"], image),
             state={"xyz": StateSpec(3, "m")},
             gripper=True,
             instruction=True,
@@ -159,13 +161,11 @@ class MetaWorld(SimulatorEnv):
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         raw, reward, _, _, info = self._env.step(np.clip(action, -1.0, 1.0))
-        return (
-            self._observe(raw, look=self.looked_at),
-            float(reward),
-            *self._solved(bool(info["success"])),
-        )
+        obs = self._observe(raw, look=self.looked_at)
+        return obs, float(reward), *self._solved(bool(info["success"]))
 
     def _observe(self, raw: np.ndarray, *, look: bool = True) -> Obs:
+        """Convert Meta-World's observation, (39,); without `look` the result has no images."""
         return Obs(
             cameras=self._cameras.render(self._env.data) if look else {},
             # The fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World.

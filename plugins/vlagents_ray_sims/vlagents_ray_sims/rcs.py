@@ -33,18 +33,18 @@ class RcsTask:
     """The settings that turn a scene registered by RCS with Gymnasium into a task."""
 
     id: str  # Gymnasium's id of the scene
-    module: str | None  # the module that registers it; None if the user names it
-    protocol: BenchmarkProtocol | None = None  # None: the user sets `max_steps`
-    control_mode: ControlMode = "joints"  # of an action; absolute by default
+    module: str | None  # the module that registers the scene; None selects the id's namespace
+    protocol: BenchmarkProtocol | None = None  # None: the user has to set `max_steps`
+    control_mode: ControlMode = "joints"  # the default of an action's control mode
     control_hz: float = 30.0
-    instruction: str = ""  # used if the simulator's info has none
-    prepare: Callable[[Any], None] = lambda _config: None  # adds the task to a scene without one
+    instruction: str = ""  # used if the simulator's info has no instruction
+    # Adds the task to the config of a scene that has none; None if it has one.
+    add_task: Callable[[Any], None] | None = None
 
 
-def _pick(config: Any) -> None:
-    config.task_cfg = require("rcs.envs.tasks").PickTaskConfig(
-        robot_name=next(iter(config.robot_cfgs))
-    )
+def _add_pick_task(config: Any) -> None:
+    first_robot = next(iter(config.robot_cfgs))
+    config.task_cfg = require("rcs.envs.tasks").PickTaskConfig(robot_name=first_robot)
 
 
 RCS_TASKS = {
@@ -59,8 +59,7 @@ RCS_TASKS = {
             control_hz=30.0,
             control="tquat",
             success="the cuboid's middle is 7.8 cm or more above the robot's base, and the gripper "
-            "is neither open "
-            "nor closed",
+            "is neither open nor closed",
             metric="success_once",
             begins="the cuboid's place in a square of 20 cm, 50 cm in front of the robot, and its "
             "turn: the seed's",
@@ -68,7 +67,7 @@ RCS_TASKS = {
         ),
         control_mode="tquat",
         instruction="pick up the green cuboid",
-        prepare=_pick,
+        add_task=_add_pick_task,
     )
 }
 
@@ -103,29 +102,39 @@ DUOBENCH_TASKS = {
 }
 
 
-# Without this file, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3,
+# If this file is missing, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3,
 # rcs/__init__.py).
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
 
-# By package: the environment variable that names the folder of its assets, the folder in the home
-# folder that counts if it is not set, and further steps of the download beside `import`.
+@dataclass(frozen=True, slots=True)
+class _Assets:
+    """Where a package reads its assets."""
+
+    variable: str  # the environment variable that names the folder
+    home_folder: str  # the folder in the home folder that is used if the variable is not set
+    further_steps: str = ""  # how to complete a download that `import` has made
+
+
 _ASSETS = {
-    "rcs": ("RCS_PREFIX", ".rcs", ""),
-    "duobench": (
+    "rcs": _Assets("RCS_PREFIX", ".rcs"),
+    "duobench": _Assets(
         "DUOBENCH_PREFIX",
         ".duobench",
-        (
-            f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would "
-            "fetch all again"
-        ),
+        f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would "
+        "fetch all again",
     ),
 }
 
 
 def missing_packages(*packages: str) -> str | None:
-    """Return why the packages, "rcs" or "duobench", cannot be imported here without a download;
-    None if they can.
+    """Return why packages cannot be imported here without a download; None if they can.
+
+    Args:
+        packages: Names of packages, "rcs" or "duobench".
+
+    Returns:
+        A sentence with the cure, or None.
     """
     for package in packages:
         if importlib.util.find_spec(package) is None:
@@ -134,44 +143,62 @@ def missing_packages(*packages: str) -> str | None:
                 "and have the workers run in it: runtime_env: {py_executable: "
                 "/path/to/.venv-rcs/bin/python}"
             )
-        variable, folder, further = _ASSETS[package]
-        prefix = Path(os.environ.get(variable) or Path.home() / folder).expanduser()
+        assets = _ASSETS[package]
+        default_folder = Path.home() / assets.home_folder
+        prefix = Path(os.environ.get(assets.variable) or default_folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
-                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {variable} "
-                "to the folder that holds its `assets`, or fetch them once by `python -c 'import "
-                f"{package}'`{further}"
+                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set "
+                f"{assets.variable} to the folder that holds its `assets`, or fetch them once by "
+                f"`python -c 'import {package}'`{assets.further_steps}"
             )
     return None
 
 
-def creator(task: RcsTask, name: str) -> Any:
-    """Return RCS's factory of a scene; raises `MissingDependency` if RCS would download."""
-    reason = missing_packages("rcs", *({"duobench"} & {task.id.partition("/")[0]}))
+def scene_creator(task: RcsTask, name: str) -> Any:
+    """Return RCS's factory of a scene, an `RCSEnvCreator`.
+
+    Args:
+        task: Defines the scene, and the module that registers it.
+        name: The name of the environment, for errors.
+
+    Raises:
+        MissingDependency: RCS is not installed, or would download assets.
+        UnknownEnv: Nothing registers the scene.
+        ConfigError: The id is not a scene of RCS.
+    """
+    namespace = task.id.partition("/")[0]
+    packages = ["rcs", "duobench"] if namespace == "duobench" else ["rcs"]
+    reason = missing_packages(*packages)
     if reason is not None:
         raise MissingDependency(f"{name}: {reason}")
-    require(task.module or task.id.partition("/")[0])
+
+    require(task.module or namespace)
     rcs = require("rcs")
-    # DuoBench registers another scene under this name on import, and episodes must not depend on
-    # that
+    # On import, DuoBench registers another scene under this name. Episodes must not depend on
+    # whether it was imported.
     rcs.SCENE_PATHS["empty_world"] = str(Path(rcs.RCS_PREFIX) / _REQUIRED)
+
     gymnasium = require("gymnasium")
     if task.id not in gymnasium.registry:
         raise UnknownEnv(
             f"{name}: Gymnasium knows no {task.id!r}; set `module` to what registers it"
         )
-    made = gymnasium.registry[task.id].entry_point
-    if not hasattr(made, "create_env"):
+    entry_point = gymnasium.registry[task.id].entry_point
+    if not hasattr(entry_point, "create_env"):
         raise ConfigError(
             f"{name}: {task.id!r} is no scene of RCS: want one whose entry point is an "
             "RCSEnvCreator"
         )
-    return made
+    return entry_point
 
 
-# RCS's angles are roll, pitch, yaw about fixed axes, R = Rz Ry Rx; its quaternions end with w.
+# The units of an arm's state. RCS's angles are roll, pitch and yaw about fixed axes, R = Rz Ry Rx,
+# and the last component of its quaternions is w.
 _UNITS = {"joints": "rad", "tquat": "m+quat_xyzw", "xyzrpy": "m+rad"}
+# Control mode -> its name in RCS's `ControlMode`.
 _MODES = {"joints": "JOINTS", "tquat": "CARTESIAN_TQuat", "xyzrpy": "CARTESIAN_TRPY"}
+# Control mode -> the space and the rotation of an action in the contract.
 _COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
     "joints": ("joint", "none"),
     "tquat": ("ee_pose", "quat_xyzw"),
@@ -180,18 +207,18 @@ _COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
 
 
 class Rcs(SimulatorEnv):
-    """One environment of one task: "pick", or the id of any scene with a task that RCS has
-    registered.
+    """One environment of one task: "pick", or the id of any scene with a task registered by RCS.
 
-    Observation: the scene's cameras; for each arm `joints` rad, `tquat` and `xyzrpy`, the tool's
-    pose in the frame that all arms share; the gripper, 1 = open. `Arms` describes the names for
-    several arms. `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the
-    world frame, metres and quaternion wxyz: for scripted experts only.
+    Observation: the scene's cameras; for each arm `joints`, rad, and `tquat` and `xyzrpy`, the
+    tool's pose in the frame that all arms share; and the gripper, 1 = open. `Arms` describes the
+    names for several arms. `info["objects"]` is for scripted experts only. It maps the joint of
+    each loose body to the body's pose in the world frame, (7,) float64, m and quaternion wxyz.
 
-    Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and
-    below.
+    Action: for each arm, its command in `control_mode` and then its gripper, which closes at 0.5
+    and below.
 
-    The simulator reports success, which ends the episode. The seed places the objects.
+    The simulator reports success, which ends the episode. The seed determines where the objects
+    are.
     """
 
     suite = "rcs"
@@ -218,77 +245,93 @@ class Rcs(SimulatorEnv):
         `SimulatorEnv`.
 
         Args:
-            task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of
-                `tasks()`.
-            module: The module that registers the id, imported first; by default the id's namespace.
-            control_mode: "joints", "tquat" or "xyzrpy"; None selects the protocol's.
+            task: One of `tasks()`, or Gymnasium's id of a scene, such as "lab/shelf"; None selects
+                the first of `tasks()`.
+            module: The module that registers the scene, which is imported first; None selects the
+                id's namespace.
+            control_mode: "joints", "tquat" or "xyzrpy"; None selects the mode of the protocol.
             delta: Whether commands are relative to the arm's current position.
-            control_hz: Steps per second; None selects the protocol's.
+            control_hz: Steps per second; None selects the rate of the protocol.
             binary_gripper: Whether the gripper only opens or closes; if not, the command is its
                 opening.
-            cameras: Cameras of the scene to return; None selects all.
+            cameras: The cameras of the scene to return; None selects all of them.
         """
         task = self.tasks()[0] if task is None else task
         if task not in self.known:
             self.require_task(task)
-        found = self.known.get(task) or RcsTask(id=task, module=None)
-        self._task = found if module is None else replace(found, module=module)
+        self._task = self.known.get(task) or RcsTask(id=task, module=None)
+        if module is not None:
+            self._task = replace(self._task, module=module)
+
         protocol = self._task.protocol
-        limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
-        if limit is None:
+        if max_steps is None and protocol is not None:
+            max_steps = protocol.max_steps
+        if max_steps is None:
             raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
-        super().__init__(task, width=width, height=height, max_steps=limit)
-        self.max_steps = limit
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
+        self.max_steps = max_steps
         self._mode = control_mode or self._task.control_mode
-        self._given_instruction = instruction
-        hz = control_hz or self._task.control_hz
-        maker = creator(self._task, self._name)
-        config = maker.config()
-        self._task.prepare(config)
-        config.sim_cfg.frequency = hz
-        config.relative_to = getattr(
-            require("rcs.envs.base").RelativeTo, "LAST_STEP" if delta else "NONE"
-        )
+        self._user_instruction = instruction
+        control_hz = control_hz or self._task.control_hz
+
+        creator = scene_creator(self._task, self._name)
+        config = creator.config()
+        if self._task.add_task is not None:
+            self._task.add_task(config)
+        rcs_base = require("rcs.envs.base")
+        config.control_mode = getattr(rcs_base.ControlMode, _MODES[self._mode])
+        config.relative_to = getattr(rcs_base.RelativeTo, "LAST_STEP" if delta else "NONE")
         config.wrapper_cfg.binary_gripper = binary_gripper
-        # Without a window, as fast as it can, with images of this size.
+        # RCS would limit relative commands to 0.5 m, 90 degrees, and 5 degrees for each joint.
+        config.max_relative_movement = None
+        # Simulate without a window, and as fast as possible.
         config.headless = True
         config.sim_cfg.realtime = False
-        # A step takes its time, whether or not the arms have reached their targets.
+        config.sim_cfg.frequency = control_hz
+        # A step lasts 1 / control_hz, whether or not the arms have reached their targets.
         config.sim_cfg.async_control = True
-        config.control_mode = getattr(require("rcs.envs.base").ControlMode, _MODES[self._mode])
-        # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint.
-        config.max_relative_movement = None
-        have = config.camera_cfgs or {}
-        require_cameras(self._name, cameras or (), have)
-        chosen = {name: copy.copy(have[name]) for name in (have if cameras is None else cameras)}
-        for camera in chosen.values():
-            camera.resolution_height, camera.resolution_width = height, width
-        config.camera_cfgs = chosen or None
-        if config.camera_adds is not None:
-            config.camera_adds = {
-                name: added for name, added in config.camera_adds.items() if name in chosen
-            }
+        self._select_cameras(config, cameras, height, width)
+
         with self._making():
-            self._env = maker.create_env(config)
+            self._env = creator.create_env(config)
             self._resources.callback(self._env.close)
             self._sim = self._env.get_wrapper_attr("sim")
-            model, free = self._sim.model, int(require("mujoco").mjtJoint.mjJNT_FREE)
-            self._loose = [
-                model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free
-            ]
+            self._loose = _free_joints(self._sim.model)
             self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
+
         self._contract = Contract(
             cameras=dict.fromkeys(config.camera_cfgs or (), CameraSpec(height, width)),
             state=self._arms.state,
             gripper=self._arms.has_gripper,
             instruction=True,
             action=self._arms.action_spec(delta=delta),
-            control_hz=hz,
+            control_hz=control_hz,
         )
+
+    def _select_cameras(
+        self, config: Any, cameras: Sequence[str] | None, height: int, width: int
+    ) -> None:
+        """Leave only these cameras of a scene in its config, all if None, with images of a size.
+
+        The configs of the cameras are copied, so that the scene's own keep their size.
+        """
+        scene_cameras = config.camera_cfgs or {}
+        require_cameras(self._name, cameras or (), scene_cameras)
+        selected = {}
+        for name in scene_cameras if cameras is None else cameras:
+            camera = copy.copy(scene_cameras[name])
+            camera.resolution_height, camera.resolution_width = height, width
+            selected[name] = camera
+
+        config.camera_cfgs = selected or None
+        if config.camera_adds is not None:
+            config.camera_adds = {
+                name: camera for name, camera in config.camera_adds.items() if name in selected
+            }
 
     @property
     def instruction(self) -> str:
-        return self._given_instruction or self._instruction or self._task.instruction
+        return self._user_instruction or self._instruction or self._task.instruction
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -301,7 +344,7 @@ class Rcs(SimulatorEnv):
 
     def describe(self) -> dict[str, Any]:
         control = f"{self._mode}, delta" if self._contract.action.delta else self._mode
-        played = {
+        settings = {
             "max_steps": self.max_steps,
             "control_hz": self._contract.control_hz,
             "control": control,
@@ -312,7 +355,7 @@ class Rcs(SimulatorEnv):
             "simulator": "rcs",
             "task": self._task.id,
             "robots": {name: robot.get_config().robot_type.id for name, robot in robots.items()},
-            "protocol": protocol.describe(**played) if protocol is not None else played,
+            "protocol": settings if protocol is None else protocol.describe(**settings),
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
@@ -328,32 +371,33 @@ class Rcs(SimulatorEnv):
             raise ConfigError(
                 f"{self._name} does not say what success is: want a scene with a task"
             )
-        # Drops entries of arms.
+        # Entries of arms have the names of the arms; the other entries are the task's.
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
 
     def _observe(self, raw: Mapping[str, Any]) -> Obs:
+        """Convert an observation of RCS."""
         state, gripper = self._arms.read(raw)
-        frames = raw.get("frames", {})
-        return Obs(
-            cameras={
-                name: np.ascontiguousarray(frame["rgb"]["data"]) for name, frame in frames.items()
-            },
-            gripper=gripper,
-            state=state,
-            info={
-                "objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}
-            },
-        )
+        cameras = {}
+        for name, frame in raw.get("frames", {}).items():
+            cameras[name] = np.ascontiguousarray(frame["rgb"]["data"])
+        objects = {joint: np.array(self._sim.data.joint(joint).qpos) for joint in self._loose}
+        return Obs(cameras=cameras, gripper=gripper, state=state, info={"objects": objects})
+
+
+def _free_joints(model: Any) -> list[str]:
+    """List the free joints of a `mujoco.MjModel`, which are the joints of its loose bodies."""
+    free_type = int(require("mujoco").mjtJoint.mjJNT_FREE)
+    return [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free_type]
 
 
 class DuoBench(Rcs):
     """DuoBench's eleven tasks of two FR3 arms, "left" and "right", named without "duobench/".
 
-    An action has 16 numbers: the left arm's seven joints, rad, and its gripper, then those of the
-    right arm. The reward is the share of the task's stages reached; a step's info has `stage` and
-    `max_stage`.
+    Action: (16,). The first eight values are the left arm's seven joints, rad, and its gripper, and
+    the last eight are those of the right arm. The reward is the fraction of the task's stages that
+    have been reached. The info of a step contains `stage` and `max_stage`.
     """
 
     suite = "duobench"
@@ -364,35 +408,41 @@ class DuoBench(Rcs):
 class Arms:
     """Translates between RCS's dicts, keyed by robot, and the observations and actions of policies.
 
-    The parts of a single arm's state have plain names, `joints`. With several arms, names begin
-    with that of the arm, `left/joints`, and the gripper is also a part of the state, (1,). A row of
-    the action has the command and then the gripper, 1 = open, of each arm in turn.
+    The state of a single arm has plain names, such as `joints`. With several arms, each name begins
+    with the name of the arm, as in `left/joints`, and the state also contains the gripper, (1,). An
+    action contains the command and then the gripper, 1 = open, of one arm after the other.
     """
 
     def __init__(
         self, actions: Mapping[str, Any], observations: Mapping[str, Any], mode: ControlMode
     ) -> None:
-        """Read RCS's spaces: `actions` and `observations` map robot -> part -> Box (D,)."""
+        """Read RCS's spaces.
+
+        Args:
+            actions: Robot -> name of a command -> Box (D,).
+            observations: Robot -> name of a reading -> Box (D,).
+            mode: The control mode of the actions.
+        """
         self.names = tuple(actions)
         self.single = len(self.names) == 1
         self._mode = mode
         self._sizes = {name: int(actions[name][mode].shape[0]) for name in self.names}
         self._grippers = {name for name in self.names if "gripper" in actions[name].spaces}
-        self.state = {
-            self._key(name, part): StateSpec(int(observations[name][part].shape[0]), unit)
-            for name in self.names
-            for part, unit in _UNITS.items()
-        }
+
+        self.state = {}
+        for name in self.names:
+            for reading, unit in _UNITS.items():
+                dim = int(observations[name][reading].shape[0])
+                self.state[self._key(name, reading)] = StateSpec(dim, unit)
         if not self.single:
-            self.state |= {
-                self._key(name, "gripper"): StateSpec(1)
-                for name in self.names
-                if name in self._grippers
-            }
-        # Whether `Obs.gripper` can report it.
+            for name in self.names:
+                if name in self._grippers:
+                    self.state[self._key(name, "gripper")] = StateSpec(1)
+        # Whether `Obs.gripper` can report the gripper.
         self.has_gripper = self.single and bool(self._grippers)
 
     def action_spec(self, *, delta: bool) -> ActionSpec:
+        """Return the contract's description of an action, relative to the arm's pose if `delta`."""
         space, rotation = _COMMANDS[self._mode]
         return ActionSpec(
             dim=sum(self._sizes.values()) + len(self._grippers),
@@ -405,34 +455,44 @@ class Arms:
             arms=None if self.single else self.names,
         )
 
-    def command(self, row: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+    def command(self, action: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+        """Convert an action, (D,), to RCS's commands: robot -> name of a command -> values."""
         commands: dict[str, dict[str, np.ndarray]] = {}
-        rest = row.astype(np.float64)
+        remaining = action.astype(np.float64)
         for name in self.names:
-            pose, rest = np.split(rest, [self._sizes[name]])
-            commands[name] = {self._mode: pose}
+            target, remaining = np.split(remaining, [self._sizes[name]])
+            commands[name] = {self._mode: target}
             if name in self._grippers:
-                commands[name]["gripper"], rest = np.split(rest, [1])
+                commands[name]["gripper"], remaining = np.split(remaining, [1])
         return commands
 
     def read(self, observation: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float | None]:
-        """Return the state, each part (D,) float32, and a single arm's gripper in [0, 1], 1 =
-        open.
+        """Convert an observation of RCS.
+
+        Args:
+            observation: Robot -> name of a reading -> values.
+
+        Returns:
+            The state, whose values are (D,) float32, and the gripper of a single arm in [0, 1],
+            1 = open. The second is None if there are several arms, or if the arm has no gripper.
         """
-        state = {
-            self._key(name, part): np.array(observation[name][part], dtype=np.float32)
-            for name in self.names
-            for part in _UNITS
-        }
-        openings = {
-            name: np.clip(np.array(observation[name]["gripper"], np.float32), 0, 1)
-            for name in self._grippers
-        }
+        state = {}
+        for name in self.names:
+            for reading in _UNITS:
+                values = np.array(observation[name][reading], dtype=np.float32)
+                state[self._key(name, reading)] = values
+
+        openings = {}
+        for name in self._grippers:
+            opening = np.array(observation[name]["gripper"], np.float32)
+            openings[name] = np.clip(opening, 0, 1)
+
         if self.single:
             return state, float(openings[self.names[0]][0]) if openings else None
-        return state | {
-            self._key(name, "gripper"): opening for name, opening in openings.items()
-        }, None
+        for name, opening in openings.items():
+            state[self._key(name, "gripper")] = opening
+        return state, None
 
-    def _key(self, name: str, part: str) -> str:
-        return part if self.single else f"{name}/{part}"
+    def _key(self, name: str, reading: str) -> str:
+        """Return the name of an arm's reading in the state."""
+        return reading if self.single else f"{name}/{reading}"

@@ -1,6 +1,4 @@
-"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its
-evaluation.
-"""
+"""The fifty kitchen tasks of RoboCasa365's evaluation: a Panda arm on a mobile base, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ Split = Literal["target", "pretrain"]
 ActionOrder = Literal["base_first", "arm_first"]
 
 # RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version
-# 1.0.1: 1.5 times those of 1.0.0.
+# 1.0.1. They are 1.5 times as long as in 1.0.0.
 ATOMIC_SEEN: Mapping[str, int] = {
     "CloseBlenderLid": 900,
     "CloseFridge": 900,
@@ -96,20 +94,25 @@ _KITCHENS: Mapping[str, str] = {
 }
 
 REGISTRIES = ("objaverse", "lightwheel")  # sets of objects from which RoboCasa draws
-TYPES = {"textures": "tex", "fixtures/stoves": "fixtures_lw"} | {
+# Folder of assets -> RoboCasa's name of the download that fills it.
+DOWNLOAD_TYPES = {
+    "textures": "tex",
+    "fixtures/stoves": "fixtures_lw",
     "objects/objaverse": "objs_objaverse",
     "objects/lightwheel": "objs_lw",
-}  # folder -> RoboCasa's name of the download that fills it
+}
 
-# hand, gripper, base, torso, mode: robosuite's order, from the order of the datasets
+# robosuite's order of an action is hand, gripper, base, torso, mode. These are the indices of its
+# values in an action of the datasets.
 _FROM_BASE_FIRST = [*range(5, 12), *range(5)]
-_GRIPPER, _MODE = 6, 11  # in robosuite's order
+_GRIPPER, _MODE = 6, 11  # indices in robosuite's order
 _ON = 0.5  # the threshold of RoboCasa's own Gymnasium environments: both {-1, 1} and {0, 1} work
 
 
 def protocol(task: str, split: Split) -> BenchmarkProtocol:
-    """Return the protocol of a task in the kitchens of `split`; results are published for both
-    splits.
+    """Return the protocol of a task in the kitchens of `split`.
+
+    Results are published for both splits.
     """
     return BenchmarkProtocol(
         name=f"RoboCasa365, split {split}",
@@ -122,26 +125,34 @@ def protocol(task: str, split: Split) -> BenchmarkProtocol:
         success="RoboCasa's own check of the task holds after a step",
         metric="success_once",
         begins=f"{_KITCHENS[split]}, and where everything stands and lies in it: the seed's",
-        # As in openpi's evaluation; GR00T's checks success at the end of each chunk of 16 steps.
+        # As in openpi's evaluation. GR00T's evaluation checks success after each chunk of 16 steps.
         ends_on_success=True,
         episodes=50,
     )
 
 
 class RoboCasa(RobosuiteEnv):
-    """One environment of one of RoboCasa365's tasks, e.g. "OpenDrawer": a Panda arm on an Omron
-    base, in a kitchen.
+    """One environment of one of RoboCasa365's tasks, e.g. "OpenDrawer".
 
-    Observation: cameras by RoboCasa's names, upright; in `state`, by the names of its datasets,
-    `base_position` (3,) m and `base_rotation` (4,) xyzw in the world frame,
-    `end_effector_position_relative` (3,) m and `end_effector_rotation_relative` (4,) xyzw of the
-    hand in the base frame, `gripper_qpos` (2,) m of the fingers.
+    A Panda arm stands on an Omron base in a kitchen.
 
-    Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s per unit) and about
-    its axis (1.5 rad/s per unit); the torso's height; the mode, at least 0.5 to move the base
-    together with the hand; the hand's target, which moves by 0.05 m per unit along the base's axes
-    and turns by 0.5 rad per unit about them, axis-angle; the gripper, which closes at 0.5 or more
-    and opens below that.
+    Observation: the cameras have RoboCasa's names, and their images are upright. `state` has the
+    names of RoboCasa's datasets:
+
+    - `base_position` (3,) m and `base_rotation` (4,) xyzw: the base's pose in the world frame.
+    - `end_effector_position_relative` (3,) m and `end_effector_rotation_relative` (4,) xyzw: the
+      hand's pose in the base frame.
+    - `gripper_qpos` (2,) m: the positions of the fingers.
+
+    Action: (12,) in [-1, 1], in this order:
+
+    - (3,): the base's velocity forward and to the left, 1 m/s per unit, and about its vertical
+      axis, 1.5 rad/s per unit.
+    - (1,): the torso's height.
+    - (1,): the mode. At 0.5 or more, the base moves together with the hand.
+    - (6,): the hand's target moves by 0.05 m per unit along the base's axes, and turns by 0.5 rad
+      per unit about them (axis-angle).
+    - (1,): the gripper closes at 0.5 or more, and opens below that.
     """
 
     suite, title, known = "robocasa", "RoboCasa", tuple(HORIZONS)
@@ -172,24 +183,18 @@ class RoboCasa(RobosuiteEnv):
         `SimulatorEnv`.
 
         Args:
-            task: RoboCasa's name, one of `tasks()`.
+            task: RoboCasa's name of the task, one of `tasks()`.
             split: The kitchens and objects: "target" or "pretrain".
-            cameras: RoboCasa's names; None selects the protocol's three cameras.
-            action_order: "base_first", the order of an action in RoboCasa365's datasets, or
-                "arm_first": hand, gripper, base, torso, mode, the order of RoboCasa's
-                `convert_action` and of LeRobot's environment.
+            cameras: RoboCasa's names of the cameras; None selects the protocol's three cameras.
+            action_order: "base_first" is the order of an action in RoboCasa365's datasets.
+                "arm_first" is the order of RoboCasa's `convert_action` and of LeRobot's
+                environment: hand, gripper, base, torso, mode.
             object_registries: The sets of objects to draw from; the protocol uses both.
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
-        for option, chosen, known in (
-            ("split", [split], get_args(Split)),
-            ("action_order", [action_order], get_args(ActionOrder)),
-            ("object_registries", object_registries, REGISTRIES),
-        ):
-            if not chosen or not set(chosen) <= set(known):
-                raise ConfigError(
-                    f"{self._name}: {option} has {list(chosen)}, want some of {list(known)}"
-                )
+        self._require_choices("split", [split], get_args(Split))
+        self._require_choices("action_order", [action_order], get_args(ActionOrder))
+        self._require_choices("object_registries", object_registries, REGISTRIES)
         self._protocol, self._ends_on_success = protocol(task, split), ends_on_success
         self.max_steps = max_steps or HORIZONS[task]
         self._contract = self.known_contract(
@@ -197,7 +202,7 @@ class RoboCasa(RobosuiteEnv):
         )
         self._order = _FROM_BASE_FIRST if action_order == "base_first" else list(range(12))
         self._registries = tuple(object_registries)
-        images = self._contract.cameras or {}
+
         require_assets(self._registries)
         with (
             failing(self._name, "import robocasa"),
@@ -207,33 +212,52 @@ class RoboCasa(RobosuiteEnv):
         ):
             warnings.simplefilter("ignore")  # warnings of upstream code
             simulator: Any = require("robocasa")
+        self._versions = {
+            "robocasa": simulator.__version__,
+            "robosuite": simulator.robosuite.__version__,
+        }
+
+        images = self._contract.cameras or {}
         with self._making(), seeded(0):
-            made = simulator.utils.env_utils.create_env(
+            env = simulator.utils.env_utils.create_env(
                 task,
                 split=split,
                 obj_registries=self._registries,
                 camera_names=list(images),
                 camera_heights=height or SIZE,
                 camera_widths=width or SIZE,
-                renderer="mujoco",  # as in envs/robosuite
+                renderer="mujoco",  # for the reason given in `Robosuite`
             )
-            # Before the first reset loads the model.
-            made.use_camera_obs = made.has_offscreen_renderer = bool(images)
-            self._use(made)
-        self._versions = {
-            "robocasa": simulator.__version__,
-            "robosuite": simulator.robosuite.__version__,
-        }
+            # Set before the first reset, which loads the model.
+            env.use_camera_obs = env.has_offscreen_renderer = bool(images)
+            self._use(env)
+
+    def _require_choices(self, option: str, values: Sequence[str], allowed: Sequence[str]) -> None:
+        """Raise `ConfigError` unless an option has values, all of which are allowed."""
+        if not values or not set(values) <= set(allowed):
+            raise ConfigError(
+                f"{self._name}: {option} has {list(values)}, want some of {list(allowed)}"
+            )
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         """Return the contract; the state has the names of RoboCasa365's datasets."""
-        chosen = CAMERAS if arguments["cameras"] is None else arguments["cameras"]
-        size = CameraSpec(arguments["height"] or SIZE, arguments["width"] or SIZE)
-        # The gripper is the last number, as in other envs.
-        last = arguments["action_order"] == "base_first"
+        cameras = CAMERAS if arguments["cameras"] is None else arguments["cameras"]
+        image = CameraSpec(arguments["height"] or SIZE, arguments["width"] or SIZE)
+
+        if arguments["action_order"] == "base_first":
+            action = replace(DELTA_POSE, dim=12, space="base_velocity+ee_pose")
+        else:
+            # The contract describes a gripper only as the last value of an action.
+            action = replace(
+                DELTA_POSE,
+                dim=12,
+                space="ee_pose+base_velocity",
+                gripper_open=None,
+                gripper_closed=None,
+            )
         return Contract(
-            cameras=dict.fromkeys(chosen, size),
+            cameras=dict.fromkeys(cameras, image),
             state={
                 "base_position": StateSpec(3, "m"),
                 "base_rotation": StateSpec(4, "quat_xyzw"),
@@ -243,11 +267,7 @@ class RoboCasa(RobosuiteEnv):
             },
             gripper=True,
             instruction=True,
-            action=replace(
-                DELTA_POSE if last else replace(DELTA_POSE, gripper_open=None, gripper_closed=None),
-                dim=12,
-                space="base_velocity+ee_pose" if last else "ee_pose+base_velocity",
-            ),
+            action=action,
             control_hz=CONTROL_HZ,
         )
 
@@ -261,9 +281,9 @@ class RoboCasa(RobosuiteEnv):
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         obs, _ = super()._begin(seed, state)
-        facts = self._env.get_ep_meta()
-        self._instruction = str(facts["lang"])  # mentions objects of this kitchen
-        return obs, {"layout": int(facts["layout_id"]), "style": int(facts["style_id"])}
+        episode = self._env.get_ep_meta()
+        self._instruction = str(episode["lang"])  # mentions objects of this kitchen
+        return obs, {"layout": int(episode["layout_id"]), "style": int(episode["style_id"])}
 
     @classmethod
     def _require_assets(cls) -> None:
@@ -277,18 +297,24 @@ class RoboCasa(RobosuiteEnv):
 
 
 def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
-    """Raise `EnvFailed`, with the cure, if textures, appliances or the objects of one of
-    `registries` are missing.
+    """Check that RoboCasa's assets are installed.
+
+    Args:
+        registries: The sets of objects that are needed, besides textures and appliances.
+
+    Raises:
+        EnvFailed: Assets are missing; the message has the command that downloads them.
     """
     spec = importlib.util.find_spec("robocasa")
     if spec is None or spec.origin is None:  # `require` raises a better error
         return
     folder = Path(spec.origin).parent / "models" / "assets"
-    wanted = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]
-    if lacks := [part for part in wanted if not (folder / part).is_dir()]:
-        types = " ".join(TYPES[part] for part in lacks)
+    needed = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]
+    missing = [name for name in needed if not (folder / name).is_dir()]
+    if missing:
+        types = " ".join(DOWNLOAD_TYPES[name] for name in missing)
         raise EnvFailed(
-            f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with "
-            "that environment's Python: python -m robocasa.scripts.download_kitchen_assets --type "
-            f"{types}; or make that folder a link to a copy of them"
+            f"robocasa: the assets in {folder} lack {missing}; download them once, about 10 GB, "
+            "with that environment's Python: python -m robocasa.scripts.download_kitchen_assets "
+            f"--type {types}; or make that folder a link to a copy of them"
         )

@@ -22,30 +22,32 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.session import variables
 from vlagents_ray.registry import require
 
-_OPEN_M = 0.04  # m, travel of a finger from closed to open
+_OPEN_M = 0.04  # travel of a finger from closed to open
 
 
 class RobosuiteEnv(SimulatorEnv):
     """One environment of robosuite; a subclass makes the simulator and passes it to `_use`.
 
-    `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of
-    objects.
+    `info["sim_state"]` is for scripted experts only. It contains the positions, m, and the
+    quaternions xyzw of objects.
     """
 
     # Names in the contract's state -> robosuite's names, where they differ.
     _raw: Mapping[str, str] = {}
 
     def _use(self, simulator: Any) -> None:
+        """Step this simulator, and close it together with the environment."""
         self._env, self._renderer = simulator, CameraRenderer(simulator)
         self._resources.callback(simulator.close)
         self._resources.callback(self._renderer.make_current)
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         with seeded(seed):
-            # Robosuite 1.5 has its own generator, shared by its components.
+            # The components of robosuite 1.5 share a generator of the simulator.
             if hasattr(self._env, "rng"):
-                self._env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-            # Frees the rendering resources of the last episode in their own context.
+                seeded_generator = np.random.default_rng(seed)
+                self._env.rng.bit_generator.state = seeded_generator.bit_generator.state
+            # A reset frees the rendering resources of the last episode, in the current context.
             self._renderer.make_current()
             self._renderer.open = True
             raw = self._env.reset()
@@ -62,26 +64,33 @@ class RobosuiteEnv(SimulatorEnv):
         return super().describe() | {"control_mode": "OSC_POSE"}
 
     def _command(self, action: np.ndarray) -> np.ndarray:
+        """Convert an action of a policy, (D,) float64, to an action of the simulator."""
         return action
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        return {
-            name: np.asarray(value, np.float64)
-            for name, value in raw.items()
-            if name.endswith(("_pos", "_quat"))
-            and not {"robot0", "robot1", "to"} & set(name.split("_"))
-        }
+        """Return the positions and quaternions of objects in an observation of robosuite."""
+        poses = {}
+        for name, value in raw.items():
+            is_pose = name.endswith(("_pos", "_quat"))
+            # Names with "to" are relative poses, as of the cube to the hand.
+            is_object = not {"robot0", "robot1", "to"} & set(name.split("_"))
+            if is_pose and is_object:
+                poses[name] = np.asarray(value, np.float64)
+        return poses
 
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
+        """Convert an observation of robosuite; without `look` it gets no images."""
         contract = self.contract
         cameras = list(contract.cameras or {}) if look else []
+        state = {}
+        for name in contract.state or {}:
+            raw_name = self._raw.get(name, name)
+            state[name] = np.asarray(raw[raw_name], np.float32)
         return Obs(
+            # OpenGL's first row is the lowest one.
             cameras={name: np.ascontiguousarray(raw[f"{name}_image"][::-1]) for name in cameras},
             gripper=gripper_opening(raw) if contract.gripper else None,
-            state={
-                name: np.asarray(raw[self._raw.get(name, name)], np.float32)
-                for name in contract.state or {}
-            },
+            state=state,
             info={"sim_state": self._sim_state(raw)},
         )
 
@@ -94,15 +103,16 @@ def gripper_opening(raw: Mapping[str, Any]) -> float:
 class CameraRenderer:
     """Renders the cameras while `open` is set; otherwise they return black images and cost nothing.
 
-    robosuite renders each camera for every observation, 14 times from the beginning of a reset to
-    the first observation of the policy. It samples the observation of a step, images included,
-    after the first 2 ms of the step's 50.
+    robosuite renders each camera for every observation: 14 times between the beginning of a reset
+    and the policy's first observation. It samples the observation of a step, images included, after
+    the first 2 ms of the step's 50 ms.
     """
 
     def __init__(self, domain: Any) -> None:
+        """Replace the sensors that `domain`, an environment of robosuite, creates for cameras."""
         self.open = True
         self._domain = domain
-        self._own = domain._create_camera_sensors
+        self._create_sensors = domain._create_camera_sensors
         domain._create_camera_sensors = self._sensors  # called again in each reset
 
     def make_current(self) -> None:
@@ -113,24 +123,26 @@ class CameraRenderer:
             sim._render_context_offscreen.gl_ctx.make_current()
 
     def _sensors(
-        self, cam_name: str, cam_w: int, cam_h: int, **rest: Any
+        self, cam_name: str, cam_w: int, cam_h: int, **options: Any
     ) -> tuple[list[Any], list[str]]:
-        [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
+        """Create the sensor of a camera as robosuite does, and let it render only while open."""
+        [sensor], names = self._create_sensors(cam_name, cam_w=cam_w, cam_h=cam_h, **options)
 
-        @functools.wraps(own)  # keeps robosuite's attributes
-        def look(cache: Any) -> Any:
+        @functools.wraps(sensor)  # keeps robosuite's attributes
+        def render_if_open(cache: Any) -> Any:
             if not self.open:
                 return np.zeros((cam_h, cam_w, 3), np.uint8)
             self.make_current()
-            return own(cache)
+            return sensor(cache)
 
-        return [look], names
+        return [render_if_open], names
 
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed numpy's global generator, from which robosuite 1.4 and LIBERO draw, and restore its
-    state afterwards.
+    """Seed numpy's global generator in the block, and restore its state afterwards.
+
+    robosuite 1.4 and LIBERO draw from that generator.
     """
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
@@ -142,29 +154,45 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextmanager
 def importing_robosuite(env: str) -> Iterator[None]:
-    """Guard the first import of robosuite: make it render on the chosen EGL device, and suppress
-    its advice and log.
+    """Guard the first import of robosuite: select the EGL device, and suppress its log and advice.
 
-    When it is imported, robosuite reads EGL's device number as CUDA's, and refuses numbers that
-    CUDA_VISIBLE_DEVICES does not list. If no EGL device was chosen, it would render on the one with
-    CUDA's number, and fail on an empty CUDA_VISIBLE_DEVICES; the worker finds out which device was
-    used. The log file's path is the same for all users of the machine. Errors name `env`.
+    When it is imported, robosuite reads the number of the EGL device as a CUDA number, and rejects
+    numbers that CUDA_VISIBLE_DEVICES does not list. While it is imported, CUDA_VISIBLE_DEVICES
+    therefore contains the number of the chosen EGL device. Without a chosen EGL device, robosuite
+    renders on the device with the CUDA number, and fails if CUDA_VISIBLE_DEVICES is empty. The
+    worker finds out later which device was used.
+
+    robosuite's log file is suppressed because its path is the same for all users of the machine.
+
+    Args:
+        env: The name of the environment, for errors.
+
+    Raises:
+        EnvFailed: No EGL device renders in software, and the process has no GPU.
     """
-    chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
-    if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
+    egl_device, visible_gpus = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
+    if visible_gpus == "" and egl_device is None and os.environ.get("MUJOCO_GL") == "egl":
         raise EnvFailed(
             f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}"
         )
+    replaced: dict[str, str] = {}
+    if egl_device is not None and visible_gpus:
+        replaced[GPUS] = egl_device
+
     log = logging.getLogger("robosuite_logs")
-    real, level = logging.FileHandler, log.level
-    logging.FileHandler = lambda _: logging.NullHandler()  # type: ignore[assignment,misc]
+    file_handler, level = logging.FileHandler, log.level
+    logging.FileHandler = _no_log_file  # type: ignore[assignment,misc]
     log.setLevel(logging.ERROR)
     try:
-        with variables({} if chosen is None or not visible else {GPUS: chosen}):
+        with variables(replaced):
             yield
     finally:
-        logging.FileHandler = real  # type: ignore[misc]
+        logging.FileHandler = file_handler  # type: ignore[misc]
         log.setLevel(level)
+
+
+def _no_log_file(_path: str) -> logging.Handler:
+    return logging.NullHandler()
 
 
 CONTROL_HZ = 20.0
@@ -182,6 +210,7 @@ class RobosuiteTask:
 
     @property
     def protocol(self) -> BenchmarkProtocol:
+        """The settings of the robomimic study for this task."""
         return BenchmarkProtocol(
             name="robomimic",
             source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and "
@@ -219,15 +248,19 @@ TASKS: Mapping[str, RobosuiteTask] = {
 class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
-    Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each
-    arm `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame,
-    `robot0_gripper_qpos` (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In
-    `info["sim_state"]`, for scripted experts only: the positions and quaternions xyzw of objects,
-    and `target_pos`, the target position of one of them.
+    Observation: the cameras have robosuite's names, and their images are upright. `state` has
+    robomimic's names. It contains for each arm:
 
-    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m per unit along the
-    base's axes and turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1
-    opens, 1 closes, and only its sign counts.
+    - `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw: the hand's pose in the world frame.
+    - `robot0_gripper_qpos` (2,) m: the positions of the fingers.
+    - `robot0_joint_pos` (7,) rad.
+
+    `info["sim_state"]` is for scripted experts only. It contains the positions, m, and quaternions
+    xyzw of objects, and `target_pos`, the position to which an object is to be moved.
+
+    Action: (7,) in [-1, 1] for each arm. The hand's target moves by 0.05 m per unit along the
+    base's axes, and turns by 0.5 rad per unit about them (axis-angle). The last value is the
+    gripper: -1 opens it, 1 closes it, and only the sign has an effect.
     """
 
     suite = title = "robosuite"
@@ -250,8 +283,8 @@ class Robosuite(RobosuiteEnv):
         `SimulatorEnv`.
 
         Args:
-            task: robosuite's name, one of `tasks()`.
-            cameras: MuJoCo's names; None selects robomimic's cameras for the task.
+            task: robosuite's name of the task, one of `tasks()`.
+            cameras: MuJoCo's names of the cameras; None selects robomimic's cameras for the task.
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         self._task = TASKS[task]
@@ -261,6 +294,7 @@ class Robosuite(RobosuiteEnv):
             {"task": task, "width": width, "height": height, "cameras": cameras}
         )
         self._instruction = instruction or self._task.instruction
+
         with importing_robosuite("robosuite"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code
             simulator = require("robosuite")
@@ -269,9 +303,10 @@ class Robosuite(RobosuiteEnv):
                 f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; "
                 f"{self.cure}"
             )
+
         images = self._contract.cameras or {}
         with self._making(), seeded(0):
-            made = simulator.make(
+            env = simulator.make(
                 task,
                 robots=["Panda"] * len(self._task.arms),
                 controller_configs=_controllers(simulator),
@@ -279,52 +314,53 @@ class Robosuite(RobosuiteEnv):
                 ignore_done=True,
                 has_renderer=False,
                 has_offscreen_renderer=bool(images),
-                # With 1.5's own renderer, a reset leaves the last one to garbage collection.
+                # After a reset, the renderer of robosuite 1.5 is left to garbage collection.
                 renderer="mujoco",
                 use_camera_obs=bool(images),
                 camera_names=list(images) or "agentview",
                 camera_heights=[spec.height for spec in images.values()] or 1,
                 camera_widths=[spec.width for spec in images.values()] or 1,
             )
-            # Left out by robosuite, but part of robomimic's observations.
+            # robosuite omits the joints, which are part of robomimic's observations.
             for arm in self._task.arms:
-                made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
-            self._use(made)
+                env.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
+            self._use(env)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         """Return the contract; names and units of the state are those of robomimic's data."""
         task = TASKS[arguments["task"]]
-        chosen = task.cameras if arguments["cameras"] is None else arguments["cameras"]
-        size = CameraSpec(arguments["height"] or task.size, arguments["width"] or task.size)
-        parts = {
-            "eef_pos": StateSpec(3, "m"),
-            "eef_quat": StateSpec(4, "quat_xyzw"),
-            "gripper_qpos": StateSpec(2, "m"),
-            "joint_pos": StateSpec(7, "rad"),
-        }
+        cameras = task.cameras if arguments["cameras"] is None else arguments["cameras"]
+        image = CameraSpec(arguments["height"] or task.size, arguments["width"] or task.size)
+
+        state = {}
+        for arm in task.arms:
+            state[f"{arm}_eef_pos"] = StateSpec(3, "m")
+            state[f"{arm}_eef_quat"] = StateSpec(4, "quat_xyzw")
+            state[f"{arm}_gripper_qpos"] = StateSpec(2, "m")
+            state[f"{arm}_joint_pos"] = StateSpec(7, "rad")
+
+        one_arm = len(task.arms) == 1
         return Contract(
-            cameras=dict.fromkeys(chosen, size),
-            state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
-            gripper=len(task.arms) == 1,
+            cameras=dict.fromkeys(cameras, image),
+            state=state,
+            gripper=one_arm,
             instruction=True,
-            action=replace(
-                DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None
-            ),
+            action=replace(DELTA_POSE, dim=7 * len(task.arms), arms=None if one_arm else task.arms),
             control_hz=CONTROL_HZ,
         )
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        env, found = self._env, super()._sim_state(raw)
+        env, poses = self._env, super()._sim_state(raw)
         if hasattr(env, "target_bin_placements"):
-            found["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)
+            poses["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)
         elif hasattr(env, "peg1_body_id"):
-            found["target_pos"] = np.array(env.sim.data.body_xpos[env.peg1_body_id], np.float64)
-        return found
+            poses["target_pos"] = np.array(env.sim.data.body_xpos[env.peg1_body_id], np.float64)
+        return poses
 
 
 def _controllers(simulator: Any) -> Any:
-    """Return the settings of OSC_POSE that robosuite ships, which robomimic also uses."""
+    """Return robosuite's own settings of its controller OSC_POSE, which robomimic also uses."""
     if hasattr(simulator, "load_composite_controller_config"):  # 1.5
         return simulator.load_composite_controller_config(robot="Panda")
     return simulator.load_controller_config(default_controller="OSC_POSE")

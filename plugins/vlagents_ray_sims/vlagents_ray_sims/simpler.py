@@ -1,8 +1,8 @@
 """SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
 Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
-https://arxiv.org/abs/2405.05941. Visual matching: photographs of the real scene behind the
-simulated robot and objects, and a fixed list of initial configurations.
+https://arxiv.org/abs/2405.05941. The setting is visual matching: a photograph of the real scene is
+the background of the simulated robot and objects, and the initial configurations are a fixed list.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ TWINS: dict[str, str] = {
     "PutSpoonOnTableClothInScene-v1": _WITHIN.format(0.02),
     "StackGreenCubeOnYellowCubeBakedTexInScene-v1": _TOUCHING,
 }
+# ManiSkill's name of a download -> the folder in `data/` that it fills.
 _DATA = {"bridge_v2_real2sim": "tasks/bridge_v2_real2sim_dataset", "widowx250s": "robots/widowx"}
 _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for name in _DATA)
 
@@ -48,7 +49,7 @@ PROTOCOL: dict[str, Any] = {
     "obs_mode": "rgb+segmentation",
     "shader": "default",
     "gripper_open_above": 0.5,  # the command is binarised at this value
-    # 15 only for the Google robot, whose scenes ManiSkill 3 does not have.
+    # SIMPLER uses 15 for the Google robot, whose scenes are not in ManiSkill 3.
     "sticky_gripper_steps": 1,
 }
 
@@ -56,20 +57,21 @@ PROTOCOL: dict[str, Any] = {
 class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
-    Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received
-    and resized themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose
-    of the gripper's link in the robot's base frame; `gripper`. For scripted experts only,
-    `info["sim_state"]`, (13,) float32 in that frame: the positions in m of object, target, gripper
-    and commanded gripper, and the object's yaw in rad.
+    Observation: the camera "3rd_view_camera", (480, 640, 3), a size that the paper's policies
+    received and resized themselves. `state` contains the arm's `joints` (6,) rad, and `tquat` and
+    `xyzrpy`, the pose of the gripper's link in the robot's base frame. `gripper` is its opening.
+    `info["sim_state"]` is for scripted experts only. It contains, as (13,) float32 in the base
+    frame, the positions, m, of the object, the target, the gripper and the commanded gripper, and
+    the object's yaw, rad.
 
-    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
-    the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
-    is relative to the last command, not to the measured pose. As in SIMPLER's script, the
-    controller reads the rotation as the numbers of a rotation vector.
+    Action: (7,), as policies trained on Bridge return it. It contains the gripper's change of
+    position, m, along the base's axes, its change of roll, pitch and yaw, rad, and the gripper,
+    1 open, 0 closed. The changes are relative to the last command, not to the measured pose. As in
+    SIMPLER's script, the controller reads the rotation as a rotation vector.
 
-    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
-    `init_states`. The seed has no other effect. The env continues after success, and never reports
-    `terminated`.
+    The initial state is `options["init_state"]`, SIMPLER's episode id. Without that option it is
+    the seed modulo `init_states`; the seed has no other effect. The env continues after success,
+    and never reports `terminated`.
     """
 
     suite, known = "simpler", tuple(TWINS)
@@ -93,7 +95,8 @@ class Simpler(SimulatorEnv):
             assets: The folder that holds `data/`; None selects `MS_ASSET_DIR`, or ~/.maniskill.
                 ManiSkill reads the variable once, so all environments of a process share one
                 folder.
-            max_steps: None selects the task's own limit, 60, or 120 for the eggplant.
+            max_steps: None selects ManiSkill's limit, which is 120 for the eggplant and 60 for the
+                other tasks.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name of the shader; the protocol uses "default".
@@ -101,26 +104,30 @@ class Simpler(SimulatorEnv):
         super().__init__(task)
         if assets is not None and "mani_skill" not in sys.modules:
             os.environ["MS_ASSET_DIR"] = assets
-        used = require("mani_skill").ASSET_DIR.parent
-        if assets is not None and used.resolve() != Path(assets).resolve():
+        used_folder = require("mani_skill").ASSET_DIR.parent
+        if assets is not None and used_folder.resolve() != Path(assets).resolve():
             raise ConfigError(
                 f"simpler: assets is {assets!r}, but this process has read ManiSkill's from "
-                f"{str(used)!r}; set MS_ASSET_DIR before it starts"
+                f"{str(used_folder)!r}; set MS_ASSET_DIR before it starts"
             )
-        if missing := _missing_assets(used):
+        missing = _missing_assets(used_folder)
+        if missing is not None:
             raise EnvFailed(missing)
-        self.max_steps, own_limit = step_limits(self._name, task, max_steps)
-        self._deviations = (
-            [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
-        )
+
+        self.max_steps, task_limit = step_limits(self._name, task, max_steps)
+        self._deviations = []
+        if self.max_steps != task_limit:
+            self._deviations.append(f"max_steps is {max_steps}, not {task_limit}")
         if shader != PROTOCOL["shader"]:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL['shader']}")
         self._task = task
-        self._given_instruction = instruction
-        # ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the
-        # class. A second twin of this process would otherwise use the lists of the first one.
+        self._user_instruction = instruction
+
+        # ManiSkill keeps the photographs, and the objects that they must not hide, in class
+        # variables. A second twin of this process would otherwise use those of the first one.
         twins: Any = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
         twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
+
         self._env = Simulator(
             self._name,
             task,
@@ -138,11 +145,10 @@ class Simpler(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        return (
-            self._alive().instructions()[0]
-            if self._given_instruction is None
-            else self._given_instruction
-        )
+        if self._user_instruction is not None:
+            return self._user_instruction
+        task_instruction: str = self._alive().instructions()[0]
+        return task_instruction
 
     @classmethod
     def missing(cls) -> str | None:
@@ -150,8 +156,8 @@ class Simpler(SimulatorEnv):
         return ManiSkill.missing() or _missing_assets(folder)
 
     def renderer(self) -> Renderer | None:
-        found: Renderer | None = self._alive().renderer()
-        return found
+        renderer: Renderer | None = self._alive().renderer()
+        return renderer
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -162,25 +168,27 @@ class Simpler(SimulatorEnv):
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        now = self._env.reset(
-            [seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True}
-        )
-        return self._seen(now), {"success": now.success[0]}
+        episode_id = require("torch").tensor([state])
+        moment = self._env.reset([seed], {"episode_id": episode_id, "reconfigure": True})
+        return self._observe(moment), {"success": moment.success[0]}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        now = self._env.step(_command(action)[np.newaxis], look=self.looked_at)
-        return self._seen(now), now.rewards[0], False, {"success": now.success[0]}
+        moment = self._env.step(_command(action)[np.newaxis], look=self.looked_at)
+        return self._observe(moment), moment.rewards[0], False, {"success": moment.success[0]}
 
-    def _seen(self, now: Moment) -> Obs:
-        env, [obs] = self._env.alive(), now.obs
-        base = env.agent.robot.pose.inv()
+    def _observe(self, moment: Moment) -> Obs:
+        """Return the observation of the only environment, with `info["sim_state"]`."""
+        env, [obs] = self._env.alive(), moment.obs
+        base_from_world = env.agent.robot.pose.inv()
+        object_pose = base_from_world * env.objs[env.source_obj_name].pose
+        target_pose = base_from_world * env.objs[env.target_obj_name].pose
         arm = env.agent.controller.controllers["arm"]
-        places = [base * env.objs[name].pose for name in (env.source_obj_name, env.target_obj_name)]
-        w, x, y, z = places[0].q[0].tolist()
+        poses = [object_pose, target_pose, arm.ee_pose_at_base, arm._target_pose]
+        positions = [pose.p[0].cpu().numpy() for pose in poses]
+
+        w, x, y, z = object_pose.q[0].tolist()
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        places += [arm.ee_pose_at_base, arm._target_pose]
-        rows = [place.p[0].cpu().numpy() for place in places]
-        obs.info["sim_state"] = np.array([*np.concatenate(rows), yaw], np.float32)
+        obs.info["sim_state"] = np.array([*np.concatenate(positions), yaw], np.float32)
         return obs
 
 
@@ -196,8 +204,9 @@ _ACTION = ActionSpec(
 
 
 def _command(action: np.ndarray) -> np.ndarray:
-    """Convert an action to ManiSkill's controller, both (7,): rotation vector, gripper -1
-    closed, 1 open.
+    """Convert an action, (7,), to the command of ManiSkill's controller, (7,) float32.
+
+    The command contains a rotation vector, and the gripper is -1 closed, 1 open.
     """
     roll, pitch, yaw = action[3:6].tolist()
     axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
@@ -206,9 +215,11 @@ def _command(action: np.ndarray) -> np.ndarray:
 
 
 def _missing_assets(folder: Path) -> str | None:
-    if not (lacks := [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]):
+    """Return which assets `folder` lacks, with the cure; None if it has all of them."""
+    missing = [name for name in _DATA.values() if not (folder / "data" / name).is_dir()]
+    if not missing:
         return None
     return (
-        f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get "
+        f"SIMPLER's assets are not in {folder} (no data/{missing[0]}); set MS_ASSET_DIR, or get "
         f"them: {_DOWNLOADS}"
     )

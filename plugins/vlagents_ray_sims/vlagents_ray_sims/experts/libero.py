@@ -1,5 +1,6 @@
-"""An expert for LIBERO's tasks, from the simulator's state: it moves objects, closes drawers and
-turns knobs.
+"""An expert for LIBERO's tasks, which moves objects, closes drawers and turns knobs.
+
+It reads the positions of the objects from the simulator's state.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from vlagents_ray_sims.experts.osc_pose import (
     yaw_of,
 )
 
-_LIFT_M = 0.2  # to pass over other objects
-_DOWNWARDS_M = 0.08  # the same where the place is lower
-_CLEAR_M = 0.12  # between the object and its place, when it is carried above
+_LIFT_M = 0.2  # an object is lifted by at least this, to pass over other objects
+_DOWNWARDS_M = 0.08  # an object that is moved to a lower target is lifted by this
+_CLEAR_M = 0.12  # height of a carried object above its target
 _LEAVE_M = 0.15
 _HANDLE_M = 0.121  # from the middle of a drawer to the outer side of its handle
-_TRAVEL_M = 0.165  # of a drawer, from open to closed
-_TWIST = 1.2  # rad, of a stove's knob
+_TRAVEL_M = 0.165  # travel of a drawer from open to closed
+_APPROACH_M = 0.06  # distance of the hand to the handle before it pushes
+_TWIST = 1.2  # rotation of a stove's knob, rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +45,7 @@ class Grip:
     foot_m: float = 0.0  # height of the object's origin above its lowest point
 
 
-# Round objects are grasped in the middle, whatever their orientation.
+# Objects that are not listed are round: they are grasped in the middle, at any orientation.
 _GRIPS = {
     # Bowls are wider than the hand: a finger goes inside.
     "akita_black_bowl": Grip((0.0, 0.048, 0.035)),
@@ -51,7 +53,7 @@ _GRIPS = {
     "porcelain_mug": Grip((0.055, 0.0, 0.095), "x"),  # the rim on the other side of the handle
     "white_yellow_mug": Grip((-0.06, 0.0, 0.085), "x"),
     "red_coffee_mug": Grip((-0.053, 0.0, 0.115), "x"),
-    "moka_pot": Grip((0.0, 0.07, 0.03), "x", foot_m=0.067),  # handles
+    "moka_pot": Grip((0.0, 0.07, 0.03), "x", foot_m=0.067),  # the handle
     "chefmate_8_frypan": Grip((0.18, 0.0, 0.042), "y"),
     "black_book": Grip((0.0, -0.012, 0.105), "x"),
     "yellow_book": Grip((0.0, 0.0, 0.095), "x"),
@@ -87,27 +89,30 @@ _TURNING = (
     PickPhase("release", OPEN, 8, waits=True),
     PickPhase("leave", OPEN, 30),
 )
+# Kind of a predicate -> the phases that meet it.
 _MOTIONS = {"on": _PLACING, "in": _PLACING, "turnon": _TURNING, "close": _CLOSING}
+# The order in which predicates are met: an object is put into a drawer before the drawer is closed.
 _ORDER = ("turnon", "on", "in", "close")
+_STATE_KEYS = {"goal", "unmet", "positions", "quaternions"}
 
 
 class LiberoExpert(PickExpert):
-    """Meets the predicates of the goal one after the other, and repeats those that are then still
-    unmet.
+    """Meets the predicates of the goal one after the other, and then repeats those still unmet.
 
-    It opens neither drawers nor microwaves: such goals are refused.
+    It cannot open drawers or microwaves: `reset` raises `ContractMismatch` for such goals.
     """
 
-    per_m = 12.0
+    units_per_m = 12.0
 
     def __init__(self, env_name: str) -> None:
         super().__init__(env_name, _PLACING)
         self._predicate: list[str] = []
-        self._tries: dict[str, int] = {}
+        self._tries: dict[str, int] = {}  # object -> the number of attempts
         self._lifted_from = 0.0  # m, height of the object before it was lifted
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        unknown = sorted({kind for kind, *_ in self._state(obs)["goal"]} - set(_MOTIONS))
+        kinds = {predicate[0] for predicate in self._state(obs)["goal"]}
+        unknown = sorted(kinds - set(_MOTIONS))
         if unknown:
             raise ContractMismatch(
                 f"{self._name}: the expert meets goals of {sorted(_MOTIONS)}, not {unknown}"
@@ -124,14 +129,16 @@ class LiberoExpert(PickExpert):
 
     def _choose(self, obs: Obs) -> None:
         """Select the predicate to meet next: the one whose object was tried least often."""
+
+        def rank(predicate: list[str]) -> tuple[int, int]:
+            kind, name, *_ = predicate
+            return self._tries.get(name, 0), _ORDER.index(kind)
+
         state = self._state(obs)
-        self._predicate = min(
-            state["unmet"] or state["goal"],
-            key=lambda one: (self._tries.get(one[1], 0), _ORDER.index(one[0])),
-        )
-        name = self._predicate[1]
+        self._predicate = min(state["unmet"] or state["goal"], key=rank)
+        kind, name, *_ = self._predicate
         self._tries[name] = self._tries.get(name, 0) + 1
-        self._phases = _MOTIONS[self._predicate[0]]
+        self._phases = _MOTIONS[kind]
 
     def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
         pose = obs.state.get("xyz_axis_angle")
@@ -155,52 +162,57 @@ class LiberoExpert(PickExpert):
 
     def _aim_at_object(self, hand: np.ndarray, obs: Obs, phase: str) -> None:
         state = self._state(obs)
-        _, name, place = self._predicate
-        thing, there = state["positions"][name], state["positions"][place]
+        _, name, region = self._predicate
+        position, region_position = state["positions"][name], state["positions"][region]
         grip = _GRIPS.get(name.rpartition("_")[0], _MIDDLE)
+
         if phase in ("over", "down"):
             if grip.along:
                 yaw = yaw_of(state["quaternions"][name])
             else:
-                # the rim away from the cabinet, whose open drawer the hand would meet; then other
-                # sides
-                cabinets = [
-                    at[1] for other, at in state["positions"].items() if "cabinet_1" in other
-                ]
-                yaw = (math.pi if cabinets and cabinets[0] > 0 else 0.0) + math.pi / 2 * (
-                    self._tries[name] - 1
-                )
+                yaw = self._rim_yaw(name, state["positions"])
             self._turn(yaw + (math.pi / 2 if grip.along == "x" else 0.0))
-            self._target = thing + rotation(yaw * UP) @ np.array(grip.offset)
+            self._target = position + rotation(yaw * UP) @ np.array(grip.offset)
             if phase == "over":
                 self._target[2] = max(self._target[2] + OVER_M, hand[2])
+
         elif phase == "lift":
-            self._lifted_from = thing[2]
-            rise = there[2] - thing[2] + grip.foot_m + _CLEAR_M
+            self._lifted_from = position[2]
+            rise = region_position[2] - position[2] + grip.foot_m + _CLEAR_M
             self._target = hand + (_DOWNWARDS_M if rise < 0 else max(_LIFT_M, rise)) * UP
-        elif phase == "carry" and thing[2] - self._lifted_from < _DOWNWARDS_M / 2:  # lost
-            self._finished(hand, obs)
+
+        elif phase == "carry" and position[2] - self._lifted_from < _DOWNWARDS_M / 2:
+            self._finished(hand, obs)  # the hand has lost the object
+
         elif phase in ("carry", "lower"):
-            above = there + hand - thing  # of the hand, with the object above its place
-            contained = place.endswith("contain_region")
-            drop = 0.1 if contained and "caddy" not in place else grip.foot_m + 0.02
-            self._target = np.array(
-                [above[0], above[1], hand[2] if phase == "carry" else above[2] + drop]
-            )
+            # The position of the hand at which the object is in the region.
+            above = region_position + hand - position
+            is_container = region.endswith("contain_region") and "caddy" not in region
+            drop = 0.1 if is_container else grip.foot_m + 0.02
+            height = hand[2] if phase == "carry" else above[2] + drop
+            self._target = np.array([above[0], above[1], height])
+
+    def _rim_yaw(self, name: str, positions: dict[str, np.ndarray]) -> float:
+        """Return the yaw at which to grasp a round object's rim, rad.
+
+        The first attempt is at the side away from the cabinet, whose open drawer the hand could
+        hit. Each further attempt is at the next side.
+        """
+        cabinets = [position for other, position in positions.items() if "cabinet_1" in other]
+        first_side = math.pi if cabinets and cabinets[0][1] > 0 else 0.0
+        return first_side + math.pi / 2 * (self._tries[name] - 1)
 
     def _aim_at_drawer(self, drawer: np.ndarray, phase: str) -> None:
-        """Push the handle from the front, with the narrow side of the hand towards the other
-        drawers.
-        """
+        """Push the handle from the front, with the hand's narrow side towards the other drawers."""
         # Cabinets stand on both sides of the table and face its middle.
         front = -math.copysign(1.0, drawer[1])
         self._turn(math.pi / 2)
         if phase in ("over", "down"):
-            self._target = drawer + np.array(
-                [0.0, front * (_HANDLE_M + 0.06), OVER_M if phase == "over" else 0.0]
-            )
+            height = OVER_M if phase == "over" else 0.0
+            self._target = drawer + np.array([0.0, front * (_HANDLE_M + _APPROACH_M), height])
         elif phase == "push":
-            self._target = self._target - np.array([0.0, front * (0.06 + _TRAVEL_M), 0.0])
+            push = np.array([0.0, front * (_APPROACH_M + _TRAVEL_M), 0.0])
+            self._target = self._target - push
 
     def _aim_at_knob(self, stove: np.ndarray, phase: str) -> None:
         self._turn(0.0)
@@ -212,12 +224,10 @@ class LiberoExpert(PickExpert):
 
     def _state(self, obs: Obs) -> dict[str, Any]:
         state = obs.info.get("sim_state")
-        if not isinstance(state, dict) or not {"goal", "unmet", "positions", "quaternions"} <= set(
-            state
-        ):
-            got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
+        if not isinstance(state, dict) or not set(state) >= _STATE_KEYS:
+            content: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
             raise InvalidObservation(
-                f"info['sim_state']: got {got}, want goal, unmet, positions and quaternions, as "
-                f"the env {self._name} gives them; this expert cannot act on images"
+                f"info['sim_state']: got {content}, want goal, unmet, positions and quaternions, "
+                f"as the env {self._name} gives them; this expert cannot act on images"
             )
         return state

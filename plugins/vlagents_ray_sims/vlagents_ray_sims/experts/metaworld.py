@@ -11,7 +11,8 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task, require
 
-_SIZE = 39  # hand 3, gripper 1, objects 14, the same of the step before, goal 3
+# Hand (3,), gripper (1,) and objects (14,), the same values of the step before, and goal (3,).
+_SIZE = 39
 
 
 class MetaWorldExpert:
@@ -31,7 +32,6 @@ class MetaWorldExpert:
         sim_vector(obs, _SIZE, self._name)
 
     def act(self, obs: Obs) -> Act:
-        action = np.asarray(
-            self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32
-        )
+        state = sim_vector(obs, _SIZE, self._name)
+        action = np.asarray(self._oracle.get_action(state), dtype=np.float32)
         return Act(action=np.clip(action, -1.0, 1.0))

@@ -15,16 +15,19 @@ _STEP_RAD = 0.2  # largest command about the vertical
 # Height of the gripper above the object before the grasp, and above the target after the release.
 _OVER_M = 0.08
 _LIFT_M = 0.10
-# Height of the gripper above the robot's foot; lower, the fingers press on the table.
+# Lowest height of the gripper above the robot's foot, at which the fingers do not yet press on the
+# table.
 _LOWEST_M = 0.0135
 _DROP_M = 0.04  # height of the object's centre above the target's at the release
 
 
 class _Stage(NamedTuple):
+    """A stage of the motion, which ends when the gripper arrives, or after `steps`."""
+
     name: str
     gripper: float
-    steps: int  # after which the next stage begins
-    near_m: float  # distance to the goal at which the next stage begins
+    steps: int
+    arrived_m: float  # distance to the goal at which the gripper has arrived
 
 
 _STAGES = (
@@ -44,58 +47,64 @@ class SimplerExpert:
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
-        self._stage = self._steps = 0
-        self._goal = np.zeros(3)  # of the gripper in this stage, m in the base frame
-        self._turn = 0.0  # remaining rotation, rad
+        self._stage = self._steps = 0  # index of the stage, and its steps up to now
+        self._goal = np.zeros(3)  # position of the gripper in the base frame, m
+        self._turn = 0.0  # remaining rotation about the vertical, rad
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        places, yaw = self._state(obs)
-        self._begin(0, places)
-        # The fingers open across the object, in either direction.
+        positions, yaw = self._state(obs)
+        self._begin(0, positions)
+        # The fingers may close across the object in either direction: choose the smaller turn.
         self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2
 
     def act(self, obs: Obs) -> Act:
-        places, _ = self._state(obs)
-        _, _, gripper, commanded = places
+        """Begin the next stage if the last one is over, and move towards the stage's goal."""
+        positions, _ = self._state(obs)
+        _, _, gripper, commanded = positions
         stage = _STAGES[self._stage]
-        arrived = float(np.linalg.norm(gripper - self._goal)) < stage.near_m and not self._turn
-        if (
-            self._stage + 1 < len(_STAGES)
-            and self._steps
-            and (arrived or self._steps >= stage.steps)
-        ):
-            self._begin(self._stage + 1, places)
+        distance = float(np.linalg.norm(gripper - self._goal))
+        arrived = distance < stage.arrived_m and not self._turn
+        is_over = self._steps > 0 and (arrived or self._steps >= stage.steps)
+        if is_over and self._stage + 1 < len(_STAGES):
+            self._begin(self._stage + 1, positions)
             stage = _STAGES[self._stage]
         self._steps += 1
+
         action = np.zeros(7, dtype=np.float32)
         action[:3] = np.clip(self._goal - commanded, -_STEP_M, _STEP_M)
         action[5] = np.clip(self._turn, -_STEP_RAD, _STEP_RAD)
         action[6] = stage.gripper
-        self._turn -= float(action[5]) if abs(self._turn) > _STEP_RAD else self._turn
+
+        if abs(self._turn) > _STEP_RAD:
+            self._turn -= float(action[5])
+        else:
+            self._turn = 0.0  # exactly, although the action is rounded to float32
         return Act(action=action)
 
-    def _begin(self, stage: int, places: np.ndarray) -> None:
+    def _begin(self, stage: int, positions: np.ndarray) -> None:
+        """Begin a stage, and set its goal from the positions that `_state` returns."""
         self._stage, self._steps = stage, 0
-        thing, target, gripper, _ = places
+        position, target, gripper, _ = positions
         up = np.array([0.0, 0.0, 1.0])
-        held = gripper - thing  # from the object to the gripper, when grasped
+        grip = gripper - position  # from the object to the gripper, when grasped
         name = _STAGES[stage].name
         if name == "over":
-            self._goal = np.maximum(thing, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up
+            self._goal = np.maximum(position, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up
         elif name == "down":
             self._goal = self._goal - _OVER_M * up
         elif name == "lift":
             self._goal = self._goal + _LIFT_M * up
         elif name == "across":
-            self._goal = np.array([*(target + held)[:2], gripper[2]])
+            self._goal = np.array([*(target + grip)[:2], gripper[2]])
         elif name == "lower":
-            self._goal = target + held + _DROP_M * up
+            self._goal = target + grip + _DROP_M * up
         elif name == "away":
             self._goal = self._goal + _OVER_M * up
 
     def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
-        """Return the positions of object, target, gripper and its command, (4, 3) m, and the
-        object's yaw, rad.
+        """Return positions, (4, 3) m, and the object's yaw, rad.
+
+        The positions are those of the object, the target, the gripper and the commanded gripper.
         """
         exact = sim_vector(obs, 13, self._name).astype(np.float64)
         return exact[:12].reshape(4, 3), float(exact[12])

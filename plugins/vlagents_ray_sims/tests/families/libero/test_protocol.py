@@ -23,8 +23,10 @@ def test_the_step_limits_are_those_of_openpi_and_openvla() -> None:
 
 
 def test_what_a_user_changes_is_named_in_the_record() -> None:
-    assert LiberoProtocol.of("libero_goal").to_json("libero_goal")["deviations"] == []
-    changed = LiberoProtocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)
+    assert LiberoProtocol.for_suite("libero_goal").to_json("libero_goal")["deviations"] == []
+    changed = LiberoProtocol.for_suite(
+        "libero_goal", simulator_seed=0, max_steps=10, settling_steps=None
+    )
     assert changed.to_json("libero_goal")["deviations"] == [
         "max_steps: 10, the protocol says 300",
         "simulator_seed: 0, the protocol says 7",
@@ -88,7 +90,7 @@ def test_a_gripper_in_a_policys_own_numbers_becomes_the_simulators(
     own: dict[str, float], commands: dict[float, int]
 ) -> None:
     """LIBERO's own, and OpenVLA's, whose evaluation takes -sign(2 g - 1)."""
-    protocol = LiberoProtocol.of("libero_spatial", **own)
+    protocol = LiberoProtocol.for_suite("libero_spatial", **own)
     for said, command in commands.items():
         action = np.array([0.1, -0.2, 0.3, 0, 0, 0.5, said], np.float32)
         simulated = to_simulator(action, protocol)

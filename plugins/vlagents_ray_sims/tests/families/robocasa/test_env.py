@@ -23,7 +23,7 @@ from vlagents_ray_sims.robocasa import (
     COMPOSITE_SEEN,
     COMPOSITE_UNSEEN,
     CONTROL_HZ,
-    TYPES,
+    DOWNLOAD_TYPES,
     RoboCasa,
 )
 
@@ -197,8 +197,8 @@ def test_the_table_of_tasks_and_the_downloads_are_robocasas(kitchen: object) -> 
         for name, tasks in TARGET_TASKS.items()
     }
     assert ours == theirs
-    assert set(TYPES.values()) <= set(DOWNLOAD_ASSET_REGISTRY)
-    for folder, name in TYPES.items():
+    assert set(DOWNLOAD_TYPES.values()) <= set(DOWNLOAD_ASSET_REGISTRY)
+    for folder, name in DOWNLOAD_TYPES.items():
         assert (
             f"models/assets/{folder.removesuffix('/stoves')}"
             in DOWNLOAD_ASSET_REGISTRY[name]["folder"]
