@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +16,7 @@ from replica_process import ReplicaProcess, model
 from shared_cpu_memory import GPU, ReaderCounts, SharedCpuMemory
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.serve.weights import PushOptions, WeightUpdates
+from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import (
     NotShared,
@@ -27,7 +27,7 @@ from vlagents_ray.weights.shared_values import (
 )
 from vlagents_ray.weights.trainable import portable
 from vlagents_ray_learn.publisher import AppTarget
-from vlagents_ray_learn.weight_push import WeightPusher
+from vlagents_ray_learn.weight_push import Values, WeightPusher
 
 pytestmark = pytest.mark.torch
 
@@ -189,12 +189,11 @@ def test_the_learner_keeps_its_memory_until_the_replica_has_answered(
         def __init__(self) -> None:
             self._pipe, self._process = replica._pipe, replica._process
 
-        async def weights(self, method: Callable[..., Any], *args: Any) -> Any:
+        async def stage(self, number: int, values: Values, options: PushOptions) -> str:
             before = memory.handles
-            answer = await super().weights(method, *args)
-            if method is WeightUpdates.stage:
-                held.extend((before, memory.handles))
-            return answer
+            fingerprint = await super().stage(number, values, options)
+            held.extend((before, memory.handles))
+            return fingerprint
 
     learner = model(device)
     changed(learner)

@@ -5,8 +5,8 @@ meanwhile.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -23,10 +23,14 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import PushMode, PushOptions, Rest
-from vlagents_ray_learn.weight_push import PushResult, ThisReplica, WeightPusher, WeightsReplica
-
-T = TypeVar("T")
+from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushMode, PushOptions, Rest
+from vlagents_ray_learn.weight_push import (
+    PushResult,
+    ThisReplica,
+    Values,
+    WeightPusher,
+    WeightsReplica,
+)
 
 
 class Gain(Agent):
@@ -56,7 +60,7 @@ class Replica(ThisReplica):
 
     def seen_by_others(self) -> WeightsReplica:
         """The replica as others call it."""
-        return _Seen(self)
+        return _ReplicaFromAfar(self)
 
     def gain(self, session: str = "s", *, reset: bool = True) -> tuple[int, float]:
         """The version and the gain with which a simulation acts."""
@@ -69,16 +73,41 @@ class Replica(ThisReplica):
         return act.info["policy"]["version"], float(act.action[0])
 
 
-class _Seen:
+class _ReplicaFromAfar(WeightsReplica):
+    """Notes each call of a replica, and fails those that the replica names."""
+
     def __init__(self, replica: Replica) -> None:
         self._replica = replica
         self.name = replica.name
 
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        self._replica.calls.append(method.__name__)
-        if method.__name__ in self._replica.fails:
-            raise self._replica.fails[method.__name__]
-        return await self._replica.weights(method, *args)
+    def _note(self, method: str) -> None:
+        self._replica.calls.append(method)
+        if method in self._replica.fails:
+            raise self._replica.fails[method]
+
+    async def newest(self) -> NewestVersion:
+        self._note("newest")
+        return await self._replica.newest()
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        self._note("stage")
+        return await self._replica.stage(number, values, options)
+
+    async def commit(self, number: int, options: PushOptions) -> None:
+        self._note("commit")
+        await self._replica.commit(number, options)
+
+    async def drop(self, number: int) -> None:
+        self._note("drop")
+        await self._replica.drop(number)
+
+    async def held(self) -> list[HeldVersion]:
+        self._note("held")
+        return await self._replica.held()
+
+    async def rest(self, rest: Rest) -> None:
+        self._note("rest")
+        await self._replica.rest(rest)
 
 
 class Application:

@@ -1,8 +1,7 @@
-"""Learning with served policies: new weights, evaluations while they are trained, transitions,
-vector environments.
+"""Learning with served policies: pushes of weights, evaluations, transitions, vector environments.
 
-All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "rollouts" (pyarrow,
-gymnasium). Modules are loaded when their names are first used.
+All names except `Publisher`, `TrainingEvaluation` and `log_ratio` need the extra "rollouts"
+(pyarrow, gymnasium). A module is loaded when one of its names is first used.
 """
 
 from __future__ import annotations
@@ -17,13 +16,14 @@ if TYPE_CHECKING:
     from vlagents_ray_learn.training_evaluation import TrainingEvaluation
     from vlagents_ray_learn.vector_env import BatchVectorEnv, as_vector_env
 
-_LATE = {
+# Module -> its names.
+_NAMES = {
     "columns": ("LogRatio", "answers", "arrays", "log_ratio"),
     "publisher": ("Publisher",),
     "rollouts": ("RolloutPlan", "RolloutStats", "Rollouts"),
     "training_evaluation": ("TrainingEvaluation",),
     "vector_env": ("BatchVectorEnv", "as_vector_env"),
-}  # module: its names
+}
 
 __all__ = [
     "BatchVectorEnv",
@@ -41,7 +41,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _LATE.items():
+    for module, names in _NAMES.items():
         if name in names:
             return getattr(importlib.import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

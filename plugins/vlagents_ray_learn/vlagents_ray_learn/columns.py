@@ -1,8 +1,8 @@
 """The columns of transitions: Arrow arrays with views for numpy and torch.
 
-A row is one step of one environment: the observation, the executed action, and its outcome. Rows of
-an episode are in order; a `pyarrow.RecordBatch` of rollouts holds one whole episode. T is the
-number of its rows.
+A row is one step of one environment: the observation, the executed action, and its outcome. The rows
+of an episode are in order. A `pyarrow.RecordBatch` of rollouts contains one whole episode, and T is
+the number of its rows.
 
 | column | numpy view | |
 |---|---|---|
@@ -16,24 +16,25 @@ number of its rows.
 | `gripper` | (T,) float32 | in [0, 1], 1 = open; only if the env has one |
 | `action` | (T, D) float32 | as executed, in the unit of the env's contract |
 | `reward` | (T,) float32 | of the environment; without a shaped reward, 1 for a step that ends in success |
-| `terminated` | (T,) bool | the environment ended the episode with this step: the value of what follows is 0 |
+| `terminated` | (T,) bool | the environment ended the episode with this step: the value of the next state is 0 |
 | `truncated` | (T,) bool | a step limit, or the policy (`Act.done`), ended it: bootstrap from the final observation |
 | `success` | (T,) bool | whether the task is solved in the state that the action led to |
-| `final.COLUMN` | (1, ...) | the observation after the last step, for each column of one; a row an episode |
+| `final.COLUMN` | (1, ...) | the observation after the last step, one row per episode, for each column of observations |
 | `logprob` | (T,) float32 | log-probability of the row, nats, if requested; see below |
 | `value`, `entropy` | (T,) float32 | of the policy at this observation, if requested; NaN without a new answer |
 | `replay.NAME` | (A, ...) | of the policy's A answers, to compute log-probabilities again, if requested; see below |
-| `version` | (T,) int64 | of the weights that chose the action; 0 if the policy names none |
+| `version` | (T,) int64 | of the weights that chose the action; 0 if the policy has no versions |
 | `source` | (T,) str | source of the action: "policy", or `act.info["source"]` ("human", "expert") |
 
-The log-probabilities of a chunk's rows add up to that of the chunk. If the policy states one for
-the whole chunk, the first row has it, and the others have NaN, as in `value` and `entropy`.
+The log-probabilities of a chunk's rows add up to the log-probability of the chunk. If the policy
+returns one for the whole chunk, the first row has it, and the other rows have NaN, as in `value` and
+`entropy`.
 
 With `want=["replay"]` there is a column for each name in `act.info["behaviour"]["replay"]`, such as
 `replay.tokens`, (A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and
-`replay.noise_level`, (A,). Values are of whole chunks, even if only some rows are executed; their
-dtypes are the policy's. In Arrow each is in the first row of its answer's chunk. `answers` returns
-the answer of each step.
+`replay.noise_level`, (A,). Values belong to whole chunks, even if only some rows are executed, and
+have the dtypes of the policy. In Arrow, each value is in the first row of its answer's chunk.
+`answers` returns the number of the answer of each step.
 """
 
 from __future__ import annotations
@@ -53,17 +54,17 @@ REPLAY = "replay"
 
 
 def arrays(transitions: Any) -> dict[str, np.ndarray]:
-    """Return the columns of transitions as numpy arrays with the shapes that the module lists.
+    """Return the columns of transitions as numpy arrays, with the shapes that the module lists.
 
     Numbers and images of a record batch, or of a table of one chunk, are read-only views of its
-    memory; several chunks are first copied into one. Text is an array of objects.
+    memory. Several chunks are first copied into one. Text becomes an array of objects.
 
     Args:
         transitions: A `pyarrow.RecordBatch` or a `pyarrow.Table` of rollouts.
 
     Returns:
-        The arrays by name of column. They have a row a step, those of `final.` columns a row an
-        episode.
+        The arrays by the names of the columns. They have one row per step, and those of `final.`
+        columns have one row per episode.
     """
     pa: Any = optional("pyarrow")
     if isinstance(transitions, pa.Table):
@@ -72,46 +73,46 @@ def arrays(transitions: Any) -> dict[str, np.ndarray]:
 
 
 def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the policy's answer of each step, (T,) int64 from 0: its row of the columns
-    `replay.NAME`.
+    """Return the number of the policy's answer at each step.
 
     Args:
         columns: The columns of whole episodes, with `t` and `act`.
+
+    Returns:
+        (T,) int64, from 0. The number is the row of the answer in the columns `replay.NAME`.
     """
-    begun: np.ndarray = (columns["t"] == 0) | (np.diff(columns["act"], prepend=-1) != 0)
-    return np.cumsum(begun) - 1
+    begins_answer: np.ndarray = (columns["t"] == 0) | (np.diff(columns["act"], prepend=-1) != 0)
+    return np.cumsum(begins_answer) - 1
 
 
 @dataclass(frozen=True, slots=True)
 class LogRatio:
-    """Differences of a learner's log-probabilities of acts from those that the server stated,
-    nats an act.
-    """
+    """The differences between a learner's and the server's log-probabilities of answers."""
 
-    mean: float
-    std: float
-    acts: int  # number of acts compared
+    mean: float  # nats per answer
+    std: float  # nats per answer
+    acts: int  # number of answers compared
 
 
 def log_ratio(learner: Any, server: Any) -> LogRatio:
-    """Compare the log-probabilities of the same acts, under the same weights, of a learner and of
-    the server.
+    """Compare the log-probabilities of the same answers between a learner and the server.
 
-    Before the first step of an optimizer the ratio of a policy gradient should be 1. Differences of
-    precision, kernels or preprocessing change it, and grow with the number of values of an act.
+    Both must have the same weights. Before the first step of an optimizer, the ratio of a policy
+    gradient should be 1, and the difference of log-probabilities 0. Differences of precision,
+    kernels or preprocessing change it, and grow with the number of values of an answer.
 
     Args:
         learner: The learner's log-probabilities, (B, ...), nats: an array or a tensor, on any
             device.
-        server: `info["behaviour"]["logprob"]` of the same acts, or their `columns["logprob"]`, of
-            the same shape. An act is a row of the first dimension, over which all others are
-            summed; rows with NaN are left out.
+        server: `info["behaviour"]["logprob"]` of the same answers, or their `columns["logprob"]`,
+            with the same shape. The first dimension is that of the answers, and the values of each
+            are summed. Answers with NaN are left out.
 
     Returns:
-        Mean and standard deviation of learner - server over the acts.
+        Mean and standard deviation of learner - server over the answers.
 
     Raises:
-        InvalidInput: The shapes differ, or no row is left.
+        InvalidInput: The shapes differ, or all answers have NaN.
     """
     learned = to_numpy(learner).astype(np.float64)
     served = to_numpy(server).astype(np.float64)
@@ -130,19 +131,21 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
 
 
 def _view(pa: Any, column: Any) -> Any:
+    """Return an Arrow array as a numpy array, without a copy if it contains numbers."""
     if isinstance(column, pa.ListArray):
         return _view(pa, column.flatten())
     if isinstance(column, pa.FixedShapeTensorArray):
         return column.to_numpy_ndarray()
     if isinstance(column, pa.DictionaryArray):
-        return np.array(column.dictionary.to_pylist(), object)[column.indices.to_numpy()]
+        texts = np.array(column.dictionary.to_pylist(), object)
+        return texts[column.indices.to_numpy()]
     return column.to_numpy(zero_copy_only=True)
 
 
 def tensors(pa: Any, values: np.ndarray) -> Any:
     """Return (T,) or (T, ...) values as an Arrow array that shares their memory."""
     if values.dtype == np.bool_:
-        # Arrow's own booleans are bits, which allow no view.
+        # The default booleans of Arrow are bits, of which numpy has no view.
         return pa.Bool8Array.from_numpy(values)
     if values.ndim == 1:
         return pa.array(values)
@@ -150,8 +153,12 @@ def tensors(pa: Any, values: np.ndarray) -> Any:
 
 
 def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
-    """Return a column of lists: the next of (N, ...) `values` at each true row of `rows`, (T,)
-    bool, else nothing.
+    """Return a column of lists, (T,), with a value in some rows and empty lists in the others.
+
+    Args:
+        pa: The module `pyarrow`.
+        values: (N, ...), in the order of their rows.
+        rows: (T,) bool, of which N are true: the rows with a value.
     """
     offsets = np.append(0, np.cumsum(rows)).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))

@@ -1,4 +1,4 @@
-"""Packages that are in an extra of this distribution."""
+"""Imports of packages that an extra of this distribution installs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from vlagents_ray.registry import require
 
 
 def optional(module: str, extra: str = "rollouts") -> ModuleType:
-    """Import a module of a package that an extra installs; raises `MissingDependency`, which
-    names the extra.
+    """Import a module of a package that an extra installs.
+
+    Raises:
+        MissingDependency: The package is not installed; the message names the extra.
     """
     return require(module, extra=extra, distribution="vlagents-ray-learn")

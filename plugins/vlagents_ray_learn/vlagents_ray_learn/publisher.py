@@ -1,4 +1,4 @@
-"""Pushing a learner's weights to served policies: `Publisher`, and its three kinds of targets."""
+"""Pushes of a learner's weights to served policies: `Publisher`, and its three kinds of targets."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ logger = logging.getLogger(__name__)
 _ANSWER_S = 10.0  # time limit for the request of the versions
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
 _DISTRIBUTION = "vlagents-ray-learn"
-_WINDOW = 16  # parts (MiB) in flight over the network: with one, each would take a round trip
+# Unacknowledged parts, 1 MiB each, over the network. With one, each part would take a round trip.
+_WINDOW = 16
 
 
 class Publisher(AbstractContextManager["Publisher"]):
-    """Pushes new weights from the learner's memory to a served policy, without a checkpoint on
-    disk.
+    """Pushes new weights from the learner's memory to a served policy, without a checkpoint.
 
         # Or "https://gpu:8000", with a key of the scope "weights".
         with Publisher("serve://pi0") as weights:
             version = weights.push(model.state_dict())
             assert weights.acknowledged(version) == 2  # replicas
 
-    Every replica checks and holds a version before any acts with it, so that a push succeeds
-    everywhere or nowhere.
+    Every replica checks and holds a version before any replica acts with it, so that a push
+    succeeds at all replicas or at none.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             certificate: As for `RemoteAgent`.
 
         Raises:
-            ConfigError: The target is none of these, or this process is in no Ray cluster.
+            ConfigError: The target is none of these, or this process is not in a Ray cluster.
         """
         self._target: EngineTarget | AppTarget | ServerTarget
         if isinstance(target, Engine):
@@ -93,7 +93,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
     def push(
         self,
-        named: Mapping[str, Any],
+        values: Mapping[str, Any],
         *,
         mode: PushMode = "next_episode",
         partial: bool = False,
@@ -104,18 +104,18 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Push new weights to the policy, and return their version once all replicas hold them.
 
         Args:
-            named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or
-                torch tensors, e.g. a `state_dict`. They are copied before this returns, so that the
+            values: The values by the names of `Agent.parameters`: numpy or JAX arrays or torch
+                tensors, e.g. a `state_dict`. They are copied before this returns, so that the
                 learner can continue.
-            mode: When sessions change: at their next reset ("next_episode"), or between two acts
-                ("keep").
-            partial: Whether names may be missing; their values stay, as when only adapters are
-                trained.
+            mode: When sessions change to the version: at their next reset ("next_episode"), or
+                between two calls of the policy ("keep").
+            partial: Whether names may be missing, as when only adapters are trained. Their values
+                do not change.
             allow_same: Whether all values may equal those of the policy.
-            pin: Whether robots and other sessions that do not follow also use it from their next
-                reset on.
-            version: The number of the version, such as the step of training; by default the newest
-                one's + 1.
+            pin: Whether robots, and other sessions that do not follow the newest version, also use
+                this version after their next reset.
+            version: The number of the version, such as the step of training; by default the number
+                of the newest version + 1.
 
         Returns:
             The version, as in `act.info["policy"]["version"]`.
@@ -128,66 +128,69 @@ class Publisher(AbstractContextManager["Publisher"]):
             Overloaded: Another push is under way.
             PolicyUnavailable: A replica cannot be reached; nothing was changed.
             Forbidden: The API key lacks the scope "weights".
-            ConfigError: The server takes no weights, since it lacks this package.
+            ConfigError: The server does not accept weights, since it lacks this package.
         """
-        if not isinstance(named, Mapping):
+        if not isinstance(values, Mapping):
             raise InvalidWeights(
-                f"weights: got {type(named).__name__}, want values by name, such as a state_dict"
+                f"weights: got {type(values).__name__}, want values by name, such as a state_dict"
             )
-        return self._target.push(named, PushOptions(mode, partial, allow_same, pin, version))
+        return self._target.push(values, PushOptions(mode, partial, allow_same, pin, version))
 
     def sleep(self, *, offload: bool = True, at_most_s: float = 600.0) -> None:
-        """Let the policy rest while the learner needs the GPU, after the running batches; requests
-        wait until `wake`.
+        """Stop the policy while the learner needs the GPU.
+
+        Running batches finish first. Requests wait until `wake`.
 
         Args:
-            offload: Whether weights move to the memory of the host, and CUDA graphs are freed.
-                Otherwise both stay, and only unused memory is freed.
+            offload: Whether to move the weights to the memory of the host, and free CUDA graphs.
+                Otherwise both stay on the GPU, and only unused memory is freed.
             at_most_s: Time after which the policy wakes by itself, since its learner may have died,
                 s.
 
         Raises:
             NotTrainable: The policy names no parameters, which `offload` would move.
-            Overloaded: It sleeps already.
+            Overloaded: The policy is already asleep.
             PolicyUnavailable: A replica cannot be reached; the others are awake.
             Forbidden: The API key lacks the scope "weights".
         """
         self._target.rest(Rest("sleep", offload, at_most_s))
 
     def wake(
-        self, named: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any
+        self, values: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any
     ) -> int | None:
-        """Let the policy act again after `sleep`, with the same weights or new ones; free the
-        learner's memory first.
+        """Let the policy act again after `sleep`, with the same weights or new ones.
+
+        Free the learner's memory on the GPU before this call.
 
         Args:
-            named: New weights, with which all acts from now on are made; None to keep those before.
+            values: New weights, with which the policy acts from now on; None keeps the weights
+                that it had before `sleep`.
             mode: As for `push`.
             options: Further options of `push`.
 
         Returns:
-            The version of the new weights; None without new ones.
+            The version of the new weights; None if there are none.
 
         Raises:
-            VLAgentsError: Those of `push`: the policy then acts with the weights before.
-                `PolicyUnavailable` if the GPU has too little memory: the policy still sleeps.
+            PolicyUnavailable: The GPU has too little memory; the policy is still asleep.
+            VLAgentsError: The errors of `push`; the policy then acts with its former weights.
         """
         self._target.rest(Rest("restore"))
         try:
-            return None if named is None else self.push(named, mode=mode, **options)
+            return None if values is None else self.push(values, mode=mode, **options)
         finally:
             self._target.rest(Rest("wake"))
 
     def acknowledged(self, version: int) -> int:
-        """Return the number of replicas that act with this version, or with a later one.
+        """Return the number of replicas that act with a version, or with a later one.
 
         Args:
-            version: The version, as `push` returned it.
+            version: The result of `push`.
         """
         return sum(newest >= version for newest in self._target.versions())
 
     def close(self) -> None:
-        """End the use of the policy, which keeps its weights."""
+        """Close the connection; the policy keeps its weights."""
 
     def __exit__(self, *exc: object) -> None:
         self.close()
@@ -197,14 +200,14 @@ class EngineTarget:
     """An engine in this process; tensors are copied once, on their device.
 
     The three targets have the same methods: `push` returns the version, `rest` lets all replicas
-    take a step of a rest, and `versions` returns the newest version of each replica.
+    sleep, restore their memory or wake, and `versions` returns the newest version of each replica.
     """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
 
-    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        return asyncio.run(self._pusher().push(named, options)).version
+    def push(self, values: Mapping[str, Any], options: PushOptions) -> int:
+        return asyncio.run(self._pusher().push(values, options)).version
 
     def rest(self, rest: Rest) -> None:
         asyncio.run(self._pusher().rest(rest))
@@ -217,17 +220,19 @@ class EngineTarget:
 
 
 class AppTarget:
-    """An application of the Ray cluster that this process is in.
+    """An application of this process's Ray cluster.
 
-    If the learner and all replicas have their weights on the same GPU, the replicas copy them
-    there. Otherwise the values are put into Ray's object store once. All replicas of this node read
-    them there, without a copy if the policy is on the CPU; Ray transfers them once to each other
-    node.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them from
+    the learner's memory. Otherwise the values are put into Ray's object store once. All replicas of
+    this node read them there, without a copy if the policy is on the CPU. Ray transfers them once
+    to each other node.
     """
 
     def __init__(self, app: str) -> None:
-        """Push to the application of that name; raises `ConfigError` if this process is in no
-        Ray cluster.
+        """Push to the application `app`.
+
+        Raises:
+            ConfigError: This process is not in a Ray cluster.
         """
         import ray
 
@@ -237,18 +242,19 @@ class AppTarget:
             )
         self._app = app
 
-    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        if gpu_of(named):
+    def push(self, values: Mapping[str, Any], options: PushOptions) -> int:
+        """Push through the GPU's memory if that is possible, otherwise through the object store."""
+        if gpu_of(values):
             try:
-                with shared(named) as values:
-                    return self._push(values, options)
+                with shared(values) as shared_values:
+                    return self._push(shared_values, options)
             except NotShared as error:
                 logger.info(
                     "serve://%s: the weights go through Ray's object store: %s", self._app, error
                 )
         import ray
 
-        return self._push([ray.put(_portable(named))], options)
+        return self._push([ray.put(_portable(values))], options)
 
     def _push(self, values: Values, options: PushOptions) -> int:
         return int(self._call("push", values, options, timeout_s=_PUSH_S).version)
@@ -260,7 +266,10 @@ class AppTarget:
         return list(self._call("versions", timeout_s=_ANSWER_S))
 
     def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
-        """Call a method of the `WeightsPart` of any replica; its module needs Ray, unlike this."""
+        """Call a method of the `WeightsPart` of any replica.
+
+        The method is named, since the part's module needs Ray, and this module does not.
+        """
         import ray
         from ray import serve
         from ray.serve.exceptions import RayServeException
@@ -272,21 +281,25 @@ class AppTarget:
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, VLAgentsError):
                 raise error.cause from error
-            if type(error.cause) is LookupError:  # `ReplicaParts.call` raises it
-                raise _takes_none(f"serve://{self._app}") from error
+            if type(error.cause) is LookupError:  # raised by `ReplicaParts.call`
+                raise _has_no_part(f"serve://{self._app}") from error
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except (RayServeException, ray.exceptions.RayError, TimeoutError) as error:
-            raise _unknown(f"serve://{self._app}", error) from error
+            raise _unknown_outcome(f"serve://{self._app}", error) from error
 
 
 class ServerTarget:
-    """A server, also on another machine; each push sends the values in parts over a new
-    WebSocket.
+    """A server, which may be on another machine.
+
+    Each push opens a WebSocket and sends the values in parts.
     """
 
     def __init__(self, url: str, credentials: Credentials) -> None:
-        """Push to the server at a URL, "http(s)://HOST:PORT" or one with the path of an
-        application.
+        """Push to the server at a URL.
+
+        Args:
+            url: "http(s)://HOST:PORT", with the path of an application if it has one.
+            credentials: The API key and the certificates.
         """
         base = http_url(url)
         credentials.use_at(base.geturl())
@@ -295,17 +308,18 @@ class ServerTarget:
         scheme = "wss" if base.scheme == "https" else "ws"
         self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + PATH).geturl()
 
-    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        values = _portable(named)
-        for name, value in values.items():
+    def push(self, values: Mapping[str, Any], options: PushOptions) -> int:
+        """Send the header, wait for its answer, and then send the parts of the values."""
+        arrays = _portable(values)
+        for name, value in arrays.items():
             if not is_array(value):
                 raise InvalidWeights(
                     f"weights: {name!r}: expected an array, got {type(value).__name__}"
                 )
-        header = header_of(values)
+        header = header_of(arrays)
         if len(header) > MESSAGE_BYTES:
             raise InvalidWeights(
-                f"weights: {len(values)} names take {len(header)} bytes, the limit is "
+                f"weights: {len(arrays)} names take {len(header)} bytes, the limit is "
                 f"{MESSAGE_BYTES}"
             )
 
@@ -314,28 +328,30 @@ class ServerTarget:
         }
         with self._explained():
             socket = open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)
+
         with closing(socket):
             unanswered = 0
-            window = 1  # the header alone is answered before any value is sent
-            for message in chain((header,), parts_of(values)):
-                # The server has refused the push; its answer has the reason.
+            window = 1  # the server answers the header before any value is sent
+            for message in chain((header,), parts_of(arrays)):
+                # If the connection is closed, the server has rejected the push, and its answer has
+                # the reason.
                 with suppress(ConnectionClosed, OSError):
                     socket.send(message, _ANSWER_S)
                 unanswered += 1
                 if unanswered >= window:
-                    answer = self._answer(socket)
+                    answer = self._receive_answer(socket)
                     unanswered -= 1
                     window = _WINDOW
             for _ in range(unanswered):
-                answer = self._answer(socket)
+                answer = self._receive_answer(socket)
         return int(answer["version"])
 
-    def _answer(self, socket: ProxiedSocket) -> dict[str, Any]:
-        """Return the answer to the oldest part without one, and raise it if it is an error."""
+    def _receive_answer(self, socket: ProxiedSocket) -> dict[str, Any]:
+        """Return the answer to the oldest unacknowledged part; an error is raised."""
         try:
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:
-            raise _unknown(self._url, error) from error
+            raise _unknown_outcome(self._url, error) from error
         if "code" in answer:
             raise read_error(answer)
         return answer
@@ -354,15 +370,15 @@ class ServerTarget:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Replace the error of a path that a server without the part does not have."""
+        """Explain errors of a server without the part, which does not have these paths."""
         try:
             yield
         except (Forbidden, UnknownApp) as error:
-            if self._may_take_weights():
+            if self._may_have_part():
                 raise
-            raise _takes_none(self._base) from error
+            raise _has_no_part(self._base) from error
 
-    def _may_take_weights(self) -> bool:
+    def _may_have_part(self) -> bool:
         """Return whether the server's metadata names the part, or cannot be read."""
         try:
             with self._http() as http:
@@ -371,22 +387,22 @@ class ServerTarget:
             return True
 
 
-def _portable(named: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: portable(value) if is_array(value) else value for name, value in named.items()}
+def _portable(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by name, whose arrays and tensors are numpy arrays."""
+    return {name: portable(value) if is_array(value) else value for name, value in values.items()}
 
 
-def _takes_none(url: str) -> ConfigError:
+def _has_no_part(url: str) -> ConfigError:
     return ConfigError(
         f"{url}: this server takes no new weights; run `{pip_install(distribution=_DISTRIBUTION)}` "
         f"in its environment, and remove `{PART}: null` from the `parts` of its deployment file"
     )
 
 
-def _unknown(url: str, error: Exception) -> PolicyUnavailable:
+def _unknown_outcome(url: str, error: Exception) -> PolicyUnavailable:
     return PolicyUnavailable(
         f"{url}: {str(error) or 'no answer'}; whether it acts with the version is unknown: look at "
-        "`acknowledged`, and "
-        f"push again"
+        "`acknowledged`, and push again"
     )
 
 

@@ -1,6 +1,4 @@
-"""What this distribution registers: an entry for each command, and one for each part of a
-replica.
-"""
+"""The entries that this distribution registers: a command, and a part of a replica."""
 
 from vlagents_ray.registry import RegistryEntry
 

@@ -23,7 +23,7 @@ from vlagents_ray.weights.trainable import evaluation_mode, fingerprint
 
 
 class TrainingEvaluation:
-    """Evaluates a policy while it is trained, in a share of the trainer's time.
+    """Evaluates a policy while it is trained, within a share of the training's time.
 
         plan = EvalConfig(
             policies=[{"name": "reach"}], suites=[{"envs": ["tabletop/lift"], "episodes": 50}],
@@ -34,9 +34,9 @@ class TrainingEvaluation:
             version = weights.push(model.state_dict())
             evaluation.play_if_due(version)
 
-    Results are those of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version:
-    "reach@3". All versions play the same episodes. The trainer waits for the end, so that nothing
-    is pushed.
+    Results have the format of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version,
+    such as "reach@3". All versions run the same episodes. `play` returns when the evaluation is
+    over, so that the trainer pushes nothing meanwhile.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class TrainingEvaluation:
         share: float = 0.1,
         progress: Progress | None = None,
     ) -> None:
-        """Check the plan; nothing is played yet.
+        """Check the plan; no episode is run yet.
 
         Args:
-            policy: The URL of the policy's server, to which the versions are pushed; or the agent
-                that this process trains. An agent's episodes are played in this process, each by a
-                copy that shares its weights, as a server makes them; those of a URL by the plan's
-                workers.
+            policy: The URL of the policy's server, to which the versions are pushed, or the agent
+                that this process trains. The plan's workers run the episodes of a URL. The episodes
+                of an agent are run in this process, each with a copy of the agent that shares its
+                weights, as in a server.
             plan: The suites, the folder of results, and one policy without `steps`: its name and
                 its options. Its `url` and `source` are ignored.
-            share: The part of the time since now that evaluations may take, in (0, 1].
+            share: The fraction of the time since this call that evaluations may take, in (0, 1].
             progress: As for `evaluate`.
 
         Raises:
@@ -81,31 +81,36 @@ class TrainingEvaluation:
                 "folder"
             )
         require_envs(plan_cases(plan))
+
         self._policy = policy
         self._plan = plan.model_copy(update={"resume": True})
         self._share = share
         self._progress = progress
+
         self._began = monotonic()
-        self._spent_s = self._last_s = 0.0
+        self._spent_s = 0.0  # duration of all evaluations
+        self._last_s = 0.0  # duration of the last evaluation
 
     @property
     def is_due(self) -> bool:
-        """Whether an evaluation as long as the last one would keep to the share. The first is
-        due at once.
+        """Whether an evaluation as long as the last one would stay within the share.
+
+        The first evaluation is due at once.
         """
         elapsed_s = monotonic() - self._began
         return self._spent_s + self._last_s <= self._share * (elapsed_s + self._last_s)
 
     def play_if_due(self, version: int) -> Summary | None:
-        """Evaluate the policy as `play` does if that is due, else return None."""
+        """Evaluate the policy as `play` does if an evaluation is due; otherwise return None."""
         return self.play(version) if self.is_due else None
 
     def play(self, version: int) -> Summary:
-        """Evaluate the policy now, for example at the end of training. Episodes with a result are
-        not played again.
+        """Evaluate the policy now, for example at the end of training.
+
+        Episodes that have a result are not run again.
 
         Args:
-            version: The result of `Publisher.push`; for an agent of this process an increasing
+            version: The result of `Publisher.push`. For an agent of this process, an increasing
                 number, such as the step of training.
 
         Returns:
@@ -113,8 +118,8 @@ class TrainingEvaluation:
 
         Raises:
             WeightsLost: The policy acts with another version: push this one, and call again.
-            ConfigError: The results of this version are of other weights, as after a restart of the
-                training.
+            ConfigError: The results of this version are those of other weights, as after a restart
+                of the training.
             NotTrainable: The agent names no parameters to train.
             VLAgentsError: As for `evaluate`.
         """
@@ -135,16 +140,19 @@ class TrainingEvaluation:
         if newest.get("version") != version:
             raise WeightsLost(
                 f"version: got {version}, but the newest that {url} acts with is "
-                f"{newest.get('version')}; "
-                f"use what the last push returned, once `acknowledged` counts all replicas"
+                f"{newest.get('version')}; use what the last push returned, once `acknowledged` "
+                "counts all replicas"
             )
-        return evaluate(self._plan_for(PushedWeights(**newest), url=url), progress=self._progress)
+        plan = self._plan_for(PushedWeights(**newest), url=url)
+        return evaluate(plan, progress=self._progress)
 
     def _evaluate_agent(self, agent: Agent, version: int) -> Summary:
-        """Evaluate an agent of this process with its present weights."""
+        """Evaluate an agent of this process with its current weights."""
         pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
         session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
-        module = None if agent.trainable is None else attrgetter(agent.trainable)(agent)
+        module = None
+        if agent.trainable is not None:
+            module = attrgetter(agent.trainable)(agent)
         with evaluation_mode(module):
             plan = self._plan_for(pushed).model_copy(update={"workers": 0})
             return evaluate(plan, agent_factory=lambda: session, progress=self._progress)
@@ -158,7 +166,7 @@ class TrainingEvaluation:
 
 
 class _EvaluatedSession(Agent):
-    """A session of an agent that is trained in this process, with the agent's present weights."""
+    """A session of an agent that is trained in this process, with the agent's current weights."""
 
     def __init__(self, trained: Agent, copies: AgentCopies, pushed: PushedWeights) -> None:
         self._trained, self._copies, self._pushed = trained, copies, pushed
@@ -177,9 +185,13 @@ class _EvaluatedSession(Agent):
         return self._copy.reset(obs, instruction, **kwargs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        """Act with the sessions' copies, and add the version of the weights to each answer."""
         copies = [session._copy for session in sessions if isinstance(session, _EvaluatedSession)]
-        named = {POLICY: self._pushed.model_dump()}
-        return [
-            act if isinstance(act, Exception) else replace(act, info={**(act.info or {}), **named})
-            for act in self._trained.act_batch(obs, copies)
-        ]
+        acts: list[Act | Exception] = []
+        for act in self._trained.act_batch(obs, copies):
+            if isinstance(act, Exception):
+                acts.append(act)
+            else:
+                info = {**(act.info or {}), POLICY: self._pushed.model_dump()}
+                acts.append(replace(act, info=info))
+        return acts

@@ -1,24 +1,26 @@
-"""New weights for all replicas of an application: every replica holds a version before any replica
-acts with it.
+"""New weights for all replicas: every replica holds a version before any replica acts with it.
 
 The replica that receives a push coordinates it. It stages the version at all replicas, and commits
-it only if all of them hold it; otherwise it drops it, and nothing has changed. A replica that
-starts later, or has missed a commit, gets the versions of the others (`WeightPusher.catch_up`). If
-the coordinator dies before the commits, the replicas drop the staged version by themselves; if it
-dies between two commits, the replicas without a commit catch up.
+it only if all of them hold it. Otherwise it drops the version, and nothing has changed.
+
+A replica that starts later, or that has missed a commit, gets the versions of the others
+(`WeightPusher.catch_up`). If the coordinator dies before the first commit, the replicas drop the
+staged version by themselves. If it dies between two commits, the replicas without a commit catch
+up.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights import (
+    HeldVersion,
     NewestVersion,
     PushMode,
     PushOptions,
@@ -27,15 +29,15 @@ from vlagents_ray.serve.weights import (
 )
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
-T = TypeVar("T")
-
 Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]] | SharedValues
-"""Values by name; a list of one reference to them in Ray's object store, which each replica reads
-in place; or handles of a learner's memory on the GPU of all replicas."""
+"""The values of a push: a mapping by name; or a list of one reference to such a mapping in Ray's
+object store, which each replica reads in place; or handles of a learner's memory on the GPU of all
+replicas."""
 
 logger = logging.getLogger(__name__)
 
-# Maximum step from one version to the next if a learner numbers them, such as by its training step.
+# Largest difference from one version to the next if a learner chooses the numbers, such as the step
+# of its training.
 _MOST_AHEAD = 10**9
 _ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
 
@@ -50,29 +52,60 @@ class PushResult:
 
 
 class WeightsReplica(Protocol):
-    """A replica's interface for a push."""
+    """A replica as the target of a push: the methods of its `WeightUpdates`.
+
+    Each method may also raise `PeerEnded` if the replica has ended, and `PeerUnreachable` if it
+    does not answer.
+    """
 
     name: str  # for messages
 
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and
-        `PeerUnreachable`.
-        """
+    async def newest(self) -> NewestVersion:
+        """Return the newest version of the replica."""
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        """Check and hold a new version, and return its fingerprint."""
+
+    async def commit(self, number: int, options: PushOptions) -> None:
+        """Use the staged version."""
+
+    async def drop(self, number: int) -> None:
+        """Drop the staged version."""
+
+    async def held(self) -> list[HeldVersion]:
+        """Return the versions that a replica that has missed them needs."""
+
+    async def rest(self, rest: Rest) -> None:
+        """Let the replica sleep, restore its memory, or wake."""
 
 
 class ThisReplica(WeightsReplica):
-    """The local replica as the target of a push."""
+    """The local replica as the target of a push. Calls may be slow: they run on other threads."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
         self.name, self._updates = name, updates
 
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call the method on another thread, since it may be slow."""
-        values = []
-        for argument in args:
-            # A list holds one reference to values in Ray's object store.
-            values.append(await argument[0] if isinstance(argument, list) else argument)
-        return await asyncio.to_thread(method, self._updates, *values)
+    async def newest(self) -> NewestVersion:
+        return await asyncio.to_thread(self._updates.newest)
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        """Check and hold a new version, after values in Ray's object store have been fetched."""
+        if isinstance(values, list):
+            [reference] = values
+            values = await reference
+        return await asyncio.to_thread(self._updates.stage, number, values, options)
+
+    async def commit(self, number: int, options: PushOptions) -> None:
+        await asyncio.to_thread(self._updates.commit, number, options)
+
+    async def drop(self, number: int) -> None:
+        await asyncio.to_thread(self._updates.drop, number)
+
+    async def held(self) -> list[HeldVersion]:
+        return await asyncio.to_thread(self._updates.held)
+
+    async def rest(self, rest: Rest) -> None:
+        await asyncio.to_thread(self._updates.rest, rest)
 
 
 class WeightPusher:
@@ -83,98 +116,119 @@ class WeightPusher:
         this_replica: WeightsReplica,
         siblings: Callable[[], Awaitable[Sequence[WeightsReplica]]],
     ) -> None:
-        """Push to `this_replica` and to its `siblings`, which are looked up for each push."""
+        """Push to a replica and to its siblings.
+
+        Args:
+            this_replica: The replica in this process.
+            siblings: Returns the other replicas; it is called for each push.
+        """
         self._this_replica, self._siblings = this_replica, siblings
         self._pushing = asyncio.Lock()
-        self._known: set[str] = set()  # names of replicas that have answered
+        self._answered: set[str] = set()  # names of replicas that have answered the last call
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights, or none of them."""
+        """Make all replicas act with new weights, or none of them.
+
+        Args:
+            values: The new weights.
+            options: The options of `Publisher.push`.
+
+        Returns:
+            The version, and the replicas that act with it. Replicas that have ended meanwhile are
+            left out, and so are replicas that did not commit and will catch up.
+
+        Raises:
+            InvalidInput: The number of the version is not above the newest one, or far above it.
+            InvalidWeights: The replicas hold different values.
+            NotShared: The GPU of the values is not readable by a replica.
+            PolicyUnavailable: A replica cannot be reached; nothing was changed.
+            VLAgentsError: The errors of `ModelWeights.stage`.
+        """
         async with self._pushing:
             newest = {
-                self._this_replica: await self._this_replica.weights(WeightUpdates.newest),
+                self._this_replica: await self._this_replica.newest(),
                 **await self._loaded(await self._siblings()),
             }
-            if len({version.model for version in newest.values()}) > 1:
-                raise PolicyUnavailable(
-                    "weights: the replicas are changing their checkpoint; push again in a while"
-                )
-
-            last = max(version.number for version in newest.values())
-            number = last + 1 if options.version is None else options.version
-            if number <= last:
-                raise InvalidInput(
-                    f"version: got {number}, want one above {last}, the newest that acts"
-                )
-            if number > last + _MOST_AHEAD:
-                raise InvalidInput(
-                    f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest "
-                    "that acts: versions never go back, so that a number beyond would end all "
-                    "numbered pushes"
-                )
-
+            number = _number_of_push(newest.values(), options)
             if isinstance(values, SharedValues):
                 _require_gpu(values.gpu, newest)
-            staged: dict[WeightsReplica, str] = {}  # fingerprints of the staged values
 
-            async def stage(replica: WeightsReplica) -> None:
-                staged[replica] = await replica.weights(
-                    WeightUpdates.stage, number, values, options
+            fingerprints = await self._stage(newest, number, values, options)
+
+            commits = [self._commit(replica, number, options) for replica in fingerprints]
+            committed = await asyncio.gather(*commits)
+            acting = []
+            for replica, acts in zip(fingerprints, committed, strict=True):
+                if acts:
+                    acting.append(replica.name)
+            return PushResult(number, fingerprints[self._this_replica], tuple(sorted(acting)))
+
+    async def _stage(
+        self,
+        replicas: Iterable[WeightsReplica],
+        number: int,
+        values: Values,
+        options: PushOptions,
+    ) -> dict[WeightsReplica, str]:
+        """Stage a version at all replicas, or at none.
+
+        Returns:
+            The fingerprint of the values at each replica, without replicas that have ended.
+        """
+        fingerprints: dict[WeightsReplica, str] = {}
+
+        async def stage(replica: WeightsReplica) -> None:
+            fingerprints[replica] = await replica.stage(number, values, options)
+
+        replicas = list(replicas)
+        try:
+            results = await asyncio.gather(*map(stage, replicas), return_exceptions=True)
+            for replica, result in zip(replicas, results, strict=True):
+                if isinstance(result, PeerUnreachable):
+                    raise _unreachable(replica) from result
+                if isinstance(result, BaseException) and not isinstance(result, PeerEnded):
+                    raise result
+            different = set(fingerprints.values())
+            if len(different) > 1:
+                raise InvalidWeights(
+                    "weights: the replicas hold different values, "
+                    f"{sorted(different)}; push them again"
                 )
-
-            try:
-                results = await asyncio.gather(*map(stage, newest), return_exceptions=True)
-                for replica, result in zip(newest, results, strict=True):
-                    if isinstance(result, PeerUnreachable):
-                        raise _unreachable(replica) from result
-                    if isinstance(result, BaseException) and not isinstance(result, PeerEnded):
-                        raise result
-                fingerprints = set(staged.values())
-                if len(fingerprints) > 1:
-                    raise InvalidWeights(
-                        "weights: the replicas hold different values, "
-                        f"{sorted(fingerprints)}; push them again"
-                    )
-            except BaseException:
-                # Where staging failed, another push may have staged a version of the same number.
-                await asyncio.gather(
-                    *(replica.weights(WeightUpdates.drop, number) for replica in staged),
-                    return_exceptions=True,
-                )
-                raise
-
-            committed = await asyncio.gather(
-                *(self._commit(replica, number, options) for replica in staged)
-            )
-
-            acting = sorted(
-                replica.name for replica, acts in zip(staged, committed, strict=True) if acts
-            )
-            return PushResult(number, staged[self._this_replica], tuple(acting))
+        except BaseException:
+            # Only where staging succeeded: where it failed, another push may have staged a version
+            # of the same number.
+            drops = [replica.drop(number) for replica in fingerprints]
+            await asyncio.gather(*drops, return_exceptions=True)
+            raise
+        return fingerprints
 
     async def rest(self, rest: Rest) -> None:
-        """Let all replicas take a step of a rest; if one cannot sleep, none does."""
+        """Let all replicas sleep, restore their memory, or wake; if one cannot sleep, none does.
+
+        Raises:
+            PolicyUnavailable: A replica cannot be reached.
+            VLAgentsError: The errors of `WeightUpdates.rest`.
+        """
         async with self._pushing:
             replicas = [self._this_replica, *await self._loaded(await self._siblings())]
-            results = await asyncio.gather(
-                *(replica.weights(WeightUpdates.rest, rest) for replica in replicas),
-                return_exceptions=True,
-            )
-            answers = dict(zip(replicas, results, strict=True))
-            failed = {
-                replica: error
-                for replica, error in answers.items()
-                if error is not None and type(error) is not PeerEnded
-            }
+            calls = [replica.rest(rest) for replica in replicas]
+            results = await asyncio.gather(*calls, return_exceptions=True)
+
+            succeeded = []
+            failed: list[tuple[WeightsReplica, BaseException]] = []
+            for replica, error in zip(replicas, results, strict=True):
+                if error is None:
+                    succeeded.append(replica)
+                elif type(error) is not PeerEnded:
+                    failed.append((replica, error))
             if not failed:
                 return
 
             if rest.step == "sleep":
-                asleep = [replica for replica in replicas if answers[replica] is None]
-                wakes = [replica.weights(WeightUpdates.rest, Rest("wake")) for replica in asleep]
+                wakes = [replica.rest(Rest("wake")) for replica in succeeded]
                 await asyncio.gather(*wakes, return_exceptions=True)
 
-            replica, error = next(iter(failed.items()))
+            replica, error = failed[0]
             if isinstance(error, PeerUnreachable):
                 raise _unreachable(replica) from error
             raise error
@@ -185,11 +239,12 @@ class WeightPusher:
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
         async with self._pushing:
-            current = best = await self._this_replica.weights(WeightUpdates.newest)
+            this_replica = self._this_replica
+            current = best = await this_replica.newest()
             source = None
             for replica in await self._siblings():
                 try:
-                    newest = await replica.weights(WeightUpdates.newest)
+                    newest = await replica.newest()
                 except (PeerEnded, PeerUnreachable, VLAgentsError):
                     continue  # the replica has no newer version
                 if newest.number > best.number and newest.model == current.model:
@@ -198,26 +253,26 @@ class WeightPusher:
                 return
 
             last = current.number
-            for version in await source.weights(WeightUpdates.held):
-                if version.number > current.number:
-                    mode: PushMode = (
-                        "keep" if last < version.kept <= version.number else "next_episode"
-                    )
-                    last = version.number
-                    options = PushOptions(mode=mode, allow_same=True, pin=version.pinned)
-                    await self._this_replica.weights(
-                        WeightUpdates.stage, version.number, version.values, options
-                    )
-                    await self._this_replica.weights(WeightUpdates.commit, version.number, options)
+            for version in await source.held():
+                if version.number <= current.number:
+                    continue
+                # Sessions change at once if a version since the last one was pushed with "keep".
+                was_kept = last < version.kept <= version.number
+                mode: PushMode = "keep" if was_kept else "next_episode"
+                last = version.number
+                options = PushOptions(mode=mode, allow_same=True, pin=version.pinned)
+                await this_replica.stage(version.number, version.values, options)
+                await this_replica.commit(version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
-        """Commit at one replica, and return whether it acts with the version; otherwise it will
-        catch up.
+        """Commit at one replica, and return whether it acts with the version.
+
+        A replica that does not act with it will catch up.
         """
         for _ in range(_ATTEMPTS):
             try:
-                await replica.weights(WeightUpdates.commit, number, options)
+                await replica.commit(number, options)
             except PeerEnded:
                 return False
             except PeerUnreachable as error:
@@ -234,37 +289,63 @@ class WeightPusher:
     async def _loaded(
         self, replicas: Sequence[WeightsReplica]
     ) -> dict[WeightsReplica, NewestVersion]:
-        """Return the newest versions of the replicas that have loaded their policy; the others will
-        catch up.
+        """Return the newest versions of the replicas that have loaded their policy.
 
-        A replica that does not answer may be loading. One that has answered before has loaded, so
-        it counts as unreachable.
+        The other replicas will catch up. A replica that does not answer may be loading. A replica
+        that has answered before has loaded its policy: if it does not answer, it is unreachable.
         """
         loaded: dict[WeightsReplica, NewestVersion] = {}
-        answers = await asyncio.gather(
-            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
-        )
+        calls = [replica.newest() for replica in replicas]
+        answers = await asyncio.gather(*calls, return_exceptions=True)
         for replica, answer in zip(replicas, answers, strict=True):
             if isinstance(answer, NewestVersion):
                 loaded[replica] = answer
-            elif isinstance(answer, PeerUnreachable) and replica.name in self._known:
+            elif isinstance(answer, PeerUnreachable) and replica.name in self._answered:
                 raise _unreachable(replica) from answer
             elif not isinstance(answer, PeerEnded | PeerUnreachable | PolicyUnavailable):
                 raise answer
 
-        self._known = {replica.name for replica in loaded}
+        self._answered = {replica.name for replica in loaded}
         return loaded
 
 
+def _number_of_push(newest: Iterable[NewestVersion], options: PushOptions) -> int:
+    """Return the number of the next version, from the newest version of each replica.
+
+    Raises:
+        PolicyUnavailable: The replicas have loaded different checkpoints.
+        InvalidInput: The learner's number is not above the newest one, or far above it.
+    """
+    versions = list(newest)
+    if len({version.model for version in versions}) > 1:
+        raise PolicyUnavailable(
+            "weights: the replicas are changing their checkpoint; push again in a while"
+        )
+
+    last = max(version.number for version in versions)
+    number = last + 1 if options.version is None else options.version
+    if number <= last:
+        raise InvalidInput(f"version: got {number}, want one above {last}, the newest that acts")
+    if number > last + _MOST_AHEAD:
+        raise InvalidInput(
+            f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest "
+            "that acts: versions never go back, so that a number beyond would end all "
+            "numbered pushes"
+        )
+    return number
+
+
 def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
+    """Raise `NotShared` unless all replicas can read the memory of this GPU."""
     for replica, newest in replicas.items():
-        if gpu not in newest.gpus:
-            reads = (
-                f"only memory of GPU {', '.join(newest.gpus)}" if newest.gpus else "no GPU's memory"
-            )
-            raise NotShared(
-                f"replica {replica.name} can copy {reads}, and the learner's is on GPU {gpu}"
-            )
+        if gpu in newest.gpus:
+            continue
+        readable = "no GPU's memory"
+        if newest.gpus:
+            readable = f"only memory of GPU {', '.join(newest.gpus)}"
+        raise NotShared(
+            f"replica {replica.name} can copy {readable}, and the learner's is on GPU {gpu}"
+        )
 
 
 def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:

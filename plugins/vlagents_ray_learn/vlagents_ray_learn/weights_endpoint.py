@@ -1,20 +1,19 @@
-"""The endpoint for learners on other machines: new weights in the safetensors format, over a
-WebSocket.
+"""The endpoint for learners on other machines, which send new weights as safetensors.
 
-    WS   /v1/weights?mode=keep   a header, then the values in parts, each of which is acknowledged
-    GET  /v1/weights             the newest version of each replica
-    POST /v1/weights/sleep       no acts, and less memory, until "wake"
-    POST /v1/weights/restore     the memory back, still without acts
-    POST /v1/weights/wake        acts again
+    WS   /v1/weights?mode=keep   push a header, then the values in parts; each part is acknowledged
+    GET  /v1/weights             return the newest version of each replica
+    POST /v1/weights/sleep       stop acting, and free memory, until "wake"
+    POST /v1/weights/restore     allocate the memory again, still without acting
+    POST /v1/weights/wake        act again
 
 `vlagents_ray.serve.weights.Rest` describes the last three.
 
-One connection is one push, which ends with it, so that all of its parts reach one replica, and no
-data of a push remain if its learner dies. A learner sends the values when the header is
-acknowledged, and has at most 16 parts of 1 MiB without an answer, so that no proxy on the way
-buffers many. The header is checked against the policy's own weights, whose size bounds the push,
-before memory is allocated. Keys need the scope "weights"; without keys, only processes of this
-machine may push.
+A connection is one push, and the push ends with the connection. Therefore, all parts of a push
+reach one replica, and no data of a push remain if its learner dies. A learner sends the values
+after the header is acknowledged. At most 16 of its parts, 1 MiB each, are unacknowledged, so that
+no proxy on the path buffers many. The header is checked against the policy's weights before memory
+is allocated, so that their size bounds the push. Keys need the scope "weights". Without keys, only
+processes of this machine may push.
 """
 
 from __future__ import annotations
@@ -55,22 +54,24 @@ PART = "weights"  # name of the replica's part that has these routes, as it is r
 LEAST_RATE = 2**18  # minimum average rate of a push, bytes/s, since it blocks other pushes
 _SCOPE = "weights"
 _DIGITS = 20  # maximum number of digits of a version's number
-_TRUTH = {"true": True, "false": False}
+_BOOLEANS = {"true": True, "false": False}  # in the query of a URL
 
 
 class ReceivesWeights(Protocol):
-    """The replicas of a policy, of which one receives new weights for all."""
+    """The replicas of a policy, one of which receives new weights for all of them."""
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Return the types and shapes of the announced values; raise an error if they do not fit
-        the policy.
+        """Return the types and shapes of the announced values.
+
+        Raises:
+            InvalidWeights: They do not fit the policy.
         """
 
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, whose `values` are arrays by name."""
 
     async def rest_all(self, rest: Rest) -> None:
-        """Make all replicas take a step of a rest."""
+        """Make all replicas sleep, restore their memory, or wake."""
 
     async def versions(self) -> list[int]:
         """Return the newest version of each replica."""
@@ -79,10 +80,13 @@ class ReceivesWeights(Protocol):
 def weights_routes(
     replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool
 ) -> list[BaseRoute]:
-    """Return the routes for new weights, each part of which must arrive within `slow_s`, s.
+    """Return the routes for new weights.
 
-    Pushes are refused if the server is `open_to_network`, i.e. if other machines reach it without a
-    key.
+    Args:
+        replicas: Receives the weights.
+        slow_s: The maximum time until the next part of a push arrives, s.
+        open_to_network: Whether other machines reach the server without a key; pushes are then
+            rejected.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [
@@ -93,19 +97,22 @@ def weights_routes(
 
 
 class _WeightsEndpoint:
+    """The handlers of the routes; at most one push is received at a time."""
+
     def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
         self._replicas, self._slow_s = replicas, slow_s
         self._scopes = ScopeCheck("weights", open_to_network=open_to_network)
         self._receiving = False
 
     async def show(self, http: HttpRequest) -> Response:
+        """Return the newest version of each replica."""
         self._scopes.require(_SCOPE)
         return JSONResponse({"versions": await self._replicas.versions()})
 
     async def rest(self, http: HttpRequest) -> Response:
-        """Make the replicas take the step of a rest that the path names."""
+        """Make the replicas sleep, restore their memory, or wake, as the path says."""
         self._scopes.require(_SCOPE)
-        rest = _rest(http.path_params["step"], http.query_params)
+        rest = _read_rest(http.path_params["step"], http.query_params)
         caller = current_caller()
         if isinstance(caller, Caller):
             caller.note("the policy's rest:", rest.step)
@@ -144,9 +151,9 @@ class _WeightsEndpoint:
             raise Overloaded("weights: another push is under way here; push again when it is over")
         self._receiving = True
         try:
-            options = _options(socket.query_params)
+            options = _read_options(socket.query_params)
             caller = current_caller()
-            header = await self._message(socket)
+            header = await self._receive_message(socket)
             if isinstance(caller, Caller):
                 caller.admit()  # a push counts as one request
                 caller.note("pushes weights:", f"mode {options.mode}")
@@ -156,7 +163,7 @@ class _WeightsEndpoint:
             begun = time.monotonic()
             while reader.received < reader.size:
                 await socket.send_text(json.dumps({"received": reader.received}))
-                reader.add(await self._message(socket))
+                reader.add(await self._receive_message(socket))
                 elapsed_s = time.monotonic() - begun
                 if elapsed_s > self._slow_s + reader.received / LEAST_RATE:
                     raise MalformedMessage(
@@ -164,7 +171,7 @@ class _WeightsEndpoint:
                         f"{LEAST_RATE} a second; another push may wait"
                     )
 
-            # When all values have arrived, the push does not depend on the learner's connection.
+            # All values have arrived: the push no longer depends on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
             return {
                 "version": pushed.version,
@@ -174,8 +181,14 @@ class _WeightsEndpoint:
         finally:
             self._receiving = False
 
-    async def _message(self, socket: WebSocket) -> bytes:
-        """Return the next message: the header, or a part of the values."""
+    async def _receive_message(self, socket: WebSocket) -> bytes:
+        """Return the next message: the header, or a part of the values.
+
+        Raises:
+            MalformedMessage: None arrives in time, or it is empty or a text.
+            MessageTooLarge: It is too long.
+            WebSocketDisconnect: The learner has disconnected.
+        """
         try:
             message = await asyncio.wait_for(socket.receive(), self._slow_s)
         except asyncio.TimeoutError:
@@ -200,11 +213,20 @@ class _WeightsEndpoint:
         return data
 
 
-def _rest(step: Any, query: Mapping[str, str]) -> Rest:
-    """Return a step of a rest, with the options in the query of its URL, such as
-    `offload=false&at_most_s=60`.
+def _read_rest(step: Any, query: Mapping[str, str]) -> Rest:
+    """Return a step between acting and acting again.
+
+    Args:
+        step: "sleep", "restore" or "wake".
+        query: The options in the query of the URL, such as `offload=false&at_most_s=60`.
+
+    Raises:
+        InvalidInput: The step is unknown, or an option is wrong.
     """
-    parsers: dict[str, Callable[[str], Any]] = {"offload": _TRUTH.__getitem__, "at_most_s": float}
+    parsers: dict[str, Callable[[str], Any]] = {
+        "offload": _BOOLEANS.__getitem__,
+        "at_most_s": float,
+    }
     try:
         options = {name: parsers[name](value) for name, value in query.items()}
         return Rest(step, **options)
@@ -215,12 +237,16 @@ def _rest(step: Any, query: Mapping[str, str]) -> Rest:
         ) from error
 
 
-def _options(query: Mapping[str, str]) -> PushOptions:
-    """Return the options of a push from the query of its URL, such as `mode=keep&partial=true`."""
-    known = {field.name for field in fields(PushOptions)}
+def _read_options(query: Mapping[str, str]) -> PushOptions:
+    """Return the options of a push from the query of its URL, such as `mode=keep&partial=true`.
+
+    Raises:
+        InvalidInput: An option is unknown, or its value is wrong.
+    """
+    option_names = {field.name for field in fields(PushOptions)}
     options: dict[str, Any] = {}
     for name, value in query.items():
-        if name not in known:
+        if name not in option_names:
             raise InvalidInput(
                 f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or "
                 "version"
@@ -229,8 +255,8 @@ def _options(query: Mapping[str, str]) -> PushOptions:
             options[name] = value
         elif name == "version" and value.isdecimal() and len(value) <= _DIGITS:
             options[name] = int(value)
-        elif name != "version" and value in _TRUTH:
-            options[name] = _TRUTH[value]
+        elif name != "version" and value in _BOOLEANS:
+            options[name] = _BOOLEANS[value]
         else:
             want = "a number" if name == "version" else "true or false"
             raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want {want}")

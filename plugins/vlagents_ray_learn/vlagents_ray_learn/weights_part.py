@@ -1,8 +1,10 @@
-"""New weights as a part of a replica: the routes for learners, the methods for learners inside the
-cluster, and the calls between replicas.
+"""The part of a replica that accepts new weights.
+
+It has the routes for learners on other machines, the methods for learners in the cluster, and the
+methods that the replicas call at one another.
 
 The part is on by default. `parts: {weights: null}` in a deployment file turns it off: the server
-then serves its checkpoints, and takes no pushes.
+then serves its checkpoints, and accepts no pushes.
 """
 
 from __future__ import annotations
@@ -10,9 +12,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import ray
 from ray.util.metrics import Histogram
@@ -25,7 +26,6 @@ from vlagents_ray.serve.weights import (
     NewestVersion,
     PushOptions,
     Rest,
-    WeightUpdates,
 )
 from vlagents_ray.weights.safetensors import ValueSpec
 from vlagents_ray_learn.weight_push import (
@@ -37,25 +37,23 @@ from vlagents_ray_learn.weight_push import (
 )
 from vlagents_ray_learn.weights_endpoint import PATH, weights_routes
 
-T = TypeVar("T")
-
 logger = logging.getLogger(__name__)
 
 # Interval of the checks whether this replica has missed a version of the weights.
 _CATCH_UP_S = 10.0
-_ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
+_ANSWER_S = 3.0  # time limit for an answer; a replica that is loading does not answer
 _TRANSFER_S = 600.0  # time limit for the answer to a call that contains weights
 _SUMMARY = (
     "New weights from a learner, with a key of the scope `weights`; see "
     "`vlagents_ray_learn.Publisher`. The versions that act."
-)
+)  # of the routes, for `GET /docs`
 
 
 class WeightsPart(ReplicaPart):
-    """Takes new weights from learners for all replicas of the application.
+    """Accepts new weights from learners for all replicas of the application.
 
-    Learners call `push`, `rest_all` and `versions` at any replica, which coordinates the others by
-    the methods of its `WeightUpdates`.
+    Learners call `push`, `rest_all` and `versions` at any replica. That replica coordinates the
+    others, at which it calls `newest`, `stage`, `commit`, `drop`, `held` and `rest`.
     """
 
     sibling_methods: ClassVar[Mapping[str, float | None]] = {
@@ -66,7 +64,7 @@ class WeightsPart(ReplicaPart):
         "drop": _ANSWER_S,
         "held": _TRANSFER_S,
         "rest": _TRANSFER_S,
-        # For learners in the cluster, which have time limits of their own.
+        # For learners in the cluster, which set the time limits of these calls.
         "push": None,
         "rest_all": None,
         "versions": None,
@@ -75,10 +73,10 @@ class WeightsPart(ReplicaPart):
     def __init__(self, settings: Any, context: PartContext) -> None:
         super().__init__(settings, context)
         self._updates = context.engine.weights
-        self._own = ThisReplica(context.replica, self._updates)
-        self._pusher = WeightPusher(self._own, self._others)
-        make = partial(series, context.metric_tags)
-        self._push_ms = make(
+        self._this_replica = ThisReplica(context.replica, self._updates)
+        self._pusher = WeightPusher(self._this_replica, self._other_replicas)
+        self._push_ms = series(
+            context.metric_tags,
             Histogram,
             "weight_push_ms",
             "Time until all replicas act with weights.",
@@ -86,11 +84,11 @@ class WeightsPart(ReplicaPart):
         )
 
     async def before_ready(self) -> None:
-        """Take the versions of the other replicas, so that all act with the same ones."""
+        """Get the versions of the other replicas, so that all act with the same ones."""
         await self._catch_up()
 
     async def run(self) -> None:
-        """Take the versions of the other replicas whenever this replica has missed one."""
+        """Get the versions of the other replicas whenever this replica has missed one."""
         while True:
             await asyncio.sleep(_CATCH_UP_S)
             await self._catch_up()
@@ -104,7 +102,7 @@ class WeightsPart(ReplicaPart):
         """Return the paths for learners, for `GET /docs` and for a `Publisher`."""
         return {"paths": [f"WS {PATH}", f"GET {PATH}"], "summary": _SUMMARY}
 
-    # For learners, by way of any replica.
+    # For learners, which call any replica.
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, or none of them."""
@@ -115,14 +113,21 @@ class WeightsPart(ReplicaPart):
 
     async def push_received(self, values: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, which this one has received over the network."""
-        if not await self._others():
+        if not await self._other_replicas():
             return await self.push(values, options)
-        # The values are copied on another thread, to not delay robots on this event loop.
+        # The values are copied on another thread, so that robots on this event loop do not wait.
         reference = await asyncio.to_thread(ray.put, values)
         return await self.push([reference], options)
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Check the header of new weights, before they are received."""
+        """Check the header of new weights before they are received.
+
+        Returns:
+            The types and shapes of the announced values, by name.
+
+        Raises:
+            InvalidWeights: They do not fit the policy.
+        """
         return self._updates.own().read_header(header, options)
 
     async def rest_all(self, rest: Rest) -> None:
@@ -131,13 +136,12 @@ class WeightsPart(ReplicaPart):
 
     async def versions(self) -> list[int]:
         """Return the newest version of each replica that can be reached."""
-        replicas: list[WeightsReplica] = [self._own, *await self._others()]
-        answers = await asyncio.gather(
-            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
-        )
+        replicas: list[WeightsReplica] = [self._this_replica, *await self._other_replicas()]
+        calls = [replica.newest() for replica in replicas]
+        answers = await asyncio.gather(*calls, return_exceptions=True)
         return [newest.number for newest in answers if isinstance(newest, NewestVersion)]
 
-    # For the replica that coordinates a push or a rest, or catches up: see `WeightUpdates`.
+    # For the replica that coordinates a push or a rest, or that catches up; see `WeightUpdates`.
 
     def newest(self) -> NewestVersion:
         """Return the newest version of this replica."""
@@ -145,7 +149,7 @@ class WeightsPart(ReplicaPart):
 
     async def stage(self, number: int, values: Values, options: PushOptions) -> str:
         """Check and hold a new version at this replica, and return its fingerprint."""
-        return await self._own.weights(WeightUpdates.stage, number, values, options)
+        return await self._this_replica.stage(number, values, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version at this replica."""
@@ -163,10 +167,11 @@ class WeightsPart(ReplicaPart):
         """Let this replica sleep, restore its memory, or wake."""
         self._updates.rest(rest)
 
-    async def _others(self) -> list[WeightsReplica]:
+    async def _other_replicas(self) -> list[WeightsReplica]:
         return [_OtherReplica(sibling) for sibling in await self.siblings()]
 
     async def _catch_up(self) -> None:
+        """Get missed versions; an error is logged, and the next check tries again."""
         try:
             await self._pusher.catch_up()
         except Exception:
@@ -176,12 +181,28 @@ class WeightsPart(ReplicaPart):
 
 
 class _OtherReplica(WeightsReplica):
-    """Another replica as the target of a push, through its part."""
+    """Another replica as the target of a push, which is reached through its `WeightsPart`."""
 
     def __init__(self, sibling: SiblingPart) -> None:
         self.name, self._sibling = sibling.name, sibling
 
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call the method of the same name of the part there."""
-        answer: T = await self._sibling.call(method, *args)
-        return answer
+    async def newest(self) -> NewestVersion:
+        newest: NewestVersion = await self._sibling.call(WeightsPart.newest)
+        return newest
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        fingerprint: str = await self._sibling.call(WeightsPart.stage, number, values, options)
+        return fingerprint
+
+    async def commit(self, number: int, options: PushOptions) -> None:
+        await self._sibling.call(WeightsPart.commit, number, options)
+
+    async def drop(self, number: int) -> None:
+        await self._sibling.call(WeightsPart.drop, number)
+
+    async def held(self) -> list[HeldVersion]:
+        versions: list[HeldVersion] = await self._sibling.call(WeightsPart.held)
+        return versions
+
+    async def rest(self, rest: Rest) -> None:
+        await self._sibling.call(WeightsPart.rest, rest)

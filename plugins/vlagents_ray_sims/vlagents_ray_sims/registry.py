@@ -1,4 +1,4 @@
-"""What this distribution registers: an entry for each environment."""
+"""The entries that this distribution registers, one for each environment."""
 
 from vlagents_ray.registry import RegistryEntry
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-from collections.abc import Callable
 from types import TracebackType
 from typing import Any, ClassVar
 
@@ -13,8 +12,17 @@ from shared_cpu_memory import SharedCpuMemory, files_of_torch
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.serve.weights import FollowingSession, ModelWeights, WeightUpdates
+from vlagents_ray.serve.weights import (
+    FollowingSession,
+    HeldVersion,
+    ModelWeights,
+    NewestVersion,
+    PushOptions,
+    Rest,
+    WeightUpdates,
+)
 from vlagents_ray.weights.trainable import portable
+from vlagents_ray_learn.weight_push import Values, WeightsReplica
 
 
 def model(device: str) -> Any:
@@ -103,8 +111,8 @@ def _serve(pipe: Any, device: str, gpu: str) -> None:
         pipe.send(answer)
 
 
-class ReplicaProcess:
-    """The replica as a push sees it: `vlagents_ray_learn.weight_push.WeightsReplica`."""
+class ReplicaProcess(WeightsReplica):
+    """The replica in the other process, as the target of a push."""
 
     name = "replica"
 
@@ -123,10 +131,28 @@ class ReplicaProcess:
             raise answer
         return answer
 
-    async def weights(self, method: Callable[..., Any], *args: Any) -> Any:
-        return self.ask(
-            method.__name__, *[await one[0] if isinstance(one, list) else one for one in args]
-        )
+    async def newest(self) -> NewestVersion:
+        newest: NewestVersion = self.ask("newest")
+        return newest
+
+    async def stage(self, number: int, values: Values, options: PushOptions) -> str:
+        if isinstance(values, list):
+            values = await values[0]
+        fingerprint: str = self.ask("stage", number, values, options)
+        return fingerprint
+
+    async def commit(self, number: int, options: PushOptions) -> None:
+        self.ask("commit", number, options)
+
+    async def drop(self, number: int) -> None:
+        self.ask("drop", number)
+
+    async def held(self) -> list[HeldVersion]:
+        versions: list[HeldVersion] = self.ask("held")
+        return versions
+
+    async def rest(self, rest: Rest) -> None:
+        self.ask("rest", rest)
 
     def __enter__(self) -> ReplicaProcess:
         return self
