@@ -33,7 +33,8 @@ from vlagents_ray_learn.optional import optional
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
 
-_FIRST_ROWS = 128  # allocated; unwritten memory costs nothing
+# Rows that are allocated first; the system provides the memory only when it is written.
+_FIRST_ROWS = 128
 _OTHER_MEMBERS = 2**31  # added to the policy seeds of a group's further members
 
 
@@ -46,20 +47,28 @@ class TransitionRecorder(EpisodeRecorder):
         self._images = images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._observed: dict[str, _Rows] = {}  # the columns of the observations
-        # action, reward, success, act, version ….
+        # For each step: action, reward, success, number of the answer, version, source.
         self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []
+        # The requested columns with a number for each step.
         self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
-        self._acts = 0
+        self._replay: dict[str, _Rows] = {}  # a row for each answer of which a row was executed
+
+        # The current answer of the policy.
+        self._acts = 0  # number of answers up to it
         self._version, self._source = 0, "policy"
-        self._next: dict[str, list[float]] = {}  # requested values, for the next rows of the act
-        self._replay: dict[str, _Rows] = {}  # a row for each act with executed rows
-        self._next_replay: dict[str, np.ndarray] = {}  # until the first row of the act is executed
+        self._next: dict[str, list[float]] = {}  # requested numbers of its remaining rows
+        self._next_replay: dict[str, np.ndarray] = {}  # until its first row is executed
 
     @property
     def wants_images(self) -> EpisodeChoice:
         return "all" if self._images else "none"
 
     def add_observation(self, obs: Obs) -> None:
+        """Add the observation before an action, or after the last one.
+
+        Raises:
+            EnvFailed: Its names or shapes differ from those of the first observation.
+        """
         values: dict[str, Any] = {}
         if self._images:
             values |= {f"cameras.{name}": image for name, image in sorted(obs.cameras.items())}
@@ -72,13 +81,18 @@ class TransitionRecorder(EpisodeRecorder):
                 dtype = np.uint8 if value.ndim == 3 else np.float32
                 self._observed[name] = _Rows(value, dtype)
         expected = {name: rows.shape for name, rows in self._observed.items()}
-        got = {name: value.shape for name, value in values.items()}
-        if got != expected:
-            raise EnvFailed(f"env step: expected {expected} as after reset, got {got}")
+        shapes = {name: value.shape for name, value in values.items()}
+        if shapes != expected:
+            raise EnvFailed(f"env step: expected {expected} as after reset, got {shapes}")
         for name, value in values.items():
             self._observed[name].add(value)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        """Add an answer of the policy, before its rows are executed.
+
+        Raises:
+            ConfigError: A requested value is missing or has a wrong shape.
+        """
         self._acts += 1
         self._version = version_of(act) or 0
         self._source = str(act.info.get("source", "policy"))
@@ -87,15 +101,16 @@ class TransitionRecorder(EpisodeRecorder):
         if missing:
             raise ConfigError(
                 f"want: got no {' and no '.join(missing)} in act.info[{BEHAVIOUR!r}], which has "
-                f"{sorted(behaviour)}; "
-                f"take a policy that returns it, or leave it out of `want`"
+                f"{sorted(behaviour)}; take a policy that returns it, or leave it out of `want`"
             )
+
         rows = len(act.rows())
         self._next = {name: _by_row(behaviour[name], rows, name) for name in self._wanted}
         if REPLAY in self._want:
             self._next_replay = self._checked_replay(behaviour[REPLAY])
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Add a step: the executed row of the current answer, (D,), and its outcome."""
         row = (
             np.array(action, np.float32),
             reward,
@@ -112,7 +127,12 @@ class TransitionRecorder(EpisodeRecorder):
         self._next_replay = {}
 
     def _checked_replay(self, replay: Any) -> dict[str, np.ndarray]:
-        """Return an act's replay by name; its shapes must be those of the first act."""
+        """Return the replay values of an answer by name.
+
+        Raises:
+            ConfigError: They are not numbers or arrays of numbers, or their shapes or dtypes differ
+                from those of the first answer.
+        """
         field = f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]"
         by_name = sorted(replay.items()) if isinstance(replay, Mapping) else []
         values = {name: np.asarray(value) for name, value in by_name}
@@ -124,17 +144,16 @@ class TransitionRecorder(EpisodeRecorder):
         if not self._replay:
             self._replay = {name: _Rows(value, value.dtype) for name, value in values.items()}
         expected = {name: f"{rows.dtype} {rows.shape}" for name, rows in self._replay.items()}
-        got = {name: f"{value.dtype} {value.shape}" for name, value in values.items()}
-        if got != expected:
-            raise ConfigError(f"{field}: expected {expected} as in the first act, got {got}")
+        shapes = {name: f"{value.dtype} {value.shape}" for name, value in values.items()}
+        if shapes != expected:
+            raise ConfigError(f"{field}: expected {expected} as in the first act, got {shapes}")
         return values
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the transitions of a whole episode; none of one that an error of the policy
-        ended.
-        """
+        """Return the transitions of an episode; none if an error of the policy ended it."""
         if result.status != "done":
             return Artifacts()
+
         pa = self._pa
         rows = len(self._rows)
         actions, rewards, success, acts, versions, sources = zip(*self._rows, strict=True)
@@ -153,8 +172,9 @@ class TransitionRecorder(EpisodeRecorder):
             **{name: np.array(values, np.float32) for name, values in self._wanted.items()},
             "version": np.array(versions, np.int64),
         }
+
         columns: dict[str, Any] = {}
-        zeros = pa.array(np.zeros(rows, np.int32))  # the same text in each row
+        zeros = pa.array(np.zeros(rows, np.int32))  # indices: each row has the same text
         for name, text in (("key", str(result.key)), ("instruction", result.instruction)):
             columns[name] = pa.DictionaryArray.from_arrays(zeros, pa.array([text]))
         for name, values in numbers.items():
@@ -169,17 +189,19 @@ class TransitionRecorder(EpisodeRecorder):
 
 
 class _Rows:
-    """Arrays of one shape, each copied once into a growing array."""
+    """Arrays of one shape, each of which is copied into a growing array."""
 
     def __init__(self, first: np.ndarray, dtype: Any) -> None:
+        """Begin without rows, with the shape of the array `first`, which is not added."""
         self.shape, self.dtype = first.shape, dtype
         self._rows = np.empty((_FIRST_ROWS, *first.shape), dtype)
         self._number = 0
 
     def add(self, row: np.ndarray) -> None:
         if self._number == len(self._rows):
-            full, self._rows = self._rows, np.empty((2 * self._number, *self.shape), self.dtype)
-            self._rows[: self._number] = full
+            larger = np.empty((2 * self._number, *self.shape), self.dtype)
+            larger[: self._number] = self._rows
+            self._rows = larger
         self._rows[self._number] = row
         self._number += 1
 
@@ -188,15 +210,25 @@ class _Rows:
 
 
 def _by_row(value: Any, rows: int, name: str) -> list[float]:
-    """Return a number for each row of an act: its own sum, or the act's total in the first and NaN
-    in the others.
+    """Return a number for each row of an answer, from the policy's value for the answer.
 
-    `value` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as
-    one for each token, which are summed.
+    Args:
+        value: A number; or (H,) or (H, D) numbers, if there are H rows; or, for log-probabilities,
+            numbers of any other shape, such as one for each token.
+        rows: The number of rows, H.
+        name: The name of the value.
+
+    Returns:
+        H numbers. If the value has H rows, each number is the sum of a row. Otherwise the first
+        number is the sum of the whole value, and the others are NaN.
+
+    Raises:
+        ConfigError: The value has another shape.
     """
     values = np.asarray(value, np.float64)
     if values.ndim and len(values) == rows:
-        return [float(value) for value in values.reshape(rows, -1).sum(axis=1)]
+        row_sums: list[float] = values.reshape(rows, -1).sum(axis=1).tolist()
+        return row_sums
     if name != "logprob" and values.size != 1:
         raise ConfigError(
             f"act.info[{BEHAVIOUR!r}][{name!r}]: expected a number, or shape ({rows},), got shape "
@@ -205,17 +237,17 @@ def _by_row(value: Any, rows: int, name: str) -> list[float]:
     return [float(values.sum()), *[float("nan")] * (rows - 1)]
 
 
-POLL_S = 0.25  # longest wait for a report before missing workers are started
+POLL_S = 0.25  # longest wait for a report; missing workers are then started
 
 
 @dataclass(slots=True)
 class RolloutStats:
     """The episodes of rollouts so far."""
 
-    episodes: int = 0  # delivered
-    transitions: int = 0  # delivered
-    retries: int = 0  # attempts repeated after an infrastructure failure
-    stale: int = 0  # episodes played again, as the weights had changed too much
+    episodes: int = 0  # delivered episodes
+    transitions: int = 0  # steps of the delivered episodes
+    retries: int = 0  # attempts that were repeated after an infrastructure failure
+    stale: int = 0  # episodes that were run again, as the weights had changed too much
     lost: int = 0  # episodes that no attempt finished, or that an error of the policy ended
 
 
@@ -223,11 +255,12 @@ class RolloutStats:
 class _PlannedEpisode:
     """An episode that is planned and not yet delivered."""
 
-    job: Job  # its first attempt
+    job: Job  # the first attempt
     number: int
-    over: bool = False
-    held: bool = False  # it was too old, and waits until it may begin again
-    transitions: Any = None  # if it is over; None if it is lost
+    is_over: bool = False
+    # Whether its weights were too old, and it waits until it may begin again.
+    waits_for_restart: bool = False
+    transitions: Any = None  # once it is over; None if it is lost
     oldest: int = 0  # oldest version of the weights among its actions
     pushed: int = 0  # the learner's version when the last attempt began
 
@@ -240,28 +273,28 @@ class RolloutPlan:
         ConfigError: A setting is wrong.
     """
 
-    env: str | Sequence[str]  # the name, as for an evaluation; several envs take turns
+    env: str | Sequence[str]  # the name, as for an evaluation; several envs alternate
     # URL of a server, or a factory that each worker calls to create its own agent.
     policy: str | Callable[[], Agent]
-    # 0: in this process and on this thread, without Ray: the quickest for one env and a small
-    # policy.
+    # 0 runs the episodes in this process and on this thread, without Ray. That is the fastest for
+    # one env and a small policy.
     workers: int = 1
-    # Environments that one worker steps together, with one request to the policy for all.
+    # Environments that one worker steps together, with one request to the policy for all of them.
     num_envs: int = 1
-    # Episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
+    # Consecutive episodes from one start state, which differ in the seed of the policy (GRPO).
     groups: int = 1
-    # What the policy returns for each act: "logprob", "value", "entropy", "replay".
+    # Values that the policy returns with each answer: "logprob", "value", "entropy", "replay".
     want: Sequence[str] = ()
-    # Largest age, in versions, of the weights of any act of a delivered episode; others are played
-    # again. 0 is on-policy; None delivers all.
+    # Largest age, in versions, of the weights of any answer in a delivered episode; older episodes
+    # are run again. 0 is on-policy; None delivers all episodes.
     max_lag: int | None = 0
-    seed: int = 0  # of the first start state; state n has `seed` + n
+    seed: int = 0  # seed of the first start state; state n has `seed` + n
     first: int = 0  # number of the first episode; to continue earlier rollouts, their `position`
     images: bool = True  # whether there are columns for the cameras
     env_options: Mapping[str, Any] = field(default_factory=dict)  # of the env's constructor
     reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the env
     policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
-    execute: int | None = None  # rows of each action chunk that are executed; None: all
+    execute: int | None = None  # executed rows of each action chunk; None executes all
     # Further settings of an evaluation, such as `worker`, `retries` and `env_timeout_s`.
     settings: Mapping[str, Any] = field(default_factory=dict)
 
@@ -275,7 +308,7 @@ class RolloutPlan:
             raise ConfigError(f"want: expected some of {list(WANTED)}, got {unknown}")
 
     def config(self) -> EvalConfig:
-        """Return the settings of an evaluation of these episodes; nothing is written."""
+        """Return the settings of an evaluation of these episodes, which writes no results."""
         url = self.policy if isinstance(self.policy, str) else None
         policy = {"url": url, "options": self.policy_options, "execute": self.execute}
         suite = {
@@ -294,21 +327,21 @@ class RolloutPlan:
 
 
 class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
-    """Plays episodes in the workers of an evaluation, and returns their transitions for a learner.
+    """Runs episodes in the workers of an evaluation, and returns their transitions for a learner.
 
         with Rollouts(RolloutPlan("tabletop/lift", "http://localhost:8000", workers=4)) as rollouts:
             for _ in range(100):
                 columns = arrays(rollouts.collect(64))
                 ...  # learn from them, and push the new weights
 
-    Episodes are numbered from 0 and delivered in this order, each exactly once, whatever the number
-    of workers and even if some die: a broken attempt is repeated, and has no transitions. So the
-    same seeds and weights give the same transitions. The keys are those of an evaluation of these
-    settings.
+    Episodes are numbered from 0, and each is delivered exactly once, in this order. That does not
+    depend on the number of workers, and holds even if workers die: a broken attempt is repeated,
+    and has no transitions. Therefore, the same seeds and weights give the same transitions. The
+    keys of the episodes are those of an evaluation with these settings.
 
-    A record batch is one whole episode with the columns of `vlagents_ray_learn.columns`. Workers on
-    this node write it into Ray's object store once, and numpy maps it from there; keeping it keeps
-    its memory in the store.
+    A record batch is one whole episode, with the columns of `vlagents_ray_learn.columns`. Workers
+    on this node write it into Ray's object store once, and numpy maps it from there. A batch
+    occupies memory of the store as long as it is referenced.
     """
 
     def __init__(self, plan: RolloutPlan) -> None:
@@ -328,24 +361,31 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         self._recorders = functools.partial(
             TransitionRecorder, want=tuple(plan.want), images=plan.images
         )
+
         self._block = math.lcm(plan.groups, plan.num_envs)  # episodes that are queued together
-        self._ahead = self._block * max(
-            2, math.ceil(2 * plan.workers * plan.num_envs / self._block)
-        )
+        # Episodes that are queued ahead of the learner: whole blocks, two for each environment.
+        environments = plan.workers * plan.num_envs
+        self._ahead = self._block * max(2, math.ceil(2 * environments / self._block))
+
         self._position = self._planned = plan.first
         self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
         self._driver = Driver(self._plan, [], _Consumer(self))
         self._resources = ExitStack()
         self._pool: Workers | None = None
-        # Held by whoever plays or asks, but not during a wait for reports.
+
+        # Guards all of this object's state. No thread holds it while it waits for reports.
         self._state = threading.Condition()
-        self._player: threading.Thread | None = None  # plays on while the learner learns
+        # Runs further episodes while the learner learns.
+        self._player: threading.Thread | None = None
         self._stopping = False
-        self._error: BaseException | None = None  # which ended the player
-        self._version = self._pushed = 0
-        self._allowed = plan.first  # number of the first episode that is not to begin yet
-        self._since = plan.first  # the position when the version changed
-        # Episodes delivered between the last two changes, and their distance in versions.
+        self._error: BaseException | None = None  # the error that ended the player
+
+        self._version = 0  # newest version among answers and pushes
+        self._pushed = 0  # version that the learner has set
+        self._allowed = plan.first  # number of the first episode that may not begin yet
+        self._changed_at = plan.first  # the position when the version changed
+        # Episodes that were delivered between the last two changes of the version, and the
+        # difference between these versions.
         self._pace = 0, 0
         self.stats = RolloutStats()  # the numbers of episodes so far
 
@@ -353,8 +393,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def version(self) -> int:
         """The newest version of the weights, from which the lag is counted.
 
-        It follows the versions of acts. A learner that iterates may set it to the result of a push,
-        so that no episode of older weights is delivered from then on.
+        It follows the versions in the policy's answers. A learner that iterates may set it to the
+        result of a push. After that, no episode of older weights is delivered.
         """
         return self._version
 
@@ -362,20 +402,21 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def version(self, pushed: int) -> None:
         with self._state:
             self._pushed = pushed
-            self._saw(pushed)
+            self._note_version(pushed)
 
     @property
     def position(self) -> int:
-        """The number of the next episode: keep it in the learner's checkpoint, to continue with
-        `first`.
+        """The number of the next episode.
+
+        A learner keeps it in its checkpoint, and passes it as `first` to continue.
         """
         return self._position
 
     def __next__(self) -> Any:
         """Return the transitions of the next episode, a `pyarrow.RecordBatch`.
 
-        A thread hands later episodes to the workers meanwhile, also until the next call: two for
-        each environment.
+        Until the next call, a thread passes later episodes to the workers, two for each
+        environment.
         """
         delivered: list[Any] = []
         while not delivered:  # an episode may be lost
@@ -386,18 +427,20 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         """Run the next episodes without prefetching, so none uses outdated weights.
 
         Args:
-            episodes: Their number; whole groups, if there are groups.
+            episodes: The number of episodes, a multiple of `groups`.
 
         Returns:
             Their transitions in order, a `pyarrow.Table` with a chunk for each episode. Lost
-            episodes are left out; if all are lost, the result has as many of the next ones.
+            episodes are left out. If all of them are lost, the same number of following episodes
+            is run.
 
         Raises:
-            ConfigError: The number does not make whole groups, or the envs have different columns.
+            ConfigError: The number is not a multiple of `groups`, or the envs have different
+                columns.
             WeightsLost: The policy acts with older weights than `version`, after a restart: push
                 them, and call again.
-            VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a
-                row.
+            VLAgentsError: The last infrastructure error, after `abort_after` consecutive lost
+                episodes.
         """
         if episodes < 1 or episodes % self._settings.groups:
             raise ConfigError(
@@ -417,8 +460,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def close(self) -> None:
         """End the workers, and the Ray cluster if it was started for them; safe to call twice.
 
-        Delivered transitions are in Ray's memory: copy those that are needed after the end of Ray.
-        A later request starts workers again, which repeat the episodes that were not delivered.
+        Delivered transitions are in Ray's memory: copy those that are needed after Ray has ended.
+        A later call starts workers again, which repeat the episodes that were not delivered.
         """
         self._stop_player()
         if self._pool is not None:
@@ -432,66 +475,74 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self._end(*exc)
 
     def _end(self, *exc: Any) -> None:
+        """End the workers, and plan the episodes that were not delivered again."""
         self._stop_player()
         for episode in self._episodes.values():
-            episode.over = episode.held = False
-            episode.transitions = None  # in the memory of a Ray that may end
+            episode.is_over = episode.waits_for_restart = False
+            episode.transitions = None  # Ray, whose memory it is in, may end
         self._pool = self._error = None
         self._resources.__exit__(*exc)
 
     def _limit(self) -> int:
-        """Return the number of the first episode that is not to begin yet.
+        """Return the number of the first episode that may not begin yet.
 
-        At the pace of the last push, an episode with a higher number would be too old when it is
-        its turn. Without this limit, learners that once were slow would for ever get episodes that
-        are played twice.
+        If the learner pushes at the pace of its last push, an episode with a higher number would be
+        too old when it is delivered. Without this limit, a learner that was slow once would get
+        every later episode only at the second run.
         """
         limit = (self._position + 1) // self._block * self._block + self._ahead
         episodes, versions = self._pace
-        # Slower than at the last push.
-        if self._settings.max_lag is None or self._position >= self._since + episodes:
+        is_slower = self._position >= self._changed_at + episodes  # than before the last push
+        if self._settings.max_lag is None or is_slower:
             return limit
-        return min(limit, self._since + episodes * (1 + self._settings.max_lag // versions))
+        fresh_episodes = episodes * (1 + self._settings.max_lag // versions)
+        return min(limit, self._changed_at + fresh_episodes)
 
-    def _saw(self, version: int) -> None:
-        """Note the version of an act or of a push."""
+    def _note_version(self, version: int) -> None:
+        """Update the newest version, and the pace of pushes, after an answer or a push."""
         if version <= self._version:
             return
-        delivered = self._position - self._since
+        delivered = self._position - self._changed_at
         if delivered:
             self._pace = delivered, version - self._version
-            self._since = self._position
+            self._changed_at = self._position
         self._version = version
 
     def _deliver(self, end: int, limit: int | None = None) -> list[Any]:
-        """Play until the episodes before number `end` are over; those before `limit` may also
-        begin, and go on.
+        """Run the episodes before number `end`, and return the transitions of those not lost.
+
+        Args:
+            end: The number of the first episode that is not delivered.
+            limit: The number of the first episode that may not begin; None selects `end`. Episodes
+                between the two continue after this returns.
         """
         try:
-            ahead = limit is not None and self._settings.workers > 0
-            if ahead:
+            prefetches = limit is not None and self._settings.workers > 0
+            if prefetches:
                 self._start_player()
             else:
                 self._stop_player()
             with self._state:
                 self._plan_until(limit or end)
-                wanted = list(itertools.islice(self._episodes.items(), end - self._position))
+                next_episodes = dict(itertools.islice(self._episodes.items(), end - self._position))
                 self._replay_stale()
                 self._state.notify_all()
-                while not all(episode.over for _, episode in wanted):
+                while not all(episode.is_over for episode in next_episodes.values()):
                     if self._error is not None:
                         raise self._error
-                    if ahead:
+                    if prefetches:
                         self._state.wait()
                     else:
-                        self._play_on()
-                for key, _ in wanted:
+                        self._run_queued()
+                for key in next_episodes:
                     del self._episodes[key]
                 self._position = end
         except BaseException:
             self._end(*sys.exc_info())
             raise
-        batches = [episode.transitions for _, episode in wanted if episode.transitions is not None]
+
+        results = [episode.transitions for episode in next_episodes.values()]
+        batches = [transitions for transitions in results if transitions is not None]
         self.stats.episodes += len(batches)
         self.stats.transitions += sum(batch.num_rows for batch in batches)
         return batches
@@ -499,9 +550,10 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     def _start_player(self) -> None:
         if self._player is None:
             self._stopping = False
-            # On this thread, as Ray may be started for it, with handlers of signals.
+            # Start the workers on this thread: Ray, which may be started for them, sets handlers
+            # of signals.
             self._running_pool()
-            self._player = threading.Thread(target=self._play_ahead, name="rollouts", daemon=True)
+            self._player = threading.Thread(target=self._run_ahead, name="rollouts", daemon=True)
             self._player.start()
 
     def _stop_player(self) -> None:
@@ -512,8 +564,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self._player.join()
             self._player = None
 
-    def _play_ahead(self) -> None:
-        """Play what is planned until `_stopping`, or until an error."""
+    def _run_ahead(self) -> None:
+        """Run planned episodes until `_stopping`, or until an error."""
         pool = self._running_pool()
         try:
             while True:
@@ -522,33 +574,31 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                         self._state.wait()
                     if self._stopping:
                         return
-                self._play_on()
+                self._run_queued()
         except BaseException as error:  # noqa: BLE001 - the next call raises it
             with self._state:
                 self._error = error
                 self._state.notify_all()
 
     def _plan_until(self, limit: int) -> None:
-        """Queue the episodes up to number `limit`."""
+        """Queue the episodes before number `limit`."""
+        seed = self._settings.seed
         for number in range(self._planned, limit):
-            state, member = divmod(number, self._settings.groups)
-            episode, turn = divmod(state, len(self._plan.cases))
-            case = self._plan.cases[turn]
-            # The first of a group is the episode of an evaluation. The policy seeds of the others
-            # are above all of those, so that no two episodes of an environment share their noise.
-            policy_seed = self._settings.seed + _OTHER_MEMBERS + number if member else None
-            job = Job(
-                EpisodeKey(
-                    case.env, episode, self._settings.seed + episode, case.fingerprint, policy_seed
-                ),
-                case,
-            )
-            self._episodes[job.key] = _PlannedEpisode(job, number)
+            start_state, member = divmod(number, self._settings.groups)
+            episode, case_index = divmod(start_state, len(self._plan.cases))
+            case = self._plan.cases[case_index]
+            # The first member of a group is the episode of an evaluation. The policy seeds of the
+            # others are above all seeds of evaluations, so that no two episodes of an environment
+            # have the same noise.
+            policy_seed = seed + _OTHER_MEMBERS + number if member else None
+            key = EpisodeKey(case.env, episode, seed + episode, case.fingerprint, policy_seed)
+            job = Job(key, case)
+            self._episodes[key] = _PlannedEpisode(job, number)
             self._driver.queue.put(job)
         self._planned, self._allowed = max(self._planned, limit), limit
 
-    def _play_on(self) -> None:
-        """Hand out jobs, and take the reports that arrive."""
+    def _run_queued(self) -> None:
+        """Pass jobs to idle workers, and handle the reports that arrive within `POLL_S`."""
         pool = self._running_pool()
         with self._state:
             self._driver.hand_out(pool)
@@ -559,69 +609,75 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 self._state.notify_all()
 
     def _with_start_state(self, transitions: Any, start_state: int) -> Any:
-        """Return transitions that are numbered by their start state among those of all
-        environments.
+        """Return transitions whose column `episode` is the number of the start state.
 
-        A worker numbers the states of one environment; episodes of one number would be a group of
-        several tasks.
+        The number counts the start states of all environments. A worker numbers the states of one
+        environment, so that episodes of several tasks would have the same number, and be a group.
         """
         column = tensors(self._pa, np.full(transitions.num_rows, start_state, np.int64))
-        return transitions.set_column(
-            transitions.schema.get_field_index("episode"), "episode", column
-        )
+        index = transitions.schema.get_field_index("episode")
+        return transitions.set_column(index, "episode", column)
 
     def _running_pool(self) -> Workers:
+        """Return the workers, which the first call starts, with all planned episodes queued."""
         if self._pool is None:
-            pool_of = workers_class(self._plan, self._resources)
+            workers = workers_class(self._plan, self._resources)
             self._pool = self._resources.enter_context(
-                pool_of(self._plan, self._factory, self._recorders)
+                workers(self._plan, self._factory, self._recorders)
             )
             jobs = [episode.job for episode in self._episodes.values()]
             self._driver = Driver(self._plan, jobs, _Consumer(self))
         return self._pool
 
-    def _begin(self, jobs: tuple[Job, ...]) -> None:
+    def _note_begin(self, jobs: tuple[Job, ...]) -> None:
+        """Note the learner's version when attempts begin."""
         for job in jobs:
             self._episodes[job.key].pushed = self._pushed
 
     def _finish(self, job: Job, transitions: Any) -> None:
-        """Keep the transitions of an episode until it is its turn; None if it is lost."""
+        """Keep the transitions of an episode until they are delivered; None if it is lost.
+
+        Raises:
+            WeightsLost: The policy has older weights than the learner has pushed.
+        """
         episode = self._episodes[job.key]
-        episode.over = True
+        episode.is_over = True
         if transitions is None:
             episode.transitions = None
             self.stats.lost += 1
             return
 
-        transitions = self._with_start_state(transitions, episode.number // self._settings.groups)
-        episode.transitions = transitions
+        start_state = episode.number // self._settings.groups
+        episode.transitions = self._with_start_state(transitions, start_state)
         versions = transitions.column("version").to_numpy()
         episode.oldest = int(versions.min())
-        self._saw(int(versions.max()))
+        self._note_version(int(versions.max()))
+
+        # An attempt that began after the push, but has older weights, would be repeated for ever.
         max_lag = self._settings.max_lag
-        # It would always be too old.
         if max_lag is not None and episode.pushed - episode.oldest > max_lag:
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, "
-                "but its acts name "
-                f"{episode.oldest}; set it to what a push returned, after it has (a policy that "
-                "names none has 0), and "
-                f"push again if a replica was restarted since then"
+                f"but its acts name {episode.oldest}; set it to what a push returned, after it has "
+                "(a policy that names none has 0), and push again if a replica was restarted since "
+                "then"
             )
 
     def _replay_stale(self) -> None:
-        """Queue episodes again whose acts have outdated weights, or hold them until they may
-        begin.
+        """Run episodes with outdated weights again, once they may begin.
+
+        The episodes are queued at the front, in their order: the last one is therefore first.
         """
+        max_lag = self._settings.max_lag
         for episode in reversed(self._episodes.values()):
             lag = self._version - episode.oldest if episode.transitions is not None else 0
-            if self._settings.max_lag is not None and lag > self._settings.max_lag:
-                episode.over = False
-                episode.held = True
+            if max_lag is not None and lag > max_lag:
+                episode.is_over = False
+                episode.waits_for_restart = True
                 episode.transitions = None
                 self.stats.stale += 1
-            if episode.held and episode.number < self._allowed:
-                episode.held = False
+            if episode.waits_for_restart and episode.number < self._allowed:
+                episode.waits_for_restart = False
                 self._driver.queue.put_back(episode.job)
 
 
@@ -634,10 +690,10 @@ class _Consumer(Consumer):
         self._rollouts = rollouts
 
     def began(self, jobs: tuple[Job, ...]) -> None:
-        self._rollouts._begin(jobs)
+        self._rollouts._note_begin(jobs)
 
     def described(self, job: Job, report: Report) -> None:
-        pass  # the results of a rollout do not describe who played it
+        pass  # the results of a rollout do not describe the worker
 
     def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
         self._rollouts.stats.retries += repeated

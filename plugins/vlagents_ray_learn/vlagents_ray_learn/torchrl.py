@@ -1,17 +1,16 @@
-"""TorchRL's policies on this server, and served policies as modules of TorchRL; needs the extra
-"torchrl".
+"""Policies of TorchRL on this server, and served policies as modules of TorchRL.
 
-A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` uses this server
-after one more line:
+This module needs the extra "torchrl". A program that starts TorchRL's `ProcessInferenceServer` with
+an `MPTransport` uses this server after one more line:
 
     from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as
     MPTransport
 
-Collectors are TorchRL's own: `ServedPolicy` is the module that they call
-(docs/evaluation/torchrl.md has one).
+`ServedPolicy` is the module that TorchRL's collectors call; docs/evaluation/torchrl.md has an
+example.
 
-Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and
-the instruction.
+The keys of tensordicts are those of `torchrl.data.vla`: the image is the camera "front", and the
+state is `state["state"]` of an observation.
 """
 
 from __future__ import annotations
@@ -44,24 +43,29 @@ nn: Any = optional("tensordict.nn", "torchrl")
 vla: Any = optional("torchrl.data.vla", "torchrl")
 IMAGE, STATE, TEXT = vla.IMAGE_KEY, vla.STATE_KEY, vla.INSTRUCTION_KEY
 _CAMERA = "front"
-_STATE_PART = "state"
+_STATE_NAME = "state"
 _TOKENS = "tokens"
-_LEARNED = ("logprob", REPLAY)  # values of an action that a learner needs
+_LEARNED = ("logprob", REPLAY)  # values of an answer that a learner needs
 
 
 class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     """A policy on a server as a module of TorchRL.
 
-    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions, and adds "chunk"
-    (*B, H, D) float32, or "tokens" (*B, H, D) int64 and "log_probs" in nats, or all, below
-    "vla_action". Tokens are drawn where TorchRL's exploration type is RANDOM. Each row is a
-    session, whose episode begins where "is_init" is true (TorchRL's `InitTracker`) and where the
-    instruction changes. Copies, also in other processes, have their own sessions.
+    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions. Below
+    "vla_action", it adds "chunk" (*B, H, D) float32, or "tokens" (*B, H, D) int64 and "log_probs"
+    in nats, or all three. Tokens are drawn at random if TorchRL's exploration type is RANDOM.
+
+    Each row is a session. Its episode begins where "is_init" is true (TorchRL's `InitTracker`) and
+    where the instruction changes. Each copy of this module, which may be in another process, has
+    its own sessions.
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        """Set the server, to which the first call connects; the arguments are those of
-        `RemoteAgent`.
+        """Set the server, to which the first call connects.
+
+        Args:
+            url: The URL of the server.
+            options: Further arguments of `RemoteAgent`.
         """
         super().__init__()
         self.in_keys = [IMAGE, STATE, TEXT]
@@ -85,19 +89,21 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
 
         if nn.probabilistic.interaction_type() == nn.InteractionType.RANDOM:
             want = [name for name in _LEARNED if name in (self._contract.behaviour or ())]
-            obs = [Obs(sent.cameras, state=sent.state, info={WANT: want}) for sent in obs]
-        answers = _without_errors(self._sessions[0].act_batch(obs, self._sessions[: len(obs)]))
+            obs = [Obs(row.cameras, state=row.state, info={WANT: want}) for row in obs]
+        sessions = self._sessions[: len(obs)]
+        answers = _without_errors(sessions[0].act_batch(obs, sessions))
+
         for key, values in self._outputs(answers).items():
             shape = (*batch.batch_size, *values[0].shape)
             batch.set(key, torch.from_numpy(np.stack(values)).reshape(shape))
         return batch
 
     def _open_sessions(self, number: int) -> None:
-        """Connect at the first call, and open sessions until there are that many."""
+        """Connect at the first call, and open sessions until there are `number` of them."""
         if not self._sessions:
             agent = RemoteAgent(self._url, **self._options)
             self._sessions = [agent]
-            self._instructions: dict[int, str] = {}  # of the running episode, by row
+            self._instructions: dict[int, str] = {}  # row -> instruction of its current episode
             self._contract = agent.contract or Contract()
             self._seeds = np.random.default_rng()
         self._sessions += self._sessions[0].sessions(number - len(self._sessions))
@@ -105,32 +111,38 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     def _begin_episodes(
         self, obs: Sequence[Obs], instructions: Sequence[str], is_first: Any
     ) -> None:
-        """Reset the sessions of the rows whose episode begins; `is_first` marks them, and may be
-        None.
+        """Reset the sessions of the rows whose episode begins.
+
+        Args:
+            obs: The observation of each row.
+            instructions: The instruction of each row.
+            is_first: Whether each row is the first of an episode; None if that is not known.
         """
-        begun = []
+        rows = []
         for i, instruction in enumerate(instructions):
             changed = self._instructions.get(i) != instruction
             if changed or (is_first is not None and is_first[i]):
-                begun.append(i)
-        if not begun:
+                rows.append(i)
+        if not rows:
             return
-        seeds = self._seeds.integers(2**31, size=len(begun)).tolist()
+        seeds = self._seeds.integers(2**31, size=len(rows)).tolist()
         results = self._sessions[0].reset_batch(
-            [obs[i] for i in begun],
-            [instructions[i] for i in begun],
-            [self._sessions[i] for i in begun],
+            [obs[i] for i in rows],
+            [instructions[i] for i in rows],
+            [self._sessions[i] for i in rows],
             seeds=seeds,
         )
         _without_errors(results)
-        self._instructions |= {i: instructions[i] for i in begun}
+        for i in rows:
+            self._instructions[i] = instructions[i]
 
     def _outputs(self, answers: Sequence[Act]) -> dict[Any, list[np.ndarray]]:
-        """Return the values of each row by TorchRL's keys."""
+        """Return the values of all rows by TorchRL's keys."""
         versions = [np.array(answer.info[POLICY]["version"], np.int64) for answer in answers]
         outputs: dict[Any, list[np.ndarray]] = {"policy_version": versions}
         if self._contract.action.space != _TOKENS:
             outputs[vla.ACTION_CHUNK_KEY] = [answer.rows() for answer in answers]
+
         behaviours = [answer.info.get(BEHAVIOUR, {}) for answer in answers]
         if all(_TOKENS in behaviour.get(REPLAY, {}) for behaviour in behaviours):
             tokens = [np.array(behaviour[REPLAY][_TOKENS], np.int64) for behaviour in behaviours]
@@ -140,7 +152,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         return outputs
 
     def close(self) -> None:
-        """End the sessions; a later call begins others."""
+        """End the sessions; a later call opens new ones."""
         while self._sessions:
             self._sessions.pop().close()
 
@@ -149,17 +161,22 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
 
 
 class TorchRLPolicy(Agent):
-    """A VLA policy of TorchRL (`VLAWrapperBase`), which returns chunks, or tokens if it has no
-    `action_tokenizer`.
+    """A VLA policy of TorchRL (`VLAWrapperBase`).
 
-    Tokens are drawn by the session's generator if a learner requests values; else they are the
-    likeliest. `factory` makes the policy: "module:function", or a file with the function by
-    cloudpickle, trusted, as it may run any code.
+    It returns chunks, or tokens if it has a head of tokens and no `action_tokenizer`. The session's
+    generator draws the tokens if a learner requests values. Otherwise the likeliest tokens are
+    chosen.
     """
 
     trainable: ClassVar[str | None] = "policy"
 
     def __init__(self, factory: str) -> None:
+        """Set the function that makes the policy.
+
+        Args:
+            factory: "module:function", or a file with the function, which cloudpickle has written.
+                Such a file is trusted: it can run any code.
+        """
         self._factory = factory
         self.policy: Any = None
 
@@ -179,16 +196,18 @@ class TorchRLPolicy(Agent):
         from ray import cloudpickle
 
         file = Path(self._factory)
-        make: Any = (
-            cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory)
-        )
+        make: Any
+        if file.is_file():
+            make = cloudpickle.loads(file.read_bytes())
+        else:
+            make = named_class(self._factory)
         self.policy = make().eval()
 
     def parameters(self) -> dict[str, Any]:
-        # Lazy layers get their sizes from the first batch; until then there is nothing to push or
-        # to compare.
-        lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
-        return {} if lazy else named_values(self.policy)
+        # Lazy layers get their sizes from the first batch. Before that there are no values to push
+        # or to compare.
+        has_lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
+        return {} if has_lazy else named_values(self.policy)
 
     def load_parameters(self, values: Mapping[str, Any]) -> None:
         set_values(self.policy, values)
@@ -199,58 +218,54 @@ class TorchRLPolicy(Agent):
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act | Exception]:
-        rows = [
-            attempt(_row, received, session)
-            for received, session in zip(obs, sessions, strict=True)
-        ]
-        return compute_valid(rows, self._acts)
+        rows = []
+        for session_obs, session in zip(obs, sessions, strict=True):
+            rows.append(attempt(_row, session_obs, session))
+        return compute_valid(rows, self._compute_batch)
 
-    def _acts(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
-        """Compute one batch; each row has an input, and the generator of its draw, or None for
-        the likeliest tokens.
+    def _compute_batch(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
+        """Compute the answers of one batch.
+
+        Args:
+            rows: For each session, the input, and the generator that draws its tokens; None selects
+                the likeliest tokens.
         """
         policy = self.policy
         device = next(policy.parameters()).device
         batch = torch.stack([row for row, _ in rows]).contiguous().to(device)
         with torch.no_grad():
             if policy.action_head == "continuous":
-                return [
-                    Act(chunk)
-                    for chunk in policy(batch)[vla.ACTION_CHUNK_KEY].float().cpu().numpy()
-                ]
+                chunks = policy(batch)[vla.ACTION_CHUNK_KEY].float().cpu().numpy()
+                return [Act(chunk) for chunk in chunks]
+
             distribution = policy.get_dist(batch)
             logits = getattr(distribution, "base_dist", distribution).logits  # (B, H, D, tokens)
-            # The largest logit after Gumbel noise is that of a draw from their softmax.
-            noise = [
-                np.zeros(logits[0].shape) if rng is None else rng.gumbel(size=logits[0].shape)
-                for _, rng in rows
-            ]
-            tokens = (logits + torch.from_numpy(np.stack(noise)).to(device, logits.dtype)).argmax(
-                -1
-            )
+            # The index of the largest logit after Gumbel noise is a draw from the softmax.
+            shape = logits[0].shape
+            noise = []
+            for _, generator in rows:
+                noise.append(np.zeros(shape) if generator is None else generator.gumbel(size=shape))
+            noise_on_device = torch.from_numpy(np.stack(noise)).to(device, logits.dtype)
+            tokens = (logits + noise_on_device).argmax(-1)
             # (B,), or (B, H, D) with `log_probs_mode="token"`.
             logprobs = distribution.log_prob(tokens)
-            actions = (
-                tokens
-                if policy.action_tokenizer is None
-                else policy.action_tokenizer.decode(tokens)
-            )
+            actions = tokens
+            if policy.action_tokenizer is not None:
+                actions = policy.action_tokenizer.decode(tokens)
+
         acts = []
-        outputs = zip(
+        for action, action_tokens, logprob in zip(
             _on_host(actions.float()), _on_host(tokens), _on_host(logprobs.float()), strict=True
-        )
-        for action, drawn, logprob in outputs:
-            behaviour = {"logprob": logprob, REPLAY: {_TOKENS: drawn}}
+        ):
+            behaviour = {"logprob": logprob, REPLAY: {_TOKENS: action_tokens}}
             acts.append(Act(action, info={BEHAVIOUR: behaviour}))
         return acts
 
 
 class ServerAddress:
-    """The address of a `PolicyServer` that starts later, in the place of TorchRL's
-    `MPTransport`.
-    """
+    """The address of a `PolicyServer` that starts later; replaces TorchRL's `MPTransport`."""
 
-    def __init__(self, **_of_torchrl: Any) -> None:
+    def __init__(self, **_torchrl_options: Any) -> None:
         self.port = free_port()
 
     def client(self) -> ServedPolicy:
@@ -258,16 +273,15 @@ class ServerAddress:
         return ServedPolicy(f"http://127.0.0.1:{self.port}")
 
     def close(self) -> None:
-        """Do nothing, since a server closes its port itself."""
+        """Do nothing: the server closes its port."""
 
 
 class PolicyServer:
-    """A server of a `VLAWrapperBase` on a Ray that it starts, with the arguments of TorchRL's
-    `ProcessInferenceServer`.
+    """A server of a `VLAWrapperBase`; replaces TorchRL's `ProcessInferenceServer`.
 
-    `server_config.max_batch_size` limits its batches, which wait as `batch.patience` of deployment
-    files states. For a `policy_device` "cuda", Ray reserves a GPU. Other arguments have no meaning
-    here.
+    The server starts its own Ray. Of TorchRL's arguments, the following have an effect:
+    `server_config.max_batch_size` limits the batches, whose patience is the default of deployment
+    files, and Ray reserves a GPU for a `policy_device` "cuda".
     """
 
     def __init__(
@@ -292,7 +306,7 @@ class PolicyServer:
 
     def start(self) -> Self:
         """Serve the policy, and wait until it is loaded."""
-        # Processes of environments import this module for the client alone, which does without Ray.
+        # Processes of environments import this module for the client, which does not need Ray.
         from ray import cloudpickle
 
         from vlagents_ray.serve.launch.deployment_file import deployment
@@ -303,7 +317,8 @@ class PolicyServer:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))
             file = Path(folder) / "factory"
             file.write_bytes(cloudpickle.dumps(self._factory))
-            module_path = os.pathsep.join(filter(None, sys.path))  # of the factory's modules
+            # The policy's process imports the factory's modules from the same folders.
+            module_path = os.pathsep.join(filter(None, sys.path))
             args: dict[str, Any] = {
                 "batch": self._batch,
                 "resources": self._resources,
@@ -316,13 +331,18 @@ class PolicyServer:
         return self
 
     def update_model_weights(self, weights: Any, **_: Any) -> dict[str, bool]:
-        """Push a tensordict of parameters, all or some, for all later acts; raises the errors of
-        `Publisher.push`.
+        """Push new weights, with which the policy acts from now on.
+
+        Args:
+            weights: A tensordict of parameters, all or some.
+
+        Raises:
+            VLAgentsError: The errors of `Publisher.push`.
         """
-        named = dict(weights.flatten_keys(".").items())
-        # Lazy layers of a learner have none before its first batch.
-        if all(value.numel() for value in named.values()):
-            self._publisher.push(named, mode="keep", partial=True, allow_same=True)
+        values = dict(weights.flatten_keys(".").items())
+        # Before a learner's first batch, its lazy layers have no values.
+        if all(value.numel() for value in values.values()):
+            self._publisher.push(values, mode="keep", partial=True, allow_same=True)
         return {"accepted": True}
 
     def shutdown(self, timeout: float | None = None) -> None:
@@ -331,7 +351,7 @@ class PolicyServer:
 
 
 def _without_errors(results: Sequence[Any]) -> Sequence[Any]:
-    """Return the results of a batch; raises the first error among them."""
+    """Return the results of a batch, or raise the first error among them."""
     for result in results:
         if isinstance(result, Exception):
             raise result
@@ -346,18 +366,25 @@ def _on_host(values: Any) -> np.ndarray:
 
 def _observation(row: Any) -> Obs:
     """Return the observation in a row of a tensordict."""
-    image, state = row.get(IMAGE, None), row.get(STATE, None)
-    cameras = {} if image is None else {_CAMERA: _on_host(image.movedim(0, -1).contiguous())}
-    parts = {} if state is None else {_STATE_PART: _on_host(state.float())}
-    return Obs(cameras, state=parts)
+    obs = Obs()
+    image = row.get(IMAGE, None)  # (3, H, W)
+    if image is not None:
+        obs.cameras[_CAMERA] = _on_host(image.movedim(0, -1).contiguous())
+    state = row.get(STATE, None)
+    if state is not None:
+        obs.state[_STATE_NAME] = _on_host(state.float())
+    return obs
 
 
 def _row(obs: Obs, session: TorchRLPolicy) -> tuple[Any, np.random.Generator | None]:
-    """Return a session's input for the policy, and the generator of its draw, if any."""
+    """Return a session's input for the policy, and the generator that draws its tokens.
+
+    Without values for a learner, the generator is None.
+    """
     row = optional("tensordict", "torchrl").TensorDict({TEXT: session._instruction}, [])
     if IMAGE in session.policy.in_keys:
         image = camera_images(obs, {_CAMERA: _CAMERA})[_CAMERA]
         row[IMAGE] = torch.from_numpy(image.copy()).movedim(-1, 0)
     if STATE in session.policy.in_keys:
-        row[STATE] = torch.from_numpy(state_vector(obs, [_STATE_PART]))
+        row[STATE] = torch.from_numpy(state_vector(obs, [_STATE_NAME]))
     return row, session._draws if obs.info.get(WANT) else None

@@ -1,6 +1,4 @@
-"""Our environments as a `gymnasium.vector.VectorEnv`, for learners that step environments
-themselves.
-"""
+"""Environments as a `gymnasium.vector.VectorEnv`, for learners that step them themselves."""
 
 from __future__ import annotations
 
@@ -26,8 +24,10 @@ _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
 def action_space(contract: Contract) -> Any:
-    """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract
-    lacks D.
+    """Return the space of one environment's actions, Box (D,) float32 within the contract's bounds.
+
+    Raises:
+        ConfigError: The contract does not define D.
     """
     spec = contract.action
     low = -np.inf if spec.low is None else spec.low
@@ -37,13 +37,19 @@ def action_space(contract: Contract) -> Any:
 
 
 def observation_space(contract: Contract, observation: Observation) -> Any:
-    """Return the space of `observed`; raises `ConfigError` if the contract does not state a
-    size.
+    """Return the space of the results of `observed`.
+
+    Args:
+        contract: The contract of the environment.
+        observation: "all" or "state", as for `observed`.
+
+    Raises:
+        ConfigError: The contract does not define a size, or "state" would be empty.
     """
     spaces = gymnasium.spaces
     state = {}
-    for name, part in sorted((contract.state or {}).items()):
-        dim = _size(part.dim, f"state {name!r}: dim")
+    for name, spec in sorted((contract.state or {}).items()):
+        dim = _size(spec.dim, f"state {name!r}: dim")
         state[f"state/{name}"] = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
     if contract.gripper:
         state["gripper"] = spaces.Box(0.0, 1.0, (1,), np.float32)
@@ -72,11 +78,11 @@ def observed(obs: Obs, observation: Observation) -> Any:
     Args:
         obs: The observation of the environment.
         observation: "all" is a dict of `cameras/NAME`, `state/NAME` and, with a gripper, `gripper`,
-            (1,). "state" is one vector: the parts of the state by name, then the gripper.
+            (1,). "state" is one vector: the values of the state sorted by name, then the gripper.
     """
-    state = {
-        f"state/{name}": np.array(part, np.float32) for name, part in sorted(obs.state.items())
-    }
+    state = {}
+    for name, values in sorted(obs.state.items()):
+        state[f"state/{name}"] = np.array(values, np.float32)
     if obs.gripper is not None:
         state["gripper"] = np.array([obs.gripper], np.float32)
     if observation == "state":
@@ -86,7 +92,7 @@ def observed(obs: Obs, observation: Observation) -> Any:
 
 
 def _size(size: int | None, field: str) -> int:
-    """Return a size of the contract; raises `ConfigError` if the contract leaves it open."""
+    """Return a size of the contract; raises `ConfigError` if the contract does not define it."""
     if size is None:
         raise ConfigError(
             f"{field}: the env's contract does not state it, but Gymnasium needs it; state it there"
@@ -105,18 +111,19 @@ def as_vector_env(
 ) -> BatchVectorEnv:
     """Make vector environments for learners that use Gymnasium.
 
-    A simulator with many environments, such as ManiSkill on a GPU, steps them at once; other
+    A simulator with many environments, such as ManiSkill on a GPU, steps all of them at once. Other
     environments are stepped one after another in this process.
 
     Args:
         env: The name of the env, as for `make_env`.
         num_envs: The number of environments, N.
         observation: "all" is a dict of `cameras/NAME` (N, H, W, 3) uint8, `state/NAME` (N, D)
-            float32 and `gripper` (N, 1) float32. "state" is all but the images, as one array (N, D)
-            float32: the parts of the state by name, then the gripper.
-        autoreset: What follows the end of an episode (https://farama.org/Vector-Autoreset-Mode).
-            With "same_step", the observation is already that of the next episode, and
-            `infos["final_obs"]` has the last one of the old episode.
+            float32 and `gripper` (N, 1) float32. "state" has no images, and is one array (N, D)
+            float32: the values of the state sorted by name, then the gripper.
+        autoreset: Gymnasium's mode of resets after the end of an episode
+            (https://farama.org/Vector-Autoreset-Mode). With "same_step", the returned observation
+            is already the first of the next episode, and `infos["final_obs"]` contains the last
+            observation of the old episode.
         env_options: The options of the env's constructor.
         reset_options: The options of each reset of an environment.
 
@@ -124,35 +131,38 @@ def as_vector_env(
         The environments, which the caller closes.
 
     Raises:
-        ConfigError: An option is wrong, or the env's contract does not state a size.
+        ConfigError: An option is wrong, or the env's contract does not define a size.
         MissingDependency: Gymnasium or the simulator is not installed.
         UnknownEnv: The name or the task is unknown.
     """
-    choices = (("observation", observation, Observation), ("autoreset", autoreset, Autoreset))
-    for name, choice, literal in choices:
-        known = list(get_args(literal))
-        if choice not in known:
-            raise ConfigError(f"{name}: expected one of {known}, got {choice!r}")
+    _require_choice("observation", observation, get_args(Observation))
+    _require_choice("autoreset", autoreset, get_args(Autoreset))
     batch = make_batch(env, num_envs, **(env_options or {}))
     try:
-        return BatchVectorEnv(
-            batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options
-        )
+        autoreset_mode = vector.AutoresetMode[autoreset.upper()]
+        return BatchVectorEnv(batch, observation, autoreset_mode, reset_options)
     except BaseException:
         batch.close()
         raise
 
 
+def _require_choice(name: str, choice: str, choices: Sequence[str]) -> None:
+    """Raise `ConfigError` unless an option has one of its values."""
+    if choice not in choices:
+        raise ConfigError(f"{name}: expected one of {list(choices)}, got {choice!r}")
+
+
 class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     """The environments of a `BatchEnv` with Gymnasium's interface.
 
-    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation;
-    each new episode has the next number. Without a seed, numbers continue; the first S is drawn at
-    random.
+    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation,
+    and each new episode has the next number. A reset without a seed continues with the next
+    numbers. If the first reset has no seed, S is drawn at random.
 
-    `infos["success"]` states whether the task is solved. `infos["instruction"]` and
-    `infos["episode_seed"]` are set whenever an episode begins, the former also after each step if
-    the episodes have several tasks. A step limit of the environment truncates an episode.
+    `infos["success"]` is whether the task is solved. `infos["instruction"]` and
+    `infos["episode_seed"]` are set whenever an episode begins. If the episodes have several tasks,
+    `infos["instruction"]` is also set after each step. The environment's step limit truncates an
+    episode.
     """
 
     def __init__(
@@ -171,26 +181,29 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             reset_options: The options of each reset of an environment.
 
         Raises:
-            ConfigError: The environments' contract does not state a size.
+            ConfigError: The environments' contract does not define a size.
         """
         self._batch = batch
         self._observation = observation
         self._reset_options = dict(reset_options or {})
-        self.autoreset_mode = autoreset
         self._contract = batch.contract
+
+        # The attributes of Gymnasium's interface.
+        self.autoreset_mode = autoreset
         self.num_envs = batch.num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset}
         self.single_observation_space = observation_space(self._contract, observation)
         self.single_action_space = action_space(self._contract)
-        self.observation_space = vector.utils.batch_space(
-            self.single_observation_space, self.num_envs
-        )
-        self.action_space = vector.utils.batch_space(self.single_action_space, self.num_envs)
-        self._seed: int | None = None  # of episode 0
-        self._begun = 0  # episodes
-        self._over = np.zeros(self.num_envs, np.bool_)
-        self._steps = np.zeros(self.num_envs, np.int64)
-        self._obs: list[Obs] = []  # the current observation of each; none before the first reset
+        batch_space = vector.utils.batch_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+        self._seed: int | None = None  # seed of episode 0
+        self._begun = 0  # number of episodes up to now
+        self._over = np.zeros(self.num_envs, np.bool_)  # whether the episode is over
+        self._steps = np.zeros(self.num_envs, np.int64)  # steps of the episode
+        # The current observation of each environment; empty before the first reset.
+        self._obs: list[Obs] = []
 
     def reset(
         self,
@@ -201,42 +214,52 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Begin an episode in each environment.
 
         Args:
-            seed: The seed S of episode 0; None continues with the next numbers. Or, as in
-                Gymnasium, a seed for each environment's episode; later episodes continue after the
-                largest.
-            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's:
-                only these environments begin one.
+            seed: The seed S of episode 0; None continues with the next numbers. As in Gymnasium, a
+                list has a seed for the episode of each environment; later episodes continue after
+                the largest of them.
+            options: Options of the environments' resets. With Gymnasium's option `reset_mask`,
+                (N,) bool, only these environments begin an episode.
 
         Returns:
             The observations, and the infos.
+
+        Raises:
+            ConfigError: The mask is wrong, or the simulator resets all environments together.
+            InvalidInput: A seed is missing or negative.
+            NotReset: A mask is given in the first reset.
         """
         env_options = dict(options or {})
         mask = self._checked_mask(env_options.pop(_RESET_MASK, None))
-        seeds = None if seed is None or isinstance(seed, int) else _seeds(seed, mask)
-        super().reset(seed=seed if seeds is None else seeds[0])
+        seeds: list[int] | None = None
+        if seed is None or isinstance(seed, int):
+            super().reset(seed=seed)
+        else:
+            seeds = _masked_seeds(seed, mask)
+            super().reset(seed=seeds[0])
+
         if seeds is not None:
+            # The next episode, number len(seeds), has the seed after the largest one.
             self._seed, self._begun = max(seeds) + 1 - len(seeds), 0
         elif isinstance(seed, int):
             self._seed, self._begun = seed, 0
         elif self._seed is None:
             self._seed = int(self.np_random.integers(2**31))
+
         infos: dict[str, Any] = {}
         self._begin(mask, infos, env_options, seeds)
         return self._observations(), infos
 
     def _checked_mask(self, mask: Any) -> np.ndarray:
-        """Return which environments a reset begins an episode in, (N,) bool; None is all of
-        them.
+        """Return the environments in which a reset begins an episode, (N,) bool.
+
+        Raises:
+            ConfigError: The option is not None, and not a mask that selects an environment.
         """
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         shape = (self.num_envs,)
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != shape
-            or not mask.any()
-        ):
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == shape
+        if not is_mask or not mask.any():
             raise ConfigError(
                 f"{_RESET_MASK}: expected a bool array of shape {shape}, true somewhere, got "
                 f"{mask!r}"
@@ -254,14 +277,18 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Returns:
             The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and
             the infos.
+
+        Raises:
+            NotReset: There was no reset, or an episode is over and autoreset is disabled.
+            InvalidAction: The actions have a wrong shape, or one of them is not valid.
+            VLAgentsError: An environment failed.
         """
         if not self._obs:
             raise NotReset("step before reset; call reset(seed=...) first")
         if self._over.any() and self.autoreset_mode == vector.AutoresetMode.DISABLED:
             raise NotReset(
                 f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is "
-                "disabled; call "
-                f"reset(options={{'reset_mask': ...}})"
+                "disabled; call reset(options={'reset_mask': ...})"
             )
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
@@ -269,6 +296,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
                 f"actions: expected shape {self.action_space.shape}, a row for each environment, "
                 f"got {rows.shape}"
             )
+
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, np.bool_)
         truncated = np.zeros(self.num_envs, np.bool_)
@@ -280,7 +308,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             self._begin(restarted, infos)
 
         resets_at_once = self.autoreset_mode == vector.AutoresetMode.SAME_STEP
-        for i, step, info in self._moved(rows, moving):
+        for i, step, info in self._step_moving(rows, moving):
             self._obs[i] = step.obs
             rewards[i] = step.reward
             terminated[i] = step.terminated
@@ -301,9 +329,17 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     def close_extras(self, **_kwargs: Any) -> None:
         self._batch.close()
 
-    def _moved(self, rows: np.ndarray, moving: np.ndarray) -> list[tuple[int, Any, dict[str, Any]]]:
-        """Step the environments that are `moving`; return the number, the outputs and the info
-        of each.
+    def _step_moving(
+        self, rows: np.ndarray, moving: np.ndarray
+    ) -> list[tuple[int, Any, dict[str, Any]]]:
+        """Step some environments.
+
+        Args:
+            rows: The actions, (N, D).
+            moving: Whether to step each environment, (N,) bool.
+
+        Returns:
+            The index, the checked step and the info of each stepped environment.
         """
         if not moving.any():
             return []
@@ -337,22 +373,29 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         env_options: Mapping[str, Any] | None = None,
         chosen_seeds: Sequence[int] | None = None,
     ) -> None:
-        """Begin an episode in the environments of a mask, (N,) bool, and add its infos."""
+        """Begin an episode in some environments.
+
+        Args:
+            mask: Whether to begin one in each environment, (N,) bool.
+            infos: Gets the instructions and the seeds.
+            env_options: Options of the resets, besides `reset_options`.
+            chosen_seeds: The seeds of the episodes; None continues with the next numbers.
+        """
         assert self._seed is not None  # noqa: S101 - `reset` has set it
-        chosen = np.flatnonzero(mask).tolist()
+        indices = np.flatnonzero(mask).tolist()
         if not mask.all() and not self._batch.restarts:
             raise ConfigError(
-                f"{len(chosen)} of {self.num_envs} episodes are over, and this simulator resets "
-                "all its environments "
-                "together; use one whose episodes end together, as those of a step limit do, or "
-                "num_envs=1"
+                f"{len(indices)} of {self.num_envs} episodes are over, and this simulator resets "
+                "all its environments together; use one whose episodes end together, as those of "
+                "a step limit do, or num_envs=1"
             )
         if not mask.all() and not self._obs:
             raise NotReset(
                 f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all "
                 "first"
             )
-        numbers = range(self._begun, self._begun + len(chosen))
+
+        numbers = range(self._begun, self._begun + len(indices))
         seeds = chosen_seeds or [self._seed + number for number in numbers]
         merged = {**self._reset_options, **(env_options or {})}
         options = [options_of_reset(self._batch, number, merged) for number in numbers]
@@ -360,34 +403,43 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             if mask.all():
                 self._obs = list(self._batch.reset(seeds=seeds, options=options))
             else:
-                for i, seed, option in zip(chosen, seeds, options, strict=True):
+                for i, seed, option in zip(indices, seeds, options, strict=True):
                     self._obs[i] = self._batch.restart(i, seed=seed, options=option)
             instructions = self._batch.instructions
-        self._begun += len(chosen)
+
+        self._begun += len(indices)
         self._over[mask] = False
         self._steps[mask] = 0
-        for i, seed in zip(chosen, seeds, strict=True):
+        for i, seed in zip(indices, seeds, strict=True):
             checked_obs(self._obs[i], self._contract, "reset")
             self._add_info(infos, {"instruction": instructions[i], "episode_seed": seed}, i)
 
     def _observations(self) -> Any:
+        """Return the current observations of all environments as a member of their space."""
         rows = [observed(obs, self._observation) for obs in self._obs]
         if self._observation == "state":
             return np.stack(rows)
-        return {
-            name: np.stack([row[name] for row in rows]) for name in self.single_observation_space
-        }
+        observations = {}
+        for name in self.single_observation_space:
+            observations[name] = np.stack([row[name] for row in rows])
+        return observations
 
 
-def _seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
-    """Return the seeds of the environments that begin an episode, from a list for all
-    environments.
+def _masked_seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
+    """Return the seeds of the environments that begin an episode.
+
+    Args:
+        seeds: A seed for each environment, N; those of the others may be None.
+        mask: Whether each environment begins an episode, (N,) bool.
+
+    Raises:
+        InvalidInput: The number of seeds is wrong, or a seed is missing or negative.
     """
     if len(seeds) != mask.size:
         raise InvalidInput(
             f"seed: expected {mask.size} seeds, one for each environment, got {len(seeds)}"
         )
-    chosen = []
+    masked_seeds = []
     for i in np.flatnonzero(mask).tolist():
         seed = seeds[i]
         if not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -395,5 +447,5 @@ def _seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
                 "seed: expected a whole number for each environment that begins an episode, got "
                 f"{list(seeds)}"
             )
-        chosen.append(int(seed))
-    return chosen
+        masked_seeds.append(int(seed))
+    return masked_seeds

@@ -1,3 +1,4 @@
-"""Open loop: the observations of a dataset are sent to a policy, whose actions are compared with
-the recorded ones.
+"""Open-loop evaluation: compare a policy's actions with the recorded actions of a dataset.
+
+The policy receives the observations of the dataset, whatever its actions are.
 """

@@ -48,6 +48,7 @@ def open_loop_command(
     horizon are printed, and written as JSON.
     """
     with errors():
+        # Imported late, so that the help of the command line is fast.
         from vlagents_ray.evaluate.artifacts.storage import require_folder
         from vlagents_ray_learn.open_loop.comparison import (
             OpenLoopPlan,
@@ -59,13 +60,19 @@ def open_loop_command(
         from vlagents_ray_learn.open_loop.recorded_dataset import Names
 
         names = Names(
-            parse_camera_map(camera_map or ""), None if state is None else parse_list(state)
+            cameras=parse_camera_map(camera_map or ""),
+            state=None if state is None else parse_list(state),
         )
-        episodes = None if only is None else parse_episodes(only)
-        plan = OpenLoopPlan(episodes, horizon, every, at_once, names)
+        plan = OpenLoopPlan(
+            episodes=None if only is None else parse_episodes(only),
+            horizon=horizon,
+            every=every,
+            at_once=at_once,
+            names=names,
+        )
         datasets = open_datasets(folder)
-        into = out_dir or fresh(Path("runs/open_loop"))
-        require_folder(into)
+        result_folder = out_dir or fresh(Path("runs/open_loop"))
+        require_folder(result_folder)
         with candidate(policy) as open_session:
             result = compare(datasets, open_session, plan)
 
@@ -80,12 +87,20 @@ def open_loop_command(
             out.print(
                 f"  {joint['joint']}: {joint['mae']:.4g}, {joint['rmse']:.4g}, {joint['max']:.4g}"
             )
-        out.print(f"wrote {write_result(result, policy, into)}")
+        out.print(f"wrote {write_result(result, policy, result_folder)}")
 
 
 def parse_camera_map(text: str) -> dict[str, str]:
-    """Return the camera of the dataset for each of the policy's, from "base=top,wrist=left";
-    raises `ConfigError`.
+    """Parse the option `--camera-map`.
+
+    Args:
+        text: Pairs of names, such as "base=top,wrist=left".
+
+    Returns:
+        The policy's name of a camera -> the dataset's name.
+
+    Raises:
+        ConfigError: The text is not such a list.
     """
     cameras = {}
     for pair in parse_list(text):
@@ -99,7 +114,11 @@ def parse_camera_map(text: str) -> dict[str, str]:
 
 
 def parse_episodes(text: str) -> Sequence[int]:
-    """Return the numbers in a list such as "0-9,12"; raises `ConfigError` for any other text."""
+    """Return the numbers in a list such as "0-9,12".
+
+    Raises:
+        ConfigError: The text is not such a list, or it has too many numbers.
+    """
     episodes: list[int] = []
     for interval in parse_list(text):
         first, dash, last = interval.partition("-")

@@ -1,5 +1,6 @@
-"""A policy's answers to the observations of datasets, with several sessions at once, which it
-answers in batches.
+"""The comparison of a policy's actions with those of datasets.
+
+Several sessions run at once, so that the policy answers in batches.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ OpenSession = Callable[[], Agent]  # the caller closes the session
 
 FILE = "open_loop.json"
 _WORST_FRAMES = 10  # number of frames that the result lists
-# Options of a reset, which another policy does not have.
+# Recorded options of a reset that select weights of the recorded policy. Other policies lack them.
 _CHOICES_OF_WEIGHTS = (CHOICE, STEP, OPTION)
 
 
@@ -65,26 +66,32 @@ def candidate(source: str) -> Iterator[OpenSession]:
 
 @dataclass
 class ErrorTable:
-    """Sums over the frames so far, for each step of the horizon (H) and each number of an action
-    (D).
-    """
+    """Errors over the frames so far, by step of the horizon (H) and by value of an action (D)."""
 
-    joints: list[str]  # the names of these numbers
-    absolute: np.ndarray = field(init=False)  # (H, D), of the absolute errors
-    square: np.ndarray = field(init=False)  # (H, D), of the squared errors
-    largest: np.ndarray = field(init=False)  # (H, D), largest absolute error
-    frames: np.ndarray = field(init=False)  # (H,)
+    joints: list[str]  # names of the values of an action, D
+    absolute: np.ndarray = field(init=False)  # (H, D), sums of the absolute errors
+    square: np.ndarray = field(init=False)  # (H, D), sums of the squared errors
+    largest: np.ndarray = field(init=False)  # (H, D), largest absolute errors
+    frames: np.ndarray = field(init=False)  # (H,), number of frames
 
     def __post_init__(self) -> None:
         empty = np.zeros((0, len(self.joints)))
         self.absolute, self.square, self.largest = empty, empty, empty
         self.frames = np.zeros(0, np.int64)
 
-    def add(self, expected: np.ndarray, got: np.ndarray) -> float:
-        """Add a frame's chunks, (H, D) each, and return their mean absolute error."""
+    def add(self, expected: np.ndarray, actions: np.ndarray) -> float:
+        """Add the recorded chunk and the policy's chunk of a frame.
+
+        Args:
+            expected: The recorded actions, (H, D).
+            actions: The policy's actions, (H, D).
+
+        Returns:
+            The mean absolute error of the chunk.
+        """
         rows = len(expected)
         self._extend(rows)
-        error = np.abs(got.astype(np.float64) - expected.astype(np.float64))
+        error = np.abs(actions.astype(np.float64) - expected.astype(np.float64))
         self.absolute[:rows] += error
         self.square[:rows] += error**2
         self.largest[:rows] = np.maximum(self.largest[:rows], error)
@@ -92,7 +99,7 @@ class ErrorTable:
         return float(error.mean())
 
     def _extend(self, rows: int) -> None:
-        """Add steps of the horizon up to that number of rows."""
+        """Add steps of the horizon, up to `rows` of them."""
         missing = rows - len(self.frames)
         if missing <= 0:
             return
@@ -103,29 +110,24 @@ class ErrorTable:
         self.frames = np.pad(self.frames, (0, missing))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the errors overall, by joint, by step, and by both, in the units of the
-        actions.
-        """
+        """Return the errors overall, by joint, by step, and by both, in the units of actions."""
         total = max(1, int(self.frames.sum()))
         mae = self.absolute.sum(0) / total
         rmse = np.sqrt(self.square.sum(0) / total)
         largest = self.largest.max(0, initial=0)
-        by_joint = [
-            {"joint": name, "mae": float(mae[i]), "rmse": float(rmse[i]), "max": float(largest[i])}
-            for i, name in enumerate(self.joints)
-        ]
+        by_joint = []
+        for i, name in enumerate(self.joints):
+            errors = {"mae": float(mae[i]), "rmse": float(rmse[i]), "max": float(largest[i])}
+            by_joint.append({"joint": name, **errors})
+
         frames = self.frames[:, np.newaxis]
         means = self.absolute / frames
         step_rmse = np.sqrt((self.square / frames).mean(1))
-        by_step = [
-            {
-                "step": step,
-                "frames": int(count),
-                "mae": float(means[step].mean()),
-                "rmse": float(step_rmse[step]),
-            }
-            for step, count in enumerate(self.frames)
-        ]
+        by_step = []
+        for step, count in enumerate(self.frames):
+            errors = {"mae": float(means[step].mean()), "rmse": float(step_rmse[step])}
+            by_step.append({"step": step, "frames": int(count), **errors})
+
         return {
             "mae": float(mae.mean()),
             "rmse": float(np.sqrt((rmse**2).mean())),
@@ -140,10 +142,11 @@ class ErrorTable:
 class OpenLoopPlan:
     """The settings of a comparison."""
 
-    episodes: Sequence[int] | None = None  # of each dataset; None: all
-    # Largest number of compared rows of a chunk; None: all rows that both have.
+    episodes: Sequence[int] | None = None  # indices in each dataset; None selects all
+    # Largest number of compared rows of a chunk; None compares all rows that both chunks have.
     horizon: int | None = None
-    every: int = 1  # stride of the queried frames in a dataset without recorded answers
+    # Stride of the frames in a dataset without recorded answers: 2 skips every other one.
+    every: int = 1
     at_once: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
 
@@ -156,24 +159,27 @@ class OpenLoopResult:
     against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
-    # Calls that the recording lacks, so that a policy with a history received less.
+    # Calls that the recording lacks. A policy with a history has received less than when recorded.
     missing: int = 0
-    # dataset, episode, frame, and its chunk's "mae".
+    # For each frame: "dataset", "episode", "frame", and the "mae" of its chunk.
     frames: list[dict[str, Any]] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
+        """Return the errors of `ErrorTable`, those of each episode, and the worst frames."""
         errors_of: dict[tuple[str, int], list[float]] = {}
         for frame in self.frames:
             errors_of.setdefault((frame["dataset"], frame["episode"]), []).append(frame["mae"])
-        by_episode = [
-            {
-                "dataset": dataset,
-                "episode": episode,
-                "frames": len(errors),
-                "mae": float(np.mean(errors)),
-            }
-            for (dataset, episode), errors in sorted(errors_of.items())
-        ]
+        by_episode = []
+        for (dataset, episode), errors in sorted(errors_of.items()):
+            by_episode.append(
+                {
+                    "dataset": dataset,
+                    "episode": episode,
+                    "frames": len(errors),
+                    "mae": float(np.mean(errors)),
+                }
+            )
+
         worst = sorted(self.frames, key=lambda frame: -frame["mae"])[:_WORST_FRAMES]
         return {
             "datasets": self.datasets,
@@ -188,10 +194,10 @@ class OpenLoopResult:
 
 
 def open_datasets(folder: Path) -> list[RecordedDataset]:
-    """Open a LeRobotDataset, or all in a folder.
+    """Open a LeRobotDataset, or all datasets in a folder.
 
     Raises:
-        ConfigError: There is none, or their actions differ.
+        ConfigError: There is no dataset, or the actions of the datasets differ.
     """
     own_file = sorted(folder.glob("meta/info.json"))
     files_below = sorted(folder.glob("*/meta/info.json"))
@@ -202,10 +208,10 @@ def open_datasets(folder: Path) -> list[RecordedDataset]:
         )
     datasets = [RecordedDataset(path.parents[1]) for path in files]
     first = datasets[0]
-    for other in datasets[1:]:
-        if len(other.joints) != len(first.joints) or other.traced != first.traced:
+    for dataset in datasets[1:]:
+        if len(dataset.joints) != len(first.joints) or dataset.traced != first.traced:
             raise ConfigError(
-                f"{other.root}: has other actions than {first.root}; compare them one by one"
+                f"{dataset.root}: has other actions than {first.root}; compare them one by one"
             )
     return datasets
 
@@ -215,33 +221,41 @@ def compare(
 ) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with those of the dataset.
 
-    A session is reset with its first recorded observation, its instruction and its options, and
-    then receives each of its observations in order, whatever its answers are.
+    A session is reset with its first recorded observation, its instruction and its options. It then
+    receives each of its observations in order, whatever its answers are.
 
     Args:
         datasets: The result of `open_datasets`.
         open_session: Opens a session of the policy.
         plan: The settings.
 
+    Returns:
+        The errors.
+
     Raises:
-        ConfigError: The actions of a dataset do not fit the policy's, or a name is unknown.
-        PolicyFailed: The policy raised an error, or refused an observation.
+        ConfigError: The actions of a dataset do not have the size of the policy's actions, or a
+            name is unknown.
+        PolicyFailed: The policy raised an error, or rejected an observation.
     """
     first = datasets[0]
-    sessions = [session for dataset in datasets for session in dataset.sessions(plan.episodes)]
-    against = "answers" if first.traced else "actions"
+    sessions: list[RecordedSession] = []
+    for dataset in datasets:
+        sessions += dataset.sessions(plan.episodes)
     result = OpenLoopResult(
-        [str(dataset.root) for dataset in datasets], against, ErrorTable(first.joints)
+        datasets=[str(dataset.root) for dataset in datasets],
+        against="answers" if first.traced else "actions",
+        table=ErrorTable(first.joints),
     )
     for session in sessions:
         result.missing += sum(episode.dataset.gaps(episode) for episode in session.episodes)
-    lock = threading.Lock()
+    lock = threading.Lock()  # guards the result
 
     def query(session: RecordedSession) -> None:
         agent = open_session()
         try:
             for episode, step, actions in _answers(session, agent, plan):
-                expected = _fitting(step.expected, actions, episode)
+                _require_same_size(step.expected, actions, episode)
+                expected = step.expected
                 rows = min(len(expected), len(actions), plan.horizon or len(actions))
                 frame = {
                     "dataset": episode.dataset.root.name,
@@ -267,23 +281,19 @@ def compare(
     return result
 
 
-def _fitting(expected: np.ndarray, actions: np.ndarray, episode: RecordedEpisode) -> np.ndarray:
-    """Return the recorded actions; raises `ConfigError` if the policy's have another number of
-    values.
-    """
+def _require_same_size(expected: np.ndarray, actions: np.ndarray, episode: RecordedEpisode) -> None:
+    """Raise `ConfigError` unless the recorded and the policy's actions have as many values."""
     if actions.shape[1] != expected.shape[1]:
         raise ConfigError(
             f"{episode.dataset.root}: its actions have {expected.shape[1]} numbers, those of the "
-            "policy "
-            f"{actions.shape[1]}; use a policy of the same robot and control mode"
+            f"policy {actions.shape[1]}; use a policy of the same robot and control mode"
         )
-    return expected
 
 
 def _answers(
     session: RecordedSession, agent: Agent, plan: OpenLoopPlan
 ) -> Iterator[tuple[RecordedEpisode, RecordedStep, np.ndarray]]:
-    """Yield the frames of a session, each with the policy's action, (H, D)."""
+    """Yield the frames of a session, each with the policy's actions, (H, D)."""
     options = {
         name: value for name, value in session.options.items() if name not in _CHOICES_OF_WEIGHTS
     }
@@ -308,8 +318,6 @@ def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:
     with storing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / FILE) as path:
-            path.write_text(
-                json.dumps({"policy": policy, **result.to_json()}, indent=2, ensure_ascii=False),
-                "utf-8",
-            )
+            document = {"policy": policy, **result.to_json()}
+            path.write_text(json.dumps(document, indent=2, ensure_ascii=False), "utf-8")
     return folder / FILE

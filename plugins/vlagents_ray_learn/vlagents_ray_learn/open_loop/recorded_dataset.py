@@ -1,10 +1,11 @@
-"""Reading LeRobotDatasets v2.0 to v3.0: recordings of servers and robots, and public datasets."""
+"""Reads LeRobotDatasets v2.0 to v3.0: recordings of servers and robots, and public datasets."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +44,11 @@ _IMAGE_DTYPES = ("video", "image")
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """The policy's names for the cameras and state of a dataset without a contract of ours."""
+    """The policy's names for the cameras and the state of a dataset that has no contract."""
 
-    # policy's camera -> camera or feature of the dataset.
+    # The policy's camera -> the camera or feature of the dataset.
     cameras: Mapping[str, str] = field(default_factory=dict)
-    # Concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
+    # The names of the values that `observation.state` concatenates; "gripper" is `Obs.gripper`.
     state: Sequence[str] | None = None
 
 
@@ -59,7 +60,7 @@ class RecordedStep:
     obs: Obs
     # (H, D): the recorded answer, or the actions from here to the end of the episode.
     expected: np.ndarray
-    intervention: bool = False  # whether the recorded action is an operator's
+    intervention: bool = False  # whether the operator chose the recorded action
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +83,21 @@ class RecordedSession:
 
 
 class RecordedDataset:
-    """A dataset that is only read."""
+    """A LeRobotDataset on disk, which is only read."""
 
     def __init__(self, root: Path) -> None:
-        """Open a dataset; raises `ConfigError` if it cannot be read."""
+        """Open a dataset.
+
+        Args:
+            root: The folder of the dataset, which contains `meta/info.json`.
+
+        Raises:
+            ConfigError: The dataset cannot be read.
+        """
         self.root = root
         self._pq: Any = require("pyarrow.parquet")
         self._av: Any = require("av")
+
         self.info = _read_info(root / "meta/info.json")
         self.version = str(self.info.get("codebase_version"))
         if not self.version.startswith(("v3.", "v2.")):
@@ -103,14 +112,15 @@ class RecordedDataset:
             )
         contract = self.info.get(INFO)
         self.contract = None if contract is None else DatasetContract.from_json(contract)
+        # Whether a server has recorded its sessions and the chunks that the policy returned.
         self.traced = TRACE in self.info and CHUNK in self.features
 
     @property
     def joints(self) -> list[str]:
-        """The names of the numbers of an action."""
+        """The names of the values of an action."""
         names = self.features[ACTION].get("names")
         if isinstance(names, Mapping):  # {"motors": [...]}
-            names = [name for group in names.values() for name in group]
+            names = list(chain.from_iterable(names.values()))
         [dim] = self.features[ACTION]["shape"]
         if names and len(names) == dim:
             return [str(name) for name in names]
@@ -120,7 +130,7 @@ class RecordedDataset:
         """Return the sessions of the dataset.
 
         Args:
-            chosen: The indices of their episodes; None: all.
+            chosen: The indices of their episodes; None selects all.
 
         Raises:
             ConfigError: A chosen episode does not exist.
@@ -143,10 +153,12 @@ class RecordedDataset:
             session = columns[SESSION][0]
             by_session.setdefault(session, []).append(episode)
             options.setdefault(session, columns["reset"][0])
-        return [
-            RecordedSession(tuple(in_order), _read_values(options[session]))
-            for session, in_order in by_session.items()
-        ]
+
+        sessions = []
+        for session, session_episodes in by_session.items():
+            values = _read_values(options[session])
+            sessions.append(RecordedSession(tuple(session_episodes), values))
+        return sessions
 
     def gaps(self, episode: RecordedEpisode) -> int:
         """Return the number of calls that are missing within a traced episode."""
@@ -161,10 +173,10 @@ class RecordedDataset:
         """Yield the frames of an episode, with the input names of a policy.
 
         Args:
-            episode: One of this dataset.
-            names: The policy's names, where the dataset has no contract.
-            policy: The contract of the policy, which divides a state without names; None if it has
-                none.
+            episode: An episode of this dataset.
+            names: The policy's names, which are used if the dataset has no contract.
+            policy: The contract of the policy, which divides a state without names; None if the
+                policy has no contract.
 
         Raises:
             ConfigError: A name is unknown, or a file is incomplete.
@@ -173,29 +185,29 @@ class RecordedDataset:
             name for name, feature in self.features.items() if feature["dtype"] in _IMAGE_DTYPES
         ]
         embedded = [name for name in image_features if self.features[name]["dtype"] == "image"]
-        numbers = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
-        wanted = [name for name in numbers if name in self.features] + embedded
+        numeric = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
+        column_names = [name for name in numeric if name in self.features] + embedded
         if self.traced:
-            wanted += [CHUNK, ROWS, "request", "captured_at"]
-        columns = self._columns(episode, wanted)
+            column_names += [CHUNK, ROWS, "request", "captured_at"]
+        columns = self._columns(episode, column_names)
 
         actions = np.array(columns[ACTION], np.float32).reshape(episode.length, -1)
         cameras = self._cameras(image_features, names)
         state_features = self._state_features(names, policy)
         videos = {name: self._video(episode, name) for name in cameras if name not in embedded}
+
         for i in range(episode.length):
             images = {}
             for feature, camera in cameras.items():
-                image = (
-                    next(videos[feature])
-                    if feature in videos
-                    else _embedded_image(columns[feature][i])
-                )
+                if feature in videos:
+                    image = next(videos[feature])
+                else:
+                    image = _embedded_image(columns[feature][i])
                 images[camera] = self._original_size(image, camera)
-            values = {
-                name: np.atleast_1d(np.array(columns[name][i], np.float32))
-                for name in state_features
-            }
+
+            values = {}
+            for name in state_features:
+                values[name] = np.atleast_1d(np.array(columns[name][i], np.float32))
             state, gripper = divided_state(values, state_features)
 
             info: dict[str, Any] = {}
@@ -204,12 +216,12 @@ class RecordedDataset:
                 info = {CAPTURED: columns["captured_at"][i], **_read_values(columns["request"][i])}
                 chunk = np.array(columns[CHUNK][i], np.float32).reshape(-1, actions.shape[1])
                 expected = chunk[: columns[ROWS][i]]
+
             intervention = INTERVENTION_COLUMN in columns and bool(columns[INTERVENTION_COLUMN][i])
-            # Datasets of earlier releases also mark an operator's action that the guard refused.
-            refused = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
-            yield RecordedStep(
-                i, Obs(images, gripper, state, info), expected, intervention and not refused
-            )
+            # Datasets of earlier releases also mark an operator's action that the guard rejected.
+            rejected = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
+            obs = Obs(images, gripper, state, info)
+            yield RecordedStep(i, obs, expected, intervention and not rejected)
 
     def _episodes(self) -> list[RecordedEpisode]:
         """Read the episodes from the metadata, in the order of their indices."""
@@ -220,21 +232,25 @@ class RecordedDataset:
         else:
             for path in sorted(self.root.glob("meta/episodes/*/*.parquet")):
                 with self._pq.ParquetFile(path) as file:
-                    names = [
-                        name for name in file.schema_arrow.names if not name.startswith("stats/")
-                    ]
+                    all_names = file.schema_arrow.names
+                    names = [name for name in all_names if not name.startswith("stats/")]
                     rows += file.read(names).to_pylist()
         rows.sort(key=lambda row: row["episode_index"])
+
         episodes = []
         for row in rows:
-            instruction = str(next(iter(row.get("tasks") or ()), ""))
-            episodes.append(
-                RecordedEpisode(self, row["episode_index"], row["length"], instruction, row)
+            episode = RecordedEpisode(
+                dataset=self,
+                index=row["episode_index"],
+                length=row["length"],
+                instruction=str(next(iter(row.get("tasks") or ()), "")),
+                metadata=row,
             )
+            episodes.append(episode)
         return episodes
 
     def _columns(self, episode: RecordedEpisode, names: Sequence[str]) -> dict[str, list[Any]]:
-        """Read columns of the rows of an episode."""
+        """Read columns of the rows of an episode; raises `ConfigError` if rows are missing."""
         file = self.root / self.info["data_path"].format(**self._file_indices(episode, "data"))
         filters = [("episode_index", "=", episode.index)]
         table = self._pq.read_table(file, columns=list(names), filters=filters)
@@ -242,17 +258,24 @@ class RecordedDataset:
         if any(len(values) != episode.length for values in columns.values()):
             raise ConfigError(
                 f"{file}: expected {episode.length} frames of episode {episode.index}, got another "
-                "number; "
-                f"is the file complete?"
+                "number; is the file complete?"
             )
         return columns
 
-    def _file_indices(self, episode: RecordedEpisode, kind: str) -> dict[str, int]:
-        """Return the numbers in the path of the file with an episode's rows, or with its video."""
+    def _file_indices(self, episode: RecordedEpisode, content: str) -> dict[str, int]:
+        """Return the numbers in the path of a file.
+
+        Args:
+            episode: The episode in the file.
+            content: "data" for the rows of the episode, or "videos/FEATURE".
+        """
         if self.version.startswith("v2."):
             chunk = episode.index // int(self.info["chunks_size"])
             return {"episode_index": episode.index, "episode_chunk": chunk}
-        return {name: episode.metadata[f"{kind}/{name}"] for name in ("chunk_index", "file_index")}
+        return {
+            "chunk_index": episode.metadata[f"{content}/chunk_index"],
+            "file_index": episode.metadata[f"{content}/file_index"],
+        }
 
     def _video(self, episode: RecordedEpisode, feature: str) -> Iterator[np.ndarray]:
         """Yield the images of an episode, (H, W, 3) uint8 RGB."""
@@ -272,9 +295,7 @@ class RecordedDataset:
         )
 
     def _original_size(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Return an image without the row and the column that were added to make the size of its
-        video even.
-        """
+        """Return an image without the row and the column that make the size of its video even."""
         cameras = {} if self.contract is None else self.contract.contract.cameras or {}
         spec = cameras.get(camera)
         if spec is None or spec.height is None or spec.width is None:
@@ -282,44 +303,57 @@ class RecordedDataset:
         return np.ascontiguousarray(image[: spec.height, : spec.width])
 
     def _cameras(self, image_features: Sequence[str], names: Names) -> dict[str, str]:
-        """Return the policy's name of each feature that contains images."""
-        known = {} if self.contract is None else self.contract.cameras
-        by_feature = {
-            feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in image_features
-        }
+        """Return the policy's name of the camera of each feature that contains images.
+
+        Args:
+            image_features: The features of the dataset that contain images.
+            names: The policy's names; without cameras, it has those of the dataset.
+
+        Raises:
+            ConfigError: The dataset has no camera or feature of a name.
+        """
+        contract_names = {} if self.contract is None else self.contract.cameras
+        dataset_names = {}
+        for feature in image_features:
+            dataset_names[feature] = contract_names.get(feature, feature.removeprefix(IMAGES))
         if not names.cameras:
-            return by_feature
-        features = {camera: feature for feature, camera in by_feature.items()}
+            return dataset_names
+
+        # Cameras are named by the dataset's name of the camera, or by the feature.
+        features = {camera: feature for feature, camera in dataset_names.items()}
         features |= {feature: feature for feature in image_features}
         unknown = [name for name in names.cameras.values() if name not in features]
         if unknown:
             raise ConfigError(
-                f"--camera-map: expected some of {sorted(by_feature.values())} of {self.root}, got "
-                f"{unknown[0]!r}"
-                f"{did_you_mean(unknown[0], features)}"
+                f"--camera-map: expected some of {sorted(dataset_names.values())} of {self.root}, "
+                f"got {unknown[0]!r}{did_you_mean(unknown[0], features)}"
             )
         return {features[name]: camera for camera, name in names.cameras.items()}
 
     def _state_features(
         self, names: Names, policy: Contract | None
     ) -> dict[str, list[tuple[str, int]]]:
-        """Return the parts, and their widths, of each state feature."""
-        widths = {
-            name: int(self.features[name]["shape"][0])
-            for name in (STATE, ENVIRONMENT)
-            if name in self.features
-        }
-        if self.contract is not None and names.state is None:
-            specs = self.contract.contract.state or {}
-            order = {STATE: self.contract.state, ENVIRONMENT: self.contract.environment}
-            return {
-                name: [
-                    (part, int(specs[part].dim or 0) if part in specs else 1)
-                    for part in order[name]
-                ]
-                for name in widths
-            }
+        """Return, for each feature of the state, the names and sizes of its values in order.
+
+        Args:
+            names: The policy's names.
+            policy: The contract of the policy, which divides a state without names, or None.
+        """
+        widths = {}
+        for feature in (STATE, ENVIRONMENT):
+            if feature in self.features:
+                widths[feature] = int(self.features[feature]["shape"][0])
+
         features: dict[str, list[tuple[str, int]]] = {}
+        if self.contract is not None and names.state is None:
+            orders = {STATE: self.contract.state, ENVIRONMENT: self.contract.environment}
+            specs = self.contract.contract.state or {}
+            sizes = {name: int(spec.dim or 0) for name, spec in specs.items()}
+            for feature in widths:
+                # A name that the contract's state lacks is the gripper, which has one value.
+                features[feature] = [(name, sizes.get(name, 1)) for name in orders[feature]]
+            return features
+
         if ENVIRONMENT in widths:
             features[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
         if STATE in widths:
@@ -330,7 +364,7 @@ class RecordedDataset:
 
 
 def _read_info(file: Path) -> dict[str, Any]:
-    """Read the description of a dataset; raises `ConfigError` if it is no JSON object."""
+    """Read the description of a dataset; raises `ConfigError` if it is not a JSON object."""
     try:
         info = json.loads(file.read_text())
     except ValueError as error:
@@ -354,5 +388,5 @@ def _embedded_image(value: Mapping[str, Any]) -> np.ndarray:
 
 
 def _read_values(text: str) -> dict[str, Any]:
-    """Read a column of values by name, which is empty if there are none."""
+    """Read values by name from the text of a column, which is empty if there are none."""
     return dict(from_text(text, Budget(DEFAULT_LIMITS))) if text else {}
