@@ -1,3 +1,1 @@
-"""Jobs for clusters: evaluations and servers as Slurm jobs, and the tuner, which chooses
-settings by measuring.
-"""
+"""Jobs for clusters: evaluations and servers as Slurm jobs, and the tuner of settings."""

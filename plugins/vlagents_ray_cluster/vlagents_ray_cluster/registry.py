@@ -1,4 +1,4 @@
-"""What this distribution registers: an entry for each command."""
+"""The entries that this distribution registers, one for each command."""
 
 from vlagents_ray.registry import RegistryEntry
 

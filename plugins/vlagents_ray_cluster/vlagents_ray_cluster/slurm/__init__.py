@@ -1,5 +1,6 @@
-"""Evaluations and servers as Slurm jobs, and the hook for training scripts, which only needs the
-light install.
+"""Evaluations and servers as Slurm jobs, and the hook for training scripts.
+
+The hook, `submit_evaluation`, needs only the light install.
 """
 
 from __future__ import annotations
@@ -42,19 +43,20 @@ def submit_evaluation(
 ) -> str | None:
     """Submit a job that evaluates a newly written checkpoint, while the training continues.
 
-    A checkpoint is submitted once, by the first process that calls this, even after a restart of
-    the training. If a call fails, a later one tries again. If the training is killed during a call,
-    the first call after 6 minutes, for any checkpoint, also submits the interrupted one.
+    A checkpoint is submitted once, by the first process that calls this function, even after a
+    restart of the training. If a call fails, a later call tries again. If the training is killed
+    during a call, the first call after 6 minutes, for any checkpoint, also submits the interrupted
+    one.
 
     Args:
         words: The arguments of `vlagents-ray slurm eval`, in which `{checkpoint}` and `{step}` are
             replaced.
         checkpoint: The checkpoint.
-        step: Its training step.
+        step: The training step of the checkpoint.
         record: A folder in which each submission writes a file.
-        python: An interpreter with `vlagents-ray[serve]`, if the training's only has the light
-            install.
-        raise_errors: Raise an error instead of logging it.
+        python: An interpreter with `vlagents-ray[serve]`, if the training's interpreter only has
+            the light install.
+        raise_errors: Whether to raise an error instead of logging it.
 
     Returns:
         The number of the job; None if the checkpoint was submitted before, or if an error was
@@ -64,40 +66,20 @@ def submit_evaluation(
         HookFailed: The evaluation could not be submitted, and `raise_errors` is set.
     """
     try:
-        checkpoint, folder, words, python = (
-            os.fspath(checkpoint),
-            Path(record),
-            list(words),
-            os.fspath(python),
-        )
-        name = hashlib.sha256(
-            json.dumps([os.path.abspath(checkpoint), step, words]).encode()
-        ).hexdigest()[:16]
+        checkpoint, python, words = os.fspath(checkpoint), os.fspath(python), list(words)
+        identity = json.dumps([os.path.abspath(checkpoint), step, words])
+        digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
+        folder = Path(record)
         folder.mkdir(parents=True, exist_ok=True)
-        mark = folder / f"step-{step}-{name}.json"
-        # Submit other checkpoints whose claiming processes were killed, since no other call may
-        # follow for them.
-        for other in sorted(folder.glob("step-*.json")):
-            abandoned = _read(other)
-            if other == mark or "words" not in abandoned or _abandoned_since(other) is None:
-                continue
-            try:
-                if (job := _submit(other, abandoned, python)) is not None:
-                    of = abandoned["step"]
-                    log.info(
-                        "step %s: submitted as job %s, in place of a training that was killed",
-                        of,
-                        job,
-                    )
-            except Exception:
-                log.exception(
-                    "the evaluation of step %s was not submitted; training continues",
-                    abandoned["step"],
-                )
-        filled = [
-            word.replace("{checkpoint}", checkpoint).replace("{step}", str(step)) for word in words
-        ]
-        return _submit(mark, {"step": step, "checkpoint": checkpoint, "words": filled}, python)
+        mark = folder / f"step-{step}-{digest}.json"
+        _submit_abandoned(folder, mark, python)
+
+        filled_words = []
+        for word in words:
+            filled = word.replace("{checkpoint}", checkpoint).replace("{step}", str(step))
+            filled_words.append(filled)
+        claim = {"step": step, "checkpoint": checkpoint, "words": filled_words}
+        return _submit(mark, claim, python)
     except Exception as error:
         if raise_errors:
             raise HookFailed(f"step {step}: {error}") from error
@@ -105,17 +87,48 @@ def submit_evaluation(
         return None
 
 
-def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
-    """Return whether this process submits the checkpoint: the first to claim it, or another if
-    the first was killed.
+def _submit_abandoned(folder: Path, current: Path, python: str) -> None:
+    """Submit checkpoints whose claiming processes were killed, since no call may follow for them.
+
+    Args:
+        folder: The folder of the marks.
+        current: The mark of the checkpoint that this call submits, which is skipped.
+        python: The interpreter.
+    """
+    for mark in sorted(folder.glob("step-*.json")):
+        claim = _read(mark)
+        if mark == current or "words" not in claim or _abandoned_since(mark) is None:
+            continue
+        try:
+            job = _submit(mark, claim, python)
+        except Exception:
+            log.exception(
+                "the evaluation of step %s was not submitted; training continues", claim["step"]
+            )
+        else:
+            if job is not None:
+                log.info(
+                    "step %s: submitted as job %s, in place of a training that was killed",
+                    claim["step"],
+                    job,
+                )
+
+
+def _take_claim(mark: Path, claim: dict[str, Any]) -> bool:
+    """Claim a checkpoint for this process, and return whether that succeeded.
+
+    The first process to claim a checkpoint submits it. If that process was killed, another one
+    takes its place.
     """
     try:
         mark.open("x").close()
     except FileExistsError:
-        if (since := _abandoned_since(mark)) is None:
+        since = _abandoned_since(mark)
+        if since is None:
             return False
         try:
-            # By one of the processes that find this claim abandoned.
+            # Several processes may find this claim abandoned. The one that creates this file
+            # replaces it.
             mark.with_suffix(f".{since}").open("x").close()
         except FileExistsError:
             return False
@@ -124,21 +137,36 @@ def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
 
 
 def _abandoned_since(mark: Path) -> int | None:
-    """Return the time of a claim whose process was killed, ns since 1970; None if it was or may
-    still be submitted.
+    """Return the time of a claim whose process was killed, ns since 1970.
+
+    Returns:
+        The time; None if the checkpoint was submitted, or if its process may still submit it.
     """
     try:
         since = mark.stat().st_mtime_ns
     except FileNotFoundError:
         return None
-    return None if "job" in _read(mark) or time.time() - since / 1e9 < _ABANDONED_S else since
+    is_recent = time.time() - since / 1e9 < _ABANDONED_S
+    return None if is_recent or "job" in _read(mark) else since
 
 
 def _submit(mark: Path, claim: dict[str, Any], python: str) -> str | None:
-    """Claim a checkpoint and submit it, unless another process does; a failure releases the
-    claim.
+    """Claim a checkpoint and submit it.
+
+    A failure releases the claim.
+
+    Args:
+        mark: The file of the claim.
+        claim: The content of the file: step, checkpoint and arguments.
+        python: The interpreter.
+
+    Returns:
+        The number of the job; None if another process submits the checkpoint.
+
+    Raises:
+        HookFailed: The submission failed.
     """
-    if not _is_claimed(mark, claim):
+    if not _take_claim(mark, claim):
         return None
     command = [
         python,
@@ -168,15 +196,17 @@ def _submit(mark: Path, claim: dict[str, Any], python: str) -> str | None:
     return job
 
 
-def _replace(mark: Path, content: dict[str, Any]) -> None:
-    part = mark.with_suffix(f".{uuid.uuid4().hex}.part")
-    part.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(part, mark)
+def _replace(mark: Path, claim: dict[str, Any]) -> None:
+    """Write the file of a claim atomically."""
+    unfinished = mark.with_suffix(f".{uuid.uuid4().hex}.part")
+    unfinished.write_text(json.dumps(claim, indent=2) + "\n")
+    os.replace(unfinished, mark)
 
 
 def _read(mark: Path) -> dict[str, Any]:
+    """Return a claim; empty if its process was killed before it wrote the claim."""
     try:
-        found = json.loads(mark.read_text())
+        claim = json.loads(mark.read_text())
     except (FileNotFoundError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return claim if isinstance(claim, dict) else {}

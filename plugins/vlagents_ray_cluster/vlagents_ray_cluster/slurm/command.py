@@ -28,8 +28,8 @@ slurm = typer.Typer(
     "--nodes, --time, …",
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
-_FOUND_OUT = "it finds that out for itself"
-_TASK = "%a"  # the number of a task of --array, as in sbatch's file names
+_FOUND_OUT = "it finds that out for itself"  # why an option does not fit a job
+_TASK = "%a"  # is replaced by the number of a task of --array, as in sbatch's file names
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Print the script; write and submit nothing.")
 ]
@@ -73,17 +73,18 @@ def eval_(
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
         config, cases = _evaluation([word.replace(_TASK, index) for word in words])
-        other, _ = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
+        # Another number, which need not be a task of the array.
+        other_config, _ = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
         for tracker in config.track:
             registered_class("trackers", tracker)  # raises an error for an unknown name
-        if "array" in options and config.out == other.out:
+        if "array" in options and config.out == other_config.out:
             raise ConfigError(
                 f"--array: its tasks write to one folder; want {_TASK} in it, as in --out "
                 f"runs/x/{_TASK}"
             )
 
-        # Without --workers the workers fill the job. The number of GPUs that policies need is not
-        # known.
+        # Without --workers, the workers fill the job. They must not have GPUs then, since the
+        # number of GPUs that policies need is not known.
         fill = []
         if "workers" not in config.model_fields_set:
             if most_gpus(cases):
@@ -93,8 +94,8 @@ def eval_(
                 )
             fill = [f"--fill={max(1.0, most_cpus(cases)):g}"]
 
-        # The folder of an array is above the folders of its tasks.
-        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"
+        # The common parent of the tasks' folders, if there is an array.
+        folder = Path(os.path.commonpath([config.out, other_config.out])) / "slurm"
         arguments = ["eval", *fill, f"--closing-s={closing_s:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), dry_run, parsable)
 
@@ -121,10 +122,10 @@ def serve(
 
     with errors():
         words, options = split(context.args, _options(serve_command))
-        given = _parsed("serve", serve_command, words)
-        _refuse(given, _FOUND_OUT, "address", "host")
-        _refuse(
-            given,
+        serve_options = _parse("serve", serve_command, words)
+        _reject(serve_options, _FOUND_OUT, "address", "host")
+        _reject(
+            serve_options,
             "its server speaks no TLS, the ssh line encrypts",
             "tls_cert",
             "tls_key",
@@ -132,20 +133,23 @@ def serve(
         )
         if "array" in options:
             raise ConfigError("--array: a server is one job; submit several")
-        source = given["source"]
-        apps = {app.name: app.route_prefix or "/" for app in read_deployment(source).applications}
+
+        source = serve_options["source"]
+        arguments = ["serve"]
+        for app in read_deployment(source).applications:
+            arguments.append(f"--app={app.name}={app.route_prefix or '/'}")
+        if serve_options["port"] is not None:
+            arguments.append(f"--port={serve_options['port']}")
+        if serve_options["keys"] is None and not serve_options["insecure"]:
+            arguments.append("--key")
+
         folder = out_dir or Path("runs") / "serve" / Path(source).stem
-        arguments = ["serve", *(f"--app={name}={route}" for name, route in apps.items())]
-        arguments += [] if given["port"] is None else [f"--port={given['port']}"]
-        arguments += ["--key"] if given["keys"] is None and not given["insecure"] else []
-        _submit(
-            Script("serve", folder, [*arguments, "--", *words], options, setup=setup),
-            dry_run,
-            parsable,
-        )
+        script = Script("serve", folder, [*arguments, "--", *words], options, setup=setup)
+        _submit(script, dry_run, parsable)
 
 
 def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
+    """Submit a script, and print how to follow the job."""
     if script.setup is not None and not script.setup.is_file():
         raise ConfigError(
             f"--setup: expected a file of shell lines, got {str(script.setup)!r}, which is none"
@@ -157,19 +161,16 @@ def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
     if parsable:
         typer.echo(job)
         return
-    number = "*" if "array" in script.options else job  # one for each task
+    number = "*" if "array" in script.options else job  # each task of an array has its number
     log = script.options.get("output") or f"{script.folder}/{number}.log"
     lines = [
         f"job {job} is queued; its script: {script.file}",
         f"  state   squeue --jobs={job}",
         f"  log     {log}, and Ray's of each node in {script.folder}/{number}/",
-        *(
-            [f"  way in  {script.folder}/{number}/server.json, once it answers"]
-            if script.name == "serve"
-            else []
-        ),
-        f"  end it  scancel {job}",
     ]
+    if script.name == "serve":
+        lines.append(f"  way in  {script.folder}/{number}/server.json, once it answers")
+    lines.append(f"  end it  scancel {job}")
     out.print("\n".join(lines))
 
 
@@ -184,40 +185,41 @@ def _options(command: Callable[..., None]) -> dict[str, bool]:
     return takes_value
 
 
-def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
-    """Parse the arguments of a command, with the command's own errors."""
-    params: dict[str, Any] = (
-        _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
-    )
+def _parse(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
+    """Parse the arguments of a command; raises the errors of that command."""
+    context = _click(command).make_context(f"vlagents-ray slurm {name}", list(words))
+    params: dict[str, Any] = context.params
     return params
 
 
 def _click(command: Callable[..., None]) -> Any:
+    """Return the command of Click that Typer makes of a function."""
     app = typer.Typer(add_completion=False)
     app.command()(command)
     return typer.main.get_command(app)
 
 
-def _refuse(params: dict[str, Any], why: str, *names: str) -> None:
-    """Raise `ConfigError` if one of these options is set."""
+def _reject(params: dict[str, Any], why: str, *names: str) -> None:
+    """Raise `ConfigError` if one of these options is set; `why` is the reason."""
     options = [f"--{name.replace('_', '-')}" for name in names if params[name]]
     if options:
         raise ConfigError(f"{', '.join(options)}: not for a job: {why}; leave it out")
 
 
 def _evaluation(words: list[str]) -> tuple[EvalConfig, list[EvalCase]]:
-    """Return the configuration that `eval` builds, and its cases; raise errors that would end the
-    job at its start.
+    """Build the configuration and the cases as `eval` does.
+
+    This raises the errors with which the job would end at its start.
     """
     from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import plan_cases
 
-    given = _parsed("eval", evaluate_command, words)
-    _refuse(given, _FOUND_OUT, "address", "end_at")
-    _refuse(
-        given,
+    options = _parse("eval", evaluate_command, words)
+    _reject(options, _FOUND_OUT, "address", "end_at")
+    _reject(
+        options,
         "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)",
         "watch",
     )
-    config = config_from_options(EvalOptions(**given))
+    config = config_from_options(EvalOptions(**options))
     return config, plan_cases(resolve_policies(config, ask=False)[0])

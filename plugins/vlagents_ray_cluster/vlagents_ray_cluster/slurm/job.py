@@ -1,14 +1,15 @@
 """The programs of a job, which `job.sh` starts.
 
-    python -m vlagents_ray_cluster.slurm.job address      print the address of this node, where
-    Ray's head runs python -m vlagents_ray_cluster.slurm.job node         run Ray on this node until
-    the step ends python -m vlagents_ray_cluster.slurm.job eval [--fill CPUS] -- WORDS
+    python -m vlagents_ray_cluster.slurm.job address
+    python -m vlagents_ray_cluster.slurm.job node
+    python -m vlagents_ray_cluster.slurm.job eval [--fill CPUS] -- WORDS
     python -m vlagents_ray_cluster.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
     python -m vlagents_ray_cluster.slurm.job announce FOLDER PORT NAME=ROUTE...
 
-`eval` and `serve` run on the first node: they wait for Ray on all nodes, and are replaced by
-`vlagents-ray eval` or `vlagents-ray serve` with the arguments WORDS. `announce` prints how to reach
-the server when it is ready.
+`address` prints the address of this node, on which Ray's head will run. `node` runs Ray on this
+node until the step ends. `eval` and `serve` run on the first node. They wait for Ray on all nodes,
+and are then replaced by `vlagents-ray eval` or `vlagents-ray serve` with the arguments WORDS.
+`announce` waits until the server is ready, and prints how to reach it.
 """
 
 from __future__ import annotations
@@ -38,17 +39,20 @@ from vlagents_ray.ray_tools.session import FILES
 
 # Variable with the address of the first node, exported by the job's script.
 HEAD = "VLAGENTS_RAY_HEAD"
-# Below the ports that the package and the system assign.
+# The first port of all jobs, below the ports that the package and the system assign; the number of
+# ports of a job; and the number of jobs with different ports.
 _FIRST_PORT, _PORTS, _JOBS = 10_000, 5, 2_000
-_REST = ("--block", "--disable-usage-stats", "--log-color=false")
-# Share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's.
+_COMMON_OPTIONS = ("--block", "--disable-usage-stats", "--log-color=false")
+# Share of the job's memory for Ray's object store, which is in /dev/shm. Ray's default is 0.3 of
+# the machine's memory.
 _OBJECTS = 0.25
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-# Ray would drain for 30 s, which is useless here.
-_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}
+# Ray would otherwise drain for 30 s, for which a job that ends has no use.
+_NO_DRAIN = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}
 _HEAD_S = 120.0  # time limit for the head to listen
 _NODES_S = 300.0  # time limit for all nodes to join
-_COMMAND = "from vlagents_ray.cli import main; main()"  # runs with this Python, independent of PATH
+# Runs the command line with this Python, whatever PATH contains.
+_COMMAND = "from vlagents_ray.cli import main; main()"
 FILE = "server.json"
 _POLL_S = 0.5
 _MOST_S = 3600.0  # time limit for loading the policies
@@ -69,9 +73,7 @@ from elsewhere, first:      {ssh}
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The ports of a job, derived from its number so that jobs on the same node have different
-    ones.
-    """
+    """The ports of a job, derived from its number, so that jobs on the same node do not collide."""
 
     gcs: int  # Ray's head
     client: int  # Ray Client, which cannot be disabled
@@ -99,13 +101,13 @@ class Allocation:
 
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
+        """Return the resources of this process, from Slurm's environment variables."""
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
-        gpus = len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
-        # Slurm counts MiB, and 0 means all of the node's.
-        mebibytes = (
-            int(environ.get("SLURM_MEM_PER_NODE", "0"))
-            or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
-        )
+        gpus = len(list(filter(None, environ.get("SLURM_STEP_GPUS", "").split(","))))
+        # Slurm counts MiB, and 0 is all memory of the node.
+        mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0"))
+        if not mebibytes:
+            mebibytes = int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
             nodes=int(environ["SLURM_JOB_NUM_NODES"]),
@@ -121,58 +123,71 @@ class Allocation:
         return ports_of(self.job)
 
     def ray_start(self, head: str, folder: str) -> list[str]:
-        """Return the command that starts Ray on this node with the allocated resources."""
+        """Return the command that starts Ray on this node with the allocated resources.
+
+        Args:
+            head: The address of the first node.
+            folder: A folder for Ray's files.
+        """
         ports = self.ports
+        command = ["ray", "start"]
         if self.node == 0:
-            where = [
+            command += [
                 "--head",
                 f"--node-ip-address={head}",
                 f"--port={ports.gcs}",
                 "--include-dashboard=false",
+                f"--ray-client-server-port={ports.client}",
             ]
-            where += [f"--ray-client-server-port={ports.client}"]
         else:
-            where = [f"--address={head}:{ports.gcs}"]
-        given = [f"--num-cpus={self.cpus}", f"--num-gpus={self.gpus}"]
+            command.append(f"--address={head}:{ports.gcs}")
+
+        command += [f"--num-cpus={self.cpus}", f"--num-gpus={self.gpus}"]
         if self.memory is not None:
             objects = int(self.memory * _OBJECTS)
-            given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
-        # The other listeners use free ports, since Ray's defaults are the same numbers for every
-        # cluster.
-        given.append(f"--metrics-export-port={ports.export}")
-        free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
-        return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
+            command += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
+
+        command.append(f"--metrics-export-port={ports.export}")
+        # The other listeners use free ports, since Ray's defaults are the same for every cluster.
+        command += ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
+        return [*command, f"--temp-dir={folder}/{FILES}", *_COMMON_OPTIONS]
 
 
 def run_node() -> int:
-    """Run Ray, then remove its files; return the exit status of the step, which is that of Ray
-    on the head.
+    """Run Ray on this node until the step ends, and remove Ray's files.
+
+    Returns:
+        The exit status of the step. On the head it is that of Ray, unless Slurm has ended the step.
     """
     allocation = Allocation.here()
     head = os.environ[HEAD]
     if allocation.node:
         wait_for_head(head, allocation.ports.gcs)
-    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_AT_ONCE}
-    asked = threading.Event()
+
+    metrics_port = {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics)}
+    environment = os.environ | metrics_port | _NO_DRAIN
+    terminated = threading.Event()  # Slurm has ended the step
     with tempfile.TemporaryDirectory(
         prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True
     ) as folder:
         ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - our own command
 
-        def end(_number: int, _frame: FrameType | None) -> None:
-            asked.set()
+        def terminate(_number: int, _frame: FrameType | None) -> None:
+            terminated.set()
             ray.terminate()
 
-        signal.signal(signal.SIGTERM, end)
+        signal.signal(signal.SIGTERM, terminate)
         status = ray.wait()
-    if asked.is_set():
+
+    if terminated.is_set():
         return 0
     sys.stdout.write(f"Ray ended with {status}\n")
-    return 0 if allocation.node else status  # the job continues without a node other than the head
+    # The job continues without this node, unless it is the head.
+    return 0 if allocation.node else status
 
 
 def wait_for_head(host: str, port: int) -> None:
-    """Wait until Ray's head listens; after `_HEAD_S` the process exits with a message."""
+    """Wait until Ray's head listens. After `_HEAD_S` the process exits with a message."""
     deadline = time.monotonic() + _HEAD_S
     while True:
         try:
@@ -189,9 +204,29 @@ def wait_for_head(host: str, port: int) -> None:
 
 
 def run_command(arguments: Sequence[str]) -> None:
-    """Wait for Ray, and replace this process by the command."""
+    """Wait for Ray on all nodes, and replace this process with `vlagents-ray eval` or `serve`.
+
+    Args:
+        arguments: The arguments of this program, then "--", then those of the command.
+    """
+    end_of_own = arguments.index("--")
+    options = _command_options(arguments[:end_of_own])
+    allocation, head = Allocation.here(), os.environ[HEAD]
+    address = f"{head}:{allocation.ports.gcs}"
+    wait_for_head(head, allocation.ports.gcs)
+    cpus = wait_for_nodes(address, allocation.nodes)
+
+    words = [*arguments[end_of_own + 1 :], f"--address={address}"]
+    if options.command == "eval":
+        words += _eval_words(options, allocation.job, cpus)
+    else:
+        words += _start_announcing(options, allocation)
+    os.execv(sys.executable, [sys.executable, "-c", _COMMAND, options.command, *words])  # noqa: S606 - no shell
+
+
+def _command_options(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=["eval", "serve"])
+    parser.add_argument("command", choices=["eval", "serve"])
     parser.add_argument(
         "--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one"
     )
@@ -203,49 +238,49 @@ def run_command(arguments: Sequence[str]) -> None:
         "--port", type=int, help="port of the server; by default derived from the job's number"
     )
     parser.add_argument("--app", action="append", default=[], help="an application and its route")
-    end_of_own = arguments.index("--")
-    given = parser.parse_args(arguments[:end_of_own])
-    allocation, head = Allocation.here(), os.environ[HEAD]
-    address = f"{head}:{allocation.ports.gcs}"
-    wait_for_head(head, allocation.ports.gcs)
-    cpus = wait_for_nodes(address, allocation.nodes)
-    words = [*arguments[end_of_own + 1 :], f"--address={address}"]
-    if given.what == "eval":
-        end = end_of_job(allocation.job)
-        words += ["--resume", "--replica-per-gpu"]
-        if given.fill is not None:
-            words += [
-                f"--workers={max(1, int((cpus - 1) / given.fill))}",
-                f"--worker-cpus={given.fill:g}",
-            ]
-        words += [] if end is None else [f"--end-at={end - given.closing_s:.0f}"]
-    else:
-        from vlagents_ray.serve.access.key_store import new_key
+    return parser.parse_args(arguments)
 
-        # The job's folder, which only its user can read.
-        folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent
-        port, key = given.port or allocation.ports.serve, ""
-        words += ["--host=0.0.0.0", f"--port={port}"]
-        if given.key:
-            keys = folder / "keys.json"
-            keys.unlink(missing_ok=True)  # keys from before the job was requeued
-            key = new_key(keys, f"job-{allocation.job}")
-            words.append(f"--keys={keys}")
-        announcing = [
-            sys.executable,
-            "-m",
-            "vlagents_ray_cluster.slurm.job",
-            "announce",
-            str(folder),
-            str(port),
-            *given.app,
-        ]
-        subprocess.Popen(announcing, env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
-    os.execv(sys.executable, [sys.executable, "-c", _COMMAND, given.what, *words])  # noqa: S606 - no shell
+
+def _eval_words(options: argparse.Namespace, job: int, cpus: int) -> list[str]:
+    """Return the arguments that the job adds to `vlagents-ray eval`, from its time and CPUs."""
+    words = ["--resume", "--replica-per-gpu"]
+    if options.fill is not None:
+        workers = max(1, int((cpus - 1) / options.fill))
+        words += [f"--workers={workers}", f"--worker-cpus={options.fill:g}"]
+    end = end_of_job(job)
+    if end is not None:
+        words.append(f"--end-at={end - options.closing_s:.0f}")
+    return words
+
+
+def _start_announcing(options: argparse.Namespace, allocation: Allocation) -> list[str]:
+    """Start `announce`, and return the arguments that the job adds to `vlagents-ray serve`.
+
+    A new API key is created if the options say so.
+    """
+    from vlagents_ray.serve.access.key_store import new_key
+
+    # The job's folder, which only its user can read.
+    folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent
+    port, key = options.port or allocation.ports.serve, ""
+    words = ["--host=0.0.0.0", f"--port={port}"]
+    if options.key:
+        keys = folder / "keys.json"
+        keys.unlink(missing_ok=True)  # keys from before the job was requeued
+        key = new_key(keys, f"job-{allocation.job}")
+        words.append(f"--keys={keys}")
+
+    command = [sys.executable, "-m", "vlagents_ray_cluster.slurm.job", "announce"]
+    arguments = [str(folder), str(port), *options.app]
+    subprocess.Popen([*command, *arguments], env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
+    return words
 
 
 def wait_for_nodes(address: str, number: int) -> int:
-    """Wait until a number of nodes have joined the cluster, and return its number of CPUs."""
+    """Wait until `number` nodes have joined Ray, and return the number of CPUs of the cluster.
+
+    After `_NODES_S` the process exits with a message.
+    """
     import ray
 
     deadline = time.monotonic() + _NODES_S
@@ -275,6 +310,7 @@ def wait_for_nodes(address: str, number: int) -> int:
 
 
 def _names(nodes: list[dict[str, Any]]) -> str:
+    """Return the names and resources of nodes as text."""
     descriptions = []
     for node in sorted(nodes, key=lambda node: node["NodeManagerHostname"]):
         name, resources = node["NodeManagerHostname"], node["Resources"]
@@ -284,9 +320,8 @@ def _names(nodes: list[dict[str, Any]]) -> str:
 
 
 def end_of_job(job: int) -> float | None:
-    """Return the time at which Slurm ends the job, s since 1970; None if never. Newer versions
-    set a variable.
-    """
+    """Return the time at which Slurm ends the job, s since 1970; None if it has no limit."""
+    # Newer versions of Slurm set this variable.
     variable = os.environ.get("SLURM_JOB_END_TIME")
     if variable is not None:
         return float(variable)
@@ -299,15 +334,22 @@ def end_of_job(job: int) -> float | None:
 
 
 def announce(words: Sequence[str]) -> None:
-    """Wait until each application is ready, write the file, and print it to the job's log."""
-    folder, port, apps = Path(words[0]), int(words[1]), dict(one.split("=", 1) for one in words[2:])
+    """Wait until each application is ready, write `server.json`, and print it to the job's log.
+
+    Args:
+        words: The folder of the file, the port, and NAME=ROUTE of each application.
+    """
+    folder, port = Path(words[0]), int(words[1])
+    apps = dict(app.split("=", 1) for app in words[2:])
+    health_urls = []
+    for route in apps.values():
+        health_urls.append(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz")
+
     deadline = time.monotonic() + _MOST_S
     server = os.getppid()
-    while not all(
-        _answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()
-    ):
-        # The server has ended, and its log has the reason.
-        if time.monotonic() > deadline or os.getppid() != server:
+    while not all(map(_answers, health_urls)):
+        has_ended = os.getppid() != server  # its log has the reason
+        if has_ended or time.monotonic() > deadline:
             return
         time.sleep(_POLL_S)
 
@@ -320,8 +362,15 @@ def announce(words: Sequence[str]) -> None:
 def connection_info(
     apps: Mapping[str, str], port: int, environ: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return the content of the file: the URL of each application, the key, and a command for a
-    tunnel.
+    """Return the content of `server.json`.
+
+    Args:
+        apps: Name -> route of each application.
+        port: The port of the server.
+        environ: The environment variables of the job.
+
+    Returns:
+        The URL of each application, the API key, the command for an SSH tunnel, and the job.
     """
     host = socket.gethostname()
     url = f"http://{host}:{port}"
@@ -341,43 +390,50 @@ def connection_info(
     }
 
 
-def as_text(found: Mapping[str, Any], file: Path) -> str:
-    """Return the connection info as text without the key, since other people may read the log."""
-    url = next(iter(found["apps"].values()))
+def as_text(info: Mapping[str, Any], file: Path) -> str:
+    """Return the connection info as text without the key, since other people may read the log.
+
+    Args:
+        info: The result of `connection_info`.
+        file: The file with the key, from which the text reads it.
+    """
+    url = next(iter(info["apps"].values()))
     key = f"export {KEY_VARIABLE}=(the key that you were given; none, if the server is --insecure)"
-    if found["key"]:
-        read = "import json, sys; print(json.load(open(sys.argv[1]))['key'])"
-        key = f'export {KEY_VARIABLE}=$(python3 -c "{read}" {shlex.quote(str(file))})'
-    names = ", ".join(found["apps"])
-    return _TEXT.format(**{**found, "url": url, "key": key, "names": names, "file": file})
+    if info["key"]:
+        program = "import json, sys; print(json.load(open(sys.argv[1]))['key'])"
+        key = f'export {KEY_VARIABLE}=$(python3 -c "{program}" {shlex.quote(str(file))})'
+    names = ", ".join(info["apps"])
+    return _TEXT.format(**{**info, "url": url, "key": key, "names": names, "file": file})
 
 
-def write(file: Path, found: Mapping[str, Any]) -> None:
-    """Write the file, which contains a key, atomically and readable only by its owner."""
+def write(file: Path, info: Mapping[str, Any]) -> None:
+    """Write the connection info, which contains a key, atomically, readable only by its owner."""
     unfinished = file.with_suffix(".part")
     unfinished.touch(mode=0o600)
-    unfinished.write_text(json.dumps(found, indent=2) + "\n")
+    unfinished.write_text(json.dumps(info, indent=2) + "\n")
     unfinished.replace(file)
 
 
 def _answers(url: str) -> bool:
+    """Return whether a URL answers with a status that is not an error."""
     with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5):  # noqa: S310 - our own server
         return True
     return False
 
 
 def main() -> None:
-    what, *words = sys.argv[1:]
-    if what == "address":
+    """Run the program that the first argument names."""
+    program, *words = sys.argv[1:]
+    if program == "address":
         from ray.util import get_node_ip_address
 
         sys.stdout.write(f"{get_node_ip_address()}\n")
-    elif what == "node":
+    elif program == "node":
         sys.exit(run_node())
-    elif what == "announce":
+    elif program == "announce":
         announce(words)
     else:
-        run_command([what, *words])
+        run_command([program, *words])
 
 
 if __name__ == "__main__":

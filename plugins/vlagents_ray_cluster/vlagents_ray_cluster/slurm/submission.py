@@ -1,6 +1,4 @@
-"""The submission of jobs: sbatch's options on the command line, the script, and the call of
-sbatch.
-"""
+"""The submission of jobs: the options of sbatch, the script, and the call of sbatch."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from pathlib import Path
 from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
-# Options of sbatch (22.05 to 24.11) without a value, or with a value after "=" only.
+# Options of sbatch (22.05 to 24.11) that have no value, or a value only after "=".
 _ALONE = {
     "contiguous",
     "exclusive",
@@ -38,6 +36,7 @@ _ALONE = {
     "use-min-nodes",
     "verbose",
 }
+# Short options of sbatch -> their long names.
 _SHORT = {
     "A": "account",
     "B": "extra-node-info",
@@ -67,7 +66,7 @@ _SHORT = {
     "w": "nodelist",
     "x": "exclude",
 }
-# The script starts one process of Ray on each node, so these options are refused.
+# Rejected options -> what to use instead. The script starts one process of Ray on each node.
 _OURS = {
     "ntasks": "--nodes and --cpus-per-task",
     "ntasks-per-node": "--nodes and --cpus-per-task",
@@ -78,34 +77,44 @@ _OURS = {
     "gpus-per-task": "--gpus-per-node",
     "wrap": "no `--wrap`, as the script is written for you",
     "wait": "`squeue`, and --dependency in the jobs that wait",
-    "W": ("`squeue`, and --dependency in the jobs that wait"),
+    "W": "`squeue`, and --dependency in the jobs that wait",
     "input": "a deployment or a file of runs",
     "i": "a file of runs",
 }
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
-# The location of Slurm; other variables belong to this process's own job.
+# Variables with the location of Slurm. Slurm's other variables belong to this process's job.
 _KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}
 _SBATCH_S = 120.0
 
 
 def split(
-    words: Sequence[str], known: Mapping[str, bool]
+    words: Sequence[str], command_options: Mapping[str, bool]
 ) -> tuple[list[str], dict[str, str | None]]:
-    """Return a command's own arguments, and sbatch's options by their long names, None for those
-    without a value.
+    """Separate a command's arguments from options of sbatch.
+
+    Args:
+        words: The arguments on the command line.
+        command_options: The names of the command's options, and whether each has a value.
+
+    Returns:
+        The command's arguments, and the options of sbatch: long name -> value, or None for an
+        option without a value.
+
+    Raises:
+        ConfigError: An option is not valid, does not fit the script, or lacks its value.
     """
     arguments: list[str] = []
     sbatch: dict[str, str | None] = {}
-    waiting = iter(words)
-    for word in waiting:
+    remaining = iter(words)
+    for word in remaining:
         name, equals, value = word.partition("=")
         if not word.startswith("-") or word == "-":
             arguments.append(word)
-        elif name in known:
+        elif name in command_options:
             arguments.append(word)
-            if known[name] and not equals:
-                arguments.append(_next(waiting, name))
+            if command_options[name] and not equals:
+                arguments.append(_next(remaining, name))
         else:
             is_short = not word.startswith("--")
             if is_short:
@@ -127,12 +136,13 @@ def split(
                 raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
 
             if option not in _ALONE and attached is None:
-                attached = _next(waiting, f"--{option}")
+                attached = _next(remaining, f"--{option}")
             sbatch[option] = attached
     return arguments, sbatch
 
 
 def _next(words: Iterable[str], option: str) -> str:
+    """Return the next word, which is the value of an option; raises `ConfigError` at the end."""
     value = next(iter(words), None)
     if value is None:
         raise ConfigError(f"{option}: got no value; want {option}=VALUE")
@@ -140,7 +150,11 @@ def _next(words: Iterable[str], option: str) -> str:
 
 
 def first_index(array: str) -> str:
-    """Return the first task of an `--array`: 4 of "4-9%2"."""
+    """Return the number of the first task of `--array`, such as 4 for "4-9%2".
+
+    Raises:
+        ConfigError: The value does not begin with a number.
+    """
     match = re.match(r"\d+", array)
     if match is None:
         raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
@@ -155,30 +169,32 @@ class Script:
     folder: Path  # for the script and the job's logs, on a file system that all nodes share
     arguments: Sequence[str]  # of `vlagents_ray_cluster.slurm.job`
     options: Mapping[str, str | None]  # of sbatch; they override the defaults
-    resubmit: int = 0  # how often to submit the job again when its time is over
+    resubmit: int = 0  # number of times that the job is submitted again when its time is over
     setup: Path | None = None  # a file of shell lines to run first
 
     @property
     def file(self) -> Path:
+        """The path of the script."""
         return self.folder / f"{self.name}.sh"
 
     def text(self) -> str:
         """Return the content of the script.
 
         Raises:
-            ConfigError: A name, path or option has a control character, such as a line feed, after
-                which the rest of a comment would be a command; or quotes in a value with spaces,
-                which sbatch cannot read.
+            ConfigError: A name, path or option has a control character: after a line feed, the
+                remainder of a comment would be a command. Or a value with spaces has quotes, which
+                sbatch cannot read.
         """
-        defaults = {
+        defaults: dict[str, str | None] = {
             "job-name": f"vlagents-ray-{self.name}",
             "nodes": "1",
             "ntasks-per-node": "1",
             "chdir": os.getcwd(),
             "output": str(self.folder.absolute() / "%j.log"),
             "open-mode": "append",
-            **({} if "no-requeue" in self.options else {"requeue": None}),
         }
+        if "no-requeue" not in self.options:
+            defaults["requeue"] = None
 
         words = []
         for option, value in (defaults | dict(self.options)).items():
@@ -209,12 +225,10 @@ class Script:
             "resubmit": str(self.resubmit),
             "unfinished": str(OUT_OF_TIME),
         }
+        path = shlex.quote(str(self.file))
         lines = [
             "#!/bin/bash",
-            (
-                f"# Written by `vlagents-ray slurm {self.name}`; again: sbatch "
-                f"{shlex.quote(str(self.file))}"
-            ),
+            f"# Written by `vlagents-ray slurm {self.name}`; again: sbatch {path}",
             *(f"#SBATCH {word}" for word in words),
             "",
             *(f"{name}={shlex.quote(value)}" for name, value in settings.items()),
@@ -229,7 +243,15 @@ class SubmissionFailed(VLAgentsError):
 
 
 def submit(script: Script) -> str:
-    """Write a script, submit it, and return the job's number."""
+    """Write a script and submit it.
+
+    Returns:
+        The number of the job.
+
+    Raises:
+        ConfigError: sbatch is not installed.
+        SubmissionFailed: sbatch rejected the job, or did not answer.
+    """
     file = script.file.absolute()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())
@@ -260,10 +282,9 @@ def submit(script: Script) -> str:
 
 
 def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment without the variables of this process's own job, such as a training.
+    """Return the environment without the variables of this process's job, such as a training.
 
-    sbatch passes its environment on, and steps of the new job would read these variables as their
-    options.
+    sbatch passes its environment to the new job, whose steps would read these variables as options.
     """
     environment = {}
     for name, value in environ.items():

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vlagents_ray_cluster.tune.tuner import MeasuredPoint
 
 
-class Wanted(str, Enum):
+class Goal(str, Enum):
     """The values of `--for`."""
 
     robots = "robots"
@@ -27,12 +27,12 @@ class Wanted(str, Enum):
 
 def tune_command(
     file: Annotated[Path, typer.Argument(help="A deployment file.")],
-    wanted: Annotated[
-        Wanted,
+    goal: Annotated[
+        Goal,
         typer.Option(
             "--for", help="The most actions a second, or the most robots within --p99-ms."
         ),
-    ] = Wanted.throughput,
+    ] = Goal.throughput,
     p99_ms: Annotated[
         float | None,
         typer.Option(
@@ -70,6 +70,7 @@ def tune_command(
     to change.
     """
     began = time.monotonic()
+    # Imported late, so that the help of the command line is fast.
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
     from vlagents_ray_cluster.tune.tuner import (
@@ -83,37 +84,40 @@ def tune_command(
     )
 
     with errors():
-        goal = TuningGoal(wanted.value, p99_ms)
+        tuning_goal = TuningGoal(goal.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
             raise ConfigError(f"got {str(file)!r}, want a deployment file (.yaml)")
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
         plan = TunePlan(
-            args,
-            goal,
-            max_batch,
-            minutes,
-            seconds,
-            tolerance,
-            None if dtypes is None else parse_list(dtypes),
-            frames,
-            image,
-            parse_dims(state, "--state-dim"),
+            args=args,
+            goal=tuning_goal,
+            max_batch=max_batch,
+            minutes=minutes,
+            seconds=seconds,
+            tolerance=tolerance,
+            dtypes=None if dtypes is None else parse_list(dtypes),
+            frames=frames,
+            side=image,
+            dims=parse_dims(state, "--state-dim"),
         )
         tuner = Tuner(plan, progress, began)
         points = tuner.measure()
-        title = f"{args.policy} on {tuner.device}"
+
         head, *rows = figures(points)
-        shown = table(*head, title=title)
+        table_of_points = table(*head, title=f"{args.policy} on {tuner.device}")
         for row in rows:
-            shown.add_row(*row)
-        out.print(shown)
+            table_of_points.add_row(*row)
+        out.print(table_of_points)
         for sentence in tuner.left_out:
             out.print(f"left out: {sentence}", style="yellow")
-        chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
+
+        chosen = choose(points, tuning_goal)
+        default = default_point(points, tuning_goal, args.batch.max_size)
         out.print(f"chosen: {_words(chosen)}\nthe file as it is: {_words(default)}")
         out.print(f"after {time.monotonic() - began:.0f} s")
-        if settings := chosen_settings(chosen, args.batch, tuner.fixed):
+        settings = chosen_settings(chosen, args.batch, tuner.fixed)
+        if settings:
             text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None)
             out.print(f"set below args of {application.name!r} in {file}:\n\n{text}")
         else:
@@ -121,6 +125,7 @@ def tune_command(
 
 
 def _words(point: MeasuredPoint | None) -> str:
+    """Return a point and its figures in words."""
     if point is None:
         return "not measured, or out of the goal"
     from vlagents_ray_cluster.tune.tuner import sessions

@@ -1,4 +1,4 @@
-"""Processes of a benchmark: each implements a line protocol, and never outlives this process."""
+"""Processes of a benchmark, which answer lines of text and end with this process."""
 
 from __future__ import annotations
 
@@ -18,21 +18,16 @@ from typing_extensions import Self
 import vlagents_ray
 from vlagents_ray.errors import VLAgentsError
 
-_END_S = 10.0
-_KEPT = 2000  # characters of a failed process's standard error that are shown
+_END_S = 10.0  # time for a process to end
+_SHOWN_CHARACTERS = 2000  # of a failed process's standard error
 
 
 class ProcessFailed(VLAgentsError):
-    """A process of a benchmark, ours or a peer's, ended or did not answer; the message has the
-    end of its errors.
-    """
+    """A process of a benchmark ended or did not answer; the message has its last errors."""
 
 
 class LineProcess:
-    """A process that answers lines with lines of JSON. Its standard error is shown if it fails.
-
-    It has the environment variables of this process, changed by `environment`; None removes one.
-    """
+    """A process that answers each line with a line of JSON. If it fails, its errors are shown."""
 
     def __init__(
         self,
@@ -42,8 +37,22 @@ class LineProcess:
         *,
         end_s: float = _END_S,
     ) -> None:
+        """Start the process.
+
+        Args:
+            name: A name for errors.
+            command: The program and its arguments.
+            environment: Changes to the environment variables of this process; None removes one.
+            end_s: Time for the process to end after its input is closed, s.
+        """
+        variables = {**os.environ, **(environment or {})}
+        child_environment = {}
+        for variable, value in variables.items():
+            if value is not None:
+                child_environment[variable] = value
+
         self.name = name
-        self._end_s = end_s  # time for the process to end after its input
+        self._end_s = end_s
         self._received = b""  # the bytes after the last complete line
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
@@ -51,40 +60,38 @@ class LineProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env={
-                name: value
-                for name, value in {**os.environ, **(environment or {})}.items()
-                if value is not None
-            },
-            start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
+            env=child_environment,
+            # Ctrl-C reaches this process alone, which ends its children in order.
+            start_new_session=True,
         )
-        self._input, self._output = (
-            cast(IO[bytes], self._process.stdin),
-            cast(IO[bytes], self._process.stdout),
-        )
+        self._input = cast(IO[bytes], self._process.stdin)
+        self._output = cast(IO[bytes], self._process.stdout)
         self.pid = self._process.pid
 
     def read(self, timeout_s: float) -> Any:
-        """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end
-        or a time-out.
+        """Return the next line that the process writes, decoded from JSON.
+
+        Raises:
+            ProcessFailed: The process ended, did not answer in time, or wrote something else.
         """
         deadline = time.monotonic() + timeout_s
         while b"\n" not in self._received:
-            ready, _, _ = select.select(
-                [self._output], [], [], max(0.0, deadline - time.monotonic())
-            )
+            remaining_s = max(0.0, deadline - time.monotonic())
+            ready, _, _ = select.select([self._output], [], [], remaining_s)
             if not ready:
                 raise ProcessFailed(
                     f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip()
                 )
-            if not (more := os.read(self._output.fileno(), 2**16)):
+            data = os.read(self._output.fileno(), 2**16)
+            if not data:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_S)
                 status = self._process.returncode
                 raise ProcessFailed(
                     f"{self.name}: ended with exit status {status}\n{self._last_errors()}".rstrip()
                 )
-            self._received += more
+            self._received += data
+
         line, _, self._received = self._received.partition(b"\n")
         try:
             return json.loads(line)
@@ -93,16 +100,17 @@ class LineProcess:
 
     def send(self, line: str) -> None:
         """Send a line, without waiting for the answer."""
-        with contextlib.suppress(BrokenPipeError):  # `read` raises the reason
+        with contextlib.suppress(BrokenPipeError):  # the next `read` raises an error
             self._input.write(line.encode() + b"\n")
             self._input.flush()
 
     def request(self, line: str, timeout_s: float) -> Any:
+        """Send a line, and return the answer; raises the errors of `read`."""
         self.send(line)
         return self.read(timeout_s)
 
     def close(self) -> None:
-        """Close the standard input of the process, which ends it; kill it if it continues."""
+        """Close the standard input of the process, which ends it, and kill it if it continues."""
         with contextlib.suppress(OSError):
             self._input.close()
         try:
@@ -120,14 +128,16 @@ class LineProcess:
         self.close()
 
     def _last_errors(self) -> str:
-        self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, self._errors.tell() - _KEPT))
+        """Return the end of the process's standard error."""
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - _SHOWN_CHARACTERS))
         return self._errors.read().decode(errors="replace").strip()
 
 
 def our_environment() -> dict[str, str]:
-    """Return the environment variables with which a child process finds this package and the
-    core, installed or not.
+    """Return the environment variables with which a child process can import these packages.
+
+    The child finds this distribution and the core even if they are not installed.
     """
     core = str(Path(vlagents_ray.__file__).parents[1])
     plugin = str(Path(__file__).parents[2])

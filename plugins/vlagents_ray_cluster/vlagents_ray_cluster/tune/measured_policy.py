@@ -1,10 +1,12 @@
 """A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
 
 `python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for
-`tuner`. It runs in the policy's own Python environment, and so needs the light install and
-pydantic. The first line of its input is `ProcessSettings`, as JSON. Each further line is a request,
-{"measure": SESSIONS, "seconds": S, "priority": PRIORITY} or {"act": BATCH}, and is answered with a
-line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
+`tuner`. It runs in the policy's Python environment, and therefore needs only the light install and
+pydantic.
+
+The first line of its input is `ProcessSettings`, as JSON. Each further line is a request,
+{"measure": SESSIONS, "seconds": S, "priority": PRIORITY} or {"act": BATCH}. The answer is a line of
+JSON. While the policy loads, lines {"step": …} describe the progress. {"failed": …} is an error.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ from vlagents_ray.testing import random_observation
 from vlagents_ray.validation import check_observation
 
 INSTRUCTION = "pick up the cube"
-WARM = 2  # warm-up batches, which do not count
+WARM = 2  # number of warm-up batches, which are not counted
 _LATE_S = 600.0  # a first batch may be compiled
 FRAMES = 8  # episodes whose first actions are compared
 _TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
@@ -109,13 +111,12 @@ class MeasuredPolicy:
         self.engine.close()
 
     def actions(self, size: int, count: int) -> list[np.ndarray]:
-        """Return the first actions of episodes 0, 1, … with their own observations and seeds, in
-        batches of `size`.
+        """Compute the first actions of episodes, each of which has its observation and seed.
 
         Args:
             size: The batch size.
-            count: The number of episodes; if `size` does not divide it, the last batch continues
-                with episode 0.
+            count: The number of episodes, which are numbered from 0. If `size` does not divide it,
+                the last batch continues with episode 0.
 
         Returns:
             At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i
@@ -145,8 +146,15 @@ class MeasuredPolicy:
         return act
 
     def queued(self, size: int, seconds: float, priority: PriorityName) -> QueuedTurn:
-        """Measure `size` sessions, each of which sends its next request as soon as the last one
-        is answered.
+        """Measure sessions that send their next request as soon as the last one is answered.
+
+        Args:
+            size: The number of sessions.
+            seconds: The duration of the measurement after the warm-up, s.
+            priority: The priority of the requests.
+
+        Raises:
+            VLAgentsError: The error of a request.
         """
         views = [self._view(self.engine.contract, i) for i in range(size)]
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
@@ -175,34 +183,37 @@ class MeasuredPolicy:
         for i in range(size):
             send(i, "act")
         calls: list[tuple[float, float, float]] = []  # end (s), round trip (s), batch size
-        waiting, first = size, WARM * size
-        while waiting:
+        in_flight = size
+        warm_up = WARM * size  # number of calls that are not counted
+        while in_flight:
             i, reply, now = receive()
             calls.append((now, now - sent_at[i], reply.timing["batch_size"]))
-            waiting -= 1
-            if len(calls) <= first or now - calls[first][0] < seconds:
-                waiting += 1
+            in_flight -= 1
+            if len(calls) <= warm_up or now - calls[warm_up][0] < seconds:
+                in_flight += 1
                 send(i, "act")
 
         for i in range(size):
             send(i, "close")
             receive()
 
-        # A batch is counted once for each of its calls, so the mean size of the batches is the
-        # harmonic mean over the calls.
-        calls = calls[first:]
+        # Each batch is counted once for each of its calls. The mean size of the batches is
+        # therefore the harmonic mean over the calls.
+        calls = calls[warm_up:]
         mean_batch = len(calls) / sum(1 / call[2] for call in calls)
         return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
 
 
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
-    """Return actions per second: the slope of the line through all ends of calls.
+    """Return actions per second: the slope of the line through the ends of all calls.
 
-    Actions come in batches, so counting them within a time would be wrong by up to a batch. 0 for
-    fewer than two calls.
+    Actions are computed in batches, so that a count within a fixed time could be wrong by a batch.
 
     Args:
-        calls: The calls of each client; the first number of a call is its end, s.
+        calls: The calls of each client; the first value of a call is its end, s.
+
+    Returns:
+        The rate; 0 for fewer than two calls.
     """
     ends_of_calls: list[float] = []
     for calls_of_client in calls:
@@ -215,7 +226,7 @@ def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
 
 
 def cuda() -> Any:
-    """Return `torch.cuda` if this process uses it, else None."""
+    """Return the module `torch.cuda` if this process uses CUDA through torch, otherwise None."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
         return torch.cuda
@@ -223,7 +234,7 @@ def cuda() -> Any:
 
 
 def jax_device() -> Any:
-    """Return JAX's first device if this process uses JAX and the device is not a CPU, else None."""
+    """Return JAX's first device if this process uses JAX on an accelerator, otherwise None."""
     jax = sys.modules.get("jax")
     device = None if jax is None else jax.local_devices()[0]
     return None if device is None or device.platform == "cpu" else device
@@ -231,18 +242,21 @@ def jax_device() -> Any:
 
 def forget_peak() -> None:
     """Reset `peak_mib`, if the accelerator supports it."""
-    used = cuda()
-    if used is not None:
-        used.reset_peak_memory_stats()
+    torch_cuda = cuda()
+    if torch_cuda is not None:
+        torch_cuda.reset_peak_memory_stats()
 
 
 def peak_mib() -> float:
-    """Return the peak memory, MiB, of the accelerator, with torch since `forget_peak`; else of
-    this process.
+    """Return the peak memory in use, MiB.
+
+    Returns:
+        The memory of the accelerator, with torch since the last `forget_peak`; without an
+        accelerator, the memory of this process.
     """
-    used = cuda()
-    if used is not None:
-        return float(used.max_memory_allocated()) / 2**20
+    torch_cuda = cuda()
+    if torch_cuda is not None:
+        return float(torch_cuda.max_memory_allocated()) / 2**20
 
     device = jax_device()
     if device is not None:
@@ -252,9 +266,9 @@ def peak_mib() -> float:
 
 def device_name() -> str:
     """Return the name of the policy's accelerator, or "cpu"."""
-    used = cuda()
-    if used is not None:
-        return str(used.get_device_name())
+    torch_cuda = cuda()
+    if torch_cuda is not None:
+        return str(torch_cuda.get_device_name())
 
     device = jax_device()
     return "cpu" if device is None else str(device.device_kind)
@@ -262,7 +276,7 @@ def device_name() -> str:
 
 @dataclass(frozen=True, slots=True)
 class ProcessSettings:
-    """The first line of input."""
+    """The variant to measure; the first line of the process's input."""
 
     policy: str
     config: dict[str, Any]
@@ -270,9 +284,9 @@ class ProcessSettings:
     max_size: int  # largest number of sessions to be measured
     patience: float  # `batch.patience`
     batch_sizes: Sequence[int]  # `batch.sizes`, or none
-    frames: str | None  # a file of `save_observations`; None: random observations
-    side: int  # px, of random images whose size the contract does not state
-    dims: Mapping[str, int]  # sizes of parts of the state that the contract leaves open
+    frames: str | None  # a file of `save_observations`; None selects random observations
+    side: int  # px, size of random images for which the contract defines none
+    dims: Mapping[str, int]  # name in the state -> size, for which the contract defines none
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:
@@ -283,8 +297,9 @@ def save_observations(observations: Sequence[Obs], file: Path) -> None:
 def load_observations(file: Path) -> list[Obs]:
     """Read the observations written by `save_observations`."""
     data = file.read_bytes()
-    requests, refused = decode_requests(data, Budget(replace(DEFAULT_LIMITS, body_bytes=len(data))))
-    for reply in refused.values():
+    limits = replace(DEFAULT_LIMITS, body_bytes=len(data))
+    requests, error_replies = decode_requests(data, Budget(limits))
+    for reply in error_replies.values():
         raise PolicyFailed(f"{file}: an observation cannot be sent to a server") from reply.error
     return [request.obs for request in requests if request.obs is not None]
 
@@ -305,6 +320,7 @@ def main() -> None:
 
 
 def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None]) -> None:
+    """Load the policy, report it, and answer requests until the input ends."""
     agent: Agent = build_agent(settings.policy, settings.config, settings.wrappers)
     recorded = [] if settings.frames is None else load_observations(Path(settings.frames))
 
@@ -325,50 +341,64 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
     while isinstance(agent, Wrapper):
         agent = agent.agent
     with measured:
-        uncompiled, config = measured.engine.models.uncompiled, getattr(agent, "config", None)
-        has = {
-            name: getattr(config, name)
-            for name in _TUNED
-            if name in getattr(type(config), "model_fields", {})
-        }
-        # That the accelerator computes without emulation.
-        dtypes = [] if jax_device() is None else ["bfloat16"]
-        if (used := cuda()) is not None:
-            dtypes = ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
-        answer({
-            "device": device_name(), "load_s": measured.load_s, "uncompiled": uncompiled,
-            "settings": has, "dtypes": dtypes,
-            "modes": [False, True] if used is None else [False, "graphs", True],  # of `compile`
-        })  # fmt: skip
+        answer(_report(measured, getattr(agent, "config", None)))
         for line in sys.stdin:
             try:
-                asked = json.loads(line)
-                if "act" in asked:
-                    said: dict[str, Any] = {
-                        "actions": [
-                            action.tolist() for action in measured.actions(asked["act"], FRAMES)
-                        ]
-                    }
-                else:
-                    forget_peak()
-                    turn = measured.queued(asked["measure"], asked["seconds"], asked["priority"])
-                    trips_ms = [round(trip, 4) for trip in turn.trips_ms]
-                    said = {
-                        "actions_per_s": turn.actions_per_s,
-                        "trips_ms": trips_ms,
-                        "peak_mib": peak_mib(),
-                    }
+                result = _result(measured, json.loads(line))
             except Exception as error:  # noqa: BLE001 - as above; smaller batches may still work
-                said = {"failed": _sentence(error)}
-            answer(said)
+                result = {"failed": _sentence(error)}
+            answer(result)
+
+
+def _report(measured: MeasuredPolicy, config: Any) -> dict[str, Any]:
+    """Return what the tuner needs to choose variants: the device, the settings and their values.
+
+    Args:
+        measured: The loaded policy.
+        config: The policy's config; None if it has none.
+    """
+    settings = {}
+    for name in _TUNED:
+        if name in getattr(type(config), "model_fields", {}):
+            settings[name] = getattr(config, name)
+
+    # Types that the accelerator computes without emulation, and the values of `compile`.
+    dtypes = [] if jax_device() is None else ["bfloat16"]
+    modes: list[Any] = [False, True]
+    torch_cuda = cuda()
+    if torch_cuda is not None:
+        dtypes = ["bfloat16" if torch_cuda.get_device_capability() >= (8, 0) else "float16"]
+        modes = [False, "graphs", True]
+    return {
+        "device": device_name(),
+        "load_s": measured.load_s,
+        "uncompiled": measured.engine.models.uncompiled,
+        "settings": settings,
+        "dtypes": dtypes,
+        "modes": modes,
+    }
+
+
+def _result(measured: MeasuredPolicy, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the answer to a request of the tuner."""
+    if "act" in request:
+        actions = measured.actions(request["act"], FRAMES)
+        return {"actions": [action.tolist() for action in actions]}
+
+    forget_peak()
+    turn = measured.queued(request["measure"], request["seconds"], request["priority"])
+    return {
+        "actions_per_s": turn.actions_per_s,
+        "trips_ms": [round(trip, 4) for trip in turn.trips_ms],
+        "peak_mib": peak_mib(),
+    }
 
 
 def _sentence(error: BaseException) -> str:
-    cause = (
-        error.__cause__
-        if isinstance(error, PolicyFailed) and error.__cause__ is not None
-        else error
-    )
+    """Return an error in one line, with the cause of an error in the policy's code."""
+    cause = error
+    if isinstance(error, PolicyFailed) and error.__cause__ is not None:
+        cause = error.__cause__
     return f"{type(cause).__name__}: {' '.join(str(cause).split())}"
 
 

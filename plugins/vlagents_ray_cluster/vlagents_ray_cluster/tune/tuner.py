@@ -1,5 +1,6 @@
-"""Measures variants of a deployment file's settings, each in its own process, within a given
-time, and chooses one.
+"""Measures variants of a deployment file's settings, and chooses one.
+
+Each variant is measured in its own process. The whole tuning has a time limit.
 """
 
 from __future__ import annotations
@@ -31,17 +32,15 @@ _BETTER = 1.05
 
 
 class GoalMissed(VLAgentsError):
-    """No measured settings reach the goal; the message has the nearest."""
+    """No measured settings reach the goal; the message has those that come closest."""
 
 
 @dataclass(frozen=True, slots=True)
 class TuningGoal:
-    """The goal of `tune`: the most actions per second, or the most robots whose round trips are
-    short enough.
-    """
+    """The goal of `tune`: many actions per second, or many robots with short round trips."""
 
     kind: Literal["throughput", "robots"]
-    p99_ms: float | None = None  # for robots: upper bound of the 99th percentile of round trips
+    p99_ms: float | None = None  # for robots: limit of the 99th percentile of round trips
 
     def __post_init__(self) -> None:
         if self.kind == "robots" and self.p99_ms is None:
@@ -55,39 +54,39 @@ class TuningGoal:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """The file's own settings of the policy, or changes to them."""
+    """Changes to the settings of the policy in the file; none for the file's own settings."""
 
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """The changes in words, without the batch sizes, which have their own column in the
-        table.
-        """
-        shown = {key: value for key, value in self.changes.items() if key != "batch_sizes"}
-        words = [
-            f"{key}: {str(value).lower() if isinstance(value, bool) else value}"
-            for key, value in shown.items()
-        ]
+        """The changes in words, without the batch sizes, which have a column in the table."""
+        words = []
+        for key, value in self.changes.items():
+            if key != "batch_sizes":
+                text = str(value).lower() if isinstance(value, bool) else value
+                words.append(f"{key}: {text}")
         return ", ".join(words) or "own settings"
 
 
 @dataclass(slots=True)
 class MeasuredPoint:
-    """A variant with one number of sessions, which equals its batch size, measured in
-    alternation with others.
+    """The figures of a variant with one number of sessions, which equals its batch size.
+
+    A point is measured in several turns, which alternate with those of other points.
     """
 
     variant: Variant
     sessions: int
     # Largest difference from the actions of the file's own settings, as a share of their range.
     difference: float
-    rates: list[float] = field(default_factory=list)  # actions per second, for each turn
-    trips_ms: list[float] = field(default_factory=list)  # of all turns
+    rates: list[float] = field(default_factory=list)  # actions per second of each turn
+    trips_ms: list[float] = field(default_factory=list)  # round trips of all turns
     peak_mib: float = 0.0
-    took_s: float = 0.0  # of the first turn
+    took_s: float = 0.0  # duration of the first turn
 
     def add(self, turn: Mapping[str, Any]) -> None:
+        """Add the figures of a turn, as the process of the variant returns them."""
         self.rates.append(turn["actions_per_s"])
         self.trips_ms += turn["trips_ms"]
         self.peak_mib = max(self.peak_mib, turn["peak_mib"])
@@ -113,7 +112,7 @@ class MeasuredPoint:
 
 
 def sessions(number: int) -> str:
-    """Return a number of sessions in words."""
+    """Return a number of sessions as text, such as "1 session" or "4 sessions"."""
     return f"{number} session{'s' if number > 1 else ''}"
 
 
@@ -121,6 +120,9 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     """Choose the best point for a goal.
 
     A variant must be 5 % better than one with fewer changes, or serve more robots.
+
+    Raises:
+        GoalMissed: No point reaches the goal.
     """
     reaching = [point for point in points if point.reaches(goal)]
     if not reaching and not points:
@@ -144,22 +146,30 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
         best_points.append(max(points_of_variant, key=score))
 
     best = best_points[0]
-    for other in best_points[1:]:
-        is_better = other.actions_per_s > _BETTER * best.actions_per_s
-        if goal.kind == "robots":
-            is_better = (other.sessions, 0.0) > (
-                best.sessions,
-                other.p99_ms * _BETTER - best.p99_ms,
-            )
-        best = other if is_better else best
+    for point in best_points[1:]:
+        if goal.kind == "throughput":
+            is_better = point.actions_per_s > _BETTER * best.actions_per_s
+        elif point.sessions == best.sessions:
+            is_better = point.p99_ms * _BETTER < best.p99_ms
+        else:
+            is_better = point.sessions > best.sessions
+        if is_better:
+            best = point
     return best
 
 
 def default_point(
     points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int
 ) -> MeasuredPoint | None:
-    """Return the figures of the unchanged file; None if they were not measured, or miss the
-    goal.
+    """Return the figures of the unchanged file.
+
+    Args:
+        points: The measured points.
+        goal: The goal.
+        max_size: The file's largest batch size.
+
+    Returns:
+        The point; None if it was not measured, or misses the goal.
     """
     candidates = []
     for point in points:
@@ -174,17 +184,30 @@ def default_point(
 def chosen_settings(
     chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None
 ) -> dict[str, dict[str, Any]]:
-    """Return the settings of a deployment file to change, by section and key below `args`."""
-    config, queue = dict(chosen.variant.changes), dict[str, Any]()
+    """Return the settings of a deployment file to change.
+
+    Args:
+        chosen: The best point.
+        batch: The settings `batch` of the file.
+        fixed: The policy's `batch_sizes` in the file or by default, if it has any.
+
+    Returns:
+        Section below `args` -> key -> value.
+    """
+    config: dict[str, Any] = dict(chosen.variant.changes)
     sizes = chosen.variant.changes.get("batch_sizes", fixed)
     if sizes and sizes[-1] > chosen.sessions:
         smaller = [size for size in sizes if size < chosen.sessions]
         config["batch_sizes"] = [*smaller, chosen.sessions]
+
+    queue: dict[str, Any] = {}
     if chosen.sessions != batch.max_size and batch.sizes is not None:
         queue["sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
     elif chosen.sessions != batch.max_size:
         queue["max_size"] = chosen.sessions
-    return {section: values for section, values in (("config", config), ("batch", queue)) if values}
+
+    sections = {"config": config, "batch": queue}
+    return {section: values for section, values in sections.items() if values}
 
 
 def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
@@ -215,12 +238,12 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
     return rows
 
 
-# Factor by which two larger batches must raise the rate before a still larger one is measured.
+# Factor by which the last two batch sizes must raise the rate before a larger one is measured.
 _RISING = 1.05
-_TURNS = 3
+_TURNS = 3  # turns of each point
 _END_S = 2.0  # time for a process to end before it is killed
-# The smallest range of a number of the action, as a share of its largest magnitude, since the
-# number may hardly move.
+# The smallest range of a value of the action, as a share of its largest magnitude, since a value
+# may be nearly constant.
 _SMALLEST_RANGE = 0.1
 
 
@@ -232,21 +255,23 @@ class VariantFailed(VLAgentsError):
 class TunePlan:
     """The settings of `Tuner`."""
 
-    args: ServerArgs  # of a deployment file
+    args: ServerArgs  # the `args` of a deployment file
     goal: TuningGoal
     max_batch: int = 32
     minutes: float = 5.0  # time limit of the whole tuning
-    seconds: float = 2.0  # of each measurement
+    seconds: float = 2.0  # duration of each measurement
     tolerance: float = 0.01  # largest difference of actions, as a share of their range
-    dtypes: Sequence[str] | None = None  # to try; None: those that the device computes natively
-    frames: Path | None = None  # folder of recorded trajectories; None: random observations
-    side: int = 224  # px, of random images if the policy accepts any size
-    # Sizes of parts of the state that the contract leaves open.
+    # Types to try; None selects those that the device computes natively.
+    dtypes: Sequence[str] | None = None
+    # Folder of recorded trajectories; None selects random observations.
+    frames: Path | None = None
+    side: int = 224  # px, size of random images if the policy accepts any size
+    # Name in the state -> size, for which the contract defines none.
     dims: Mapping[str, int] = field(default_factory=dict)
 
 
 class Tuner:
-    """Measures the plan; `left_out` has a sentence for each skipped variant."""
+    """Measures the variants of a plan; `left_out` has a sentence for each skipped variant."""
 
     def __init__(
         self,
@@ -254,13 +279,22 @@ class Tuner:
         progress: Callable[[str], None] = lambda _: None,
         began: float | None = None,
     ) -> None:
+        """Set the plan; nothing is measured yet.
+
+        Args:
+            plan: The settings.
+            progress: Is called with each message about the progress.
+            began: The time from which the plan's minutes count, `time.monotonic()`; None selects
+                now.
+        """
         self.left_out: list[str] = []
         self.device = ""
-        # `batch_sizes` of the file's own settings, explicit or by default.
+        # `batch_sizes` of the policy with the file's own settings, explicit or by default.
         self.fixed: Sequence[int] | None = None
         self._plan, self._progress = plan, progress
-        self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
-        self._wanted: list[np.ndarray] = []  # actions of the file's own settings
+        began = time.monotonic() if began is None else began
+        self._end = began + plan.minutes * 60
+        self._expected: list[np.ndarray] = []  # actions with the file's own settings
         self._points: list[MeasuredPoint] = []
         self._failed: list[Variant] = []
 
@@ -299,7 +333,8 @@ class Tuner:
                             self.left_out.append(f"{variant.name}: not compiled: {reason}")
                         if variant.changes.get("compile") and len(uncompiled) == len(sizes):
                             raise VariantFailed("no size could be compiled")
-                        self._sweep(process, variant, sizes, parts=len(variants) - number)
+                        remaining = len(variants) - number
+                        self._sweep(process, variant, sizes, remaining)
                 except VariantFailed as error:
                     self._failed.append(variant)
                     self.left_out.append(f"{variant.name}: {error}")
@@ -316,9 +351,9 @@ class Tuner:
                         f"--dtypes: {self._plan.args.policy!r} has no setting `dtype`; leave it out"
                     )
                 sizes = self._candidates()
-                self._wanted = self._actions(process, sizes[0])[:FRAMES]
-                parts = len(self._variants(ready, ())) + 1
-                self._sweep(process, unchanged, sizes, parts=parts)
+                self._expected = self._actions(process, sizes[0])[:FRAMES]
+                remaining = len(self._variants(ready, ())) + 1
+                self._sweep(process, unchanged, sizes, remaining)
         except VariantFailed as error:
             if ready is None or not self._points:
                 raise VariantFailed(f"the file's own settings: {error}") from error
@@ -326,7 +361,11 @@ class Tuner:
         return ready
 
     def _candidates(self) -> list[int]:
-        """Return the batch sizes to measure, ascending: the fixed ones, or else 1, 2, 4, …"""
+        """Return the batch sizes to measure, ascending: the fixed ones, or 1, 2, 4, … if none are.
+
+        Raises:
+            ConfigError: All fixed sizes are above `max_batch`.
+        """
         fixed = self._plan.args.batch.sizes or self.fixed
         sizes = fixed or [2**power for power in range(self._plan.max_batch.bit_length())]
         candidates = [size for size in sizes if size <= self._plan.max_batch]
@@ -338,8 +377,11 @@ class Tuner:
         return candidates
 
     def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
-        """Return the variants other than the file's own settings; compiled ones use `sizes`
-        unless the file sets it.
+        """Return the variants other than the file's own settings.
+
+        Args:
+            ready: The report of the process with the file's own settings.
+            sizes: The batch sizes of compiled variants, if the file does not fix them.
         """
         settings = ready["settings"]
 
@@ -410,13 +452,20 @@ class Tuner:
             yield process, report
 
     def _sweep(
-        self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int
+        self, process: LineProcess, variant: Variant, sizes: Sequence[int], remaining: int
     ) -> None:
-        """Measure a loaded variant with growing batches while the rate rises, then again in
-        turns as time permits.
+        """Measure a loaded variant with growing batches while the rate rises.
+
+        Then the points are measured in further turns, as time permits.
+
+        Args:
+            process: The process of the variant.
+            variant: The variant.
+            sizes: The batch sizes, ascending.
+            remaining: The number of variants, with this one, that share the remaining time.
         """
         now = time.monotonic()
-        until = now + (self._end - now) / parts
+        until = now + (self._end - now) / remaining
         points: list[MeasuredPoint] = []
         for size in sizes:
             if not self._worth_more(points):
@@ -437,8 +486,10 @@ class Tuner:
                 point.add(self._turn(process, point.sessions))
 
     def _worth_more(self, points: Sequence[MeasuredPoint]) -> bool:
-        """Return whether a larger batch may serve the goal better than the measured ones,
-        ascending.
+        """Return whether a larger batch may reach the goal better than the measured ones.
+
+        Args:
+            points: The measured points of a variant, by ascending batch size.
         """
         if points and self._plan.goal.p99_ms is not None:
             return points[-1].round_trip_ms <= self._plan.goal.p99_ms
@@ -455,8 +506,21 @@ class Tuner:
         points: list[MeasuredPoint],
         until: float,
     ) -> bool:
-        """Compare the actions of a batch size, and measure it once; return False, with a report,
-        if it is skipped.
+        """Check the actions of a batch size, and measure it once.
+
+        Args:
+            process: The process of the variant.
+            variant: The variant.
+            size: The batch size.
+            points: The points of the variant, to which the new one is added.
+            until: The time by which the measurement should end, `time.monotonic()`.
+
+        Returns:
+            Whether it was measured. If not, `left_out` has the reason.
+
+        Raises:
+            VariantFailed: The variant differs from the file's own settings, or its first size
+                failed.
         """
         began = time.monotonic()
         if points and began + points[-1].took_s * size / points[-1].sessions > until:
@@ -464,7 +528,7 @@ class Tuner:
             return False
 
         try:
-            difference = largest_difference(self._actions(process, size), self._wanted)
+            difference = largest_difference(self._actions(process, size), self._expected)
             if difference > self._plan.tolerance:
                 off = (
                     f"actions differ by {difference:.2%} of their range, want at most "
@@ -493,19 +557,25 @@ class Tuner:
         return True
 
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
+        """Return the first actions of some episodes, computed in batches of `size`."""
         process.send(json.dumps({"act": size}))
         return [np.array(action, np.float64) for action in self._answer(process)["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
-        priority = "robot" if self._plan.goal.kind == "robots" else "simulation"
-        process.send(
-            json.dumps({"measure": number, "seconds": self._plan.seconds, "priority": priority})
-        )
+        """Measure a number of sessions once."""
+        request = {
+            "measure": number,
+            "seconds": self._plan.seconds,
+            "priority": "robot" if self._plan.goal.kind == "robots" else "simulation",
+        }
+        process.send(json.dumps(request))
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:
-        """Return the next line of a process; raises `VariantFailed` for its error, its end, or a
-        time-out.
+        """Return the next answer of a process.
+
+        Raises:
+            VariantFailed: The answer is an error, the process has ended, or the time is over.
         """
         try:
             answer: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
@@ -522,33 +592,47 @@ class Tuner:
         return answer
 
 
-def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
-    """Return the largest difference of two lists of actions, as a share of the range of `wanted`.
+def largest_difference(actions: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> float:
+    """Return the largest difference of two lists of actions, as a share of their range.
 
-    An action is (D,) or (H, D); the one at i is compared with `wanted[i % len(wanted)]`.
+    Each of the D values of an action has its own range: the largest minus the smallest value among
+    all rows of `expected`, or a tenth of the largest magnitude if that is more.
 
-    Each number of an action has its own range: the largest minus the smallest value among all
-    actions and rows, or a tenth of its largest magnitude if that is more.
+    Args:
+        actions: Each (D,) or (H, D). The action at i is compared with
+            `expected[i % len(expected)]`.
+        expected: Each (D,) or (H, D).
 
     Returns:
         The difference; infinity if shapes differ, or if a value is not finite.
     """
-    rows = np.concatenate([np.atleast_2d(action) for action in wanted]).astype(np.float64)
+    rows = np.concatenate([np.atleast_2d(action) for action in expected]).astype(np.float64)
     span = np.maximum(np.ptp(rows, axis=0), _SMALLEST_RANGE * np.abs(rows).max(axis=0))
     largest = 0.0
     for i, action in enumerate(actions):
-        want = np.asarray(wanted[i % len(wanted)], np.float64)
-        if np.shape(action) != want.shape or not np.isfinite(action).all():
+        expected_action = np.asarray(expected[i % len(expected)], np.float64)
+        if np.shape(action) != expected_action.shape or not np.isfinite(action).all():
             return float("inf")
-        off = np.abs(action - want)
-        shares = np.divide(off, span, out=np.where(off > 0, np.inf, 0.0), where=span > 0)
+        difference = np.abs(action - expected_action)
+        # Any difference of a value whose range is 0 is infinite.
+        shares = np.divide(
+            difference, span, out=np.where(difference > 0, np.inf, 0.0), where=span > 0
+        )
         largest = max(largest, float(shares.max(initial=0.0)))
     return largest
 
 
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
-    """Read observations, spread evenly over the trajectories below a folder and over their
-    steps.
+    """Read observations from the trajectories below a folder.
+
+    They are spread evenly over the trajectories and over the steps of each.
+
+    Args:
+        folder: A folder of trajectories, as evaluations save them.
+        count: The number of observations.
+
+    Raises:
+        ConfigError: There is no trajectory, or a video cannot be read.
     """
     files = sorted(folder.rglob("*.npz"))
     if not files:
@@ -560,7 +644,8 @@ def recorded_observations(folder: Path, count: int) -> list[Obs]:
     used = files[:: max(1, len(files) // count)][:count]
     observations: list[Obs] = []
     for number, file in enumerate(used):
-        share, trajectory = len(range(number, count, len(used))), Trajectory.load(file)
+        trajectory = Trajectory.load(file)
+        share = len(range(number, count, len(used)))  # observations of this trajectory
         steps = np.linspace(0, len(trajectory.actions), share, dtype=int).tolist()
         images = {}
         for camera, video in videos_of(file, trajectory.cameras).items():
