@@ -16,7 +16,7 @@ from readme_blocks import PAGES, commands, options_of, read_as_typed
 from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
-from vlagents_ray.envs.gymnasium import known
+from vlagents_ray.envs.gymnasium import defaults_for
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import BY_CODE, Overloaded
 from vlagents_ray.evaluate import EvalConfig
@@ -196,8 +196,8 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
     [
         ("gymnasium#meta-world", metaworld.PROTOCOL),
         ("gymnasium#aloha", aloha.PROTOCOL),
-        ("gymnasium#pusht", known("gym_pusht/PushT-v0").protocol),
-        ("gymnasium#fetch-gymnasium-robotics", known("FetchReach-v4").protocol),
+        ("gymnasium#pusht", defaults_for("gym_pusht/PushT-v0").protocol),
+        ("gymnasium#fetch-gymnasium-robotics", defaults_for("FetchReach-v4").protocol),
         ("robosuite#robosuite", TASKS["Lift"].protocol),
         ("other#calvin", calvin.PROTOCOL),
         ("robosuite#robocasa", robocasa.protocol("OpenDrawer", "target")),

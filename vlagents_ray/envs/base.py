@@ -45,11 +45,10 @@ class Environment(ABC):
     """
 
     looked_at: bool = True
-    """Whether the next observation is used; if not, an env may omit its images, which saves
-    rendering them.
+    """Whether the images of the next observation are used; if not, an env may omit them.
 
-    Observations between the rows of a chunk are not used unless videos are made; nor is that of the
-    last step. Only the images may depend on this.
+    Images between the rows of a chunk are not used unless videos are made, and neither are those of
+    the last step. Nothing but the images may depend on this.
     """
 
     several_tasks: bool = False
@@ -57,7 +56,7 @@ class Environment(ABC):
     instruction.
 
     An evaluation then resets the policy with the new instruction and with the observation of that
-    step, which has images whatever `looked_at` says. The rest of the chunk is dropped.
+    step, which has images even if `looked_at` is False. The other rows of the chunk are dropped.
     """
 
     @property
@@ -66,13 +65,14 @@ class Environment(ABC):
         """The observations (cameras, state, gripper, rate) and the actions of each environment."""
 
     def renderer(self) -> Renderer | None:
-        """The device that renders the images; None before it is made. Here: that of this
-        thread's OpenGL context.
+        """Return the device that renders the images; None before it is made.
+
+        By default it is the device of this thread's OpenGL context.
         """
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
-        """Facts that a reader of the results needs: versions, control mode, render backend."""
+        """Return facts that readers of results need: versions, control mode, render backend."""
         return {}
 
     @abstractmethod
@@ -87,11 +87,10 @@ class Environment(ABC):
 
 
 class EvalEnv(Environment):
-    """The interface of an environment, which a worker creates once and resets for each of its
-    episodes.
+    """The interface of an environment, which a worker makes once and resets for each episode.
 
-    An episode is a pure function of its seed and options: two resets with the same ones give the
-    same first observation, in any process and after any other episodes.
+    An episode is a pure function of its seed and options: two resets with the same seed and options
+    return the same first observation, in any process and after any other episodes.
     """
 
     known: ClassVar[Collection[str]] = ()  # the names of the tasks, for `tasks`
@@ -277,8 +276,10 @@ def make_env(name: str, **options: Any) -> EvalEnv:
 
 
 def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv], dict[str, Any]]:
-    """Return the class of the env `name` and its constructor's arguments; raises the errors of
-    `make_env`.
+    """Return the class of the env `name`, and the arguments of its constructor.
+
+    Raises:
+        VLAgentsError: The errors of `make_env`, as far as they are known without the simulator.
     """
     cls = env_class(name)
     if not issubclass(cls, EvalEnv):
@@ -293,7 +294,14 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
 
 
 def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
-    """Return the contract of the env `name` without making it; None if it cannot state one yet."""
+    """Return the contract of the env `name` without making it.
+
+    Returns:
+        The contract; None if it is known only once the simulator runs.
+
+    Raises:
+        VLAgentsError: The errors of `env_arguments`.
+    """
     cls, arguments = env_arguments(name, options)
     bound = inspect.signature(cls).bind(**arguments)
     bound.apply_defaults()
@@ -311,8 +319,9 @@ DELTA_POSE = ActionSpec(
     low=-1.0,
     high=1.0,
 )
-"""A change of the end effector's pose, and the gripper, as in robosuite; others differ in a few
-fields.
+"""A change of the end effector's pose, and the gripper, as in robosuite.
+
+Other environments replace a few fields.
 """
 
 
@@ -331,8 +340,10 @@ def require_known(suite: str, task: str | None, known: Sequence[str], also: str 
 
 
 def one_row(act: Act, contract: Contract) -> np.ndarray:
-    """Return the action of a step as (D,) float32; raises `InvalidAction` if it is a chunk or
-    not valid.
+    """Return the action of a step, (D,) float32.
+
+    Raises:
+        InvalidAction: The action is a chunk, or not valid.
     """
     action = check_action(act.action, contract)
     if action.ndim != 1:
@@ -365,16 +376,16 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
         return SequentialBatch(envs)
 
 
-ERROR = "error"  # in the info of an environment whose step failed, beside others
+# Key of the exception in the info of an environment whose step failed, while others succeeded.
+ERROR = "error"
 
 
 class SequentialBatch(BatchEnv):
-    """Environments that are stepped one after another, while one call of the policy serves all of
-    them.
+    """Environments that are stepped one after another, with one call of the policy for all of them.
 
     If the step of one of several environments raises an exception, such as `InvalidAction`, its
-    info contains the exception as `ERROR`, and the others are stepped: an episode does not depend
-    on those in other environments.
+    info contains the exception as `ERROR`, and the others are still stepped: an episode does not
+    depend on the episodes of other environments.
     """
 
     restarts = True
@@ -467,11 +478,11 @@ class SequentialBatch(BatchEnv):
                 closing.callback(env.close)
 
     def _stacked(self, observations: list[Obs], moved: Collection[int]) -> list[Obs]:
-        """Return the observations with the images of each camera as rows of one array, if images
-        are used.
+        """Return the observations with the images of each camera as rows of one array.
 
-        An idle environment may have left its images out when it last moved; images of one that
-        moved then take their place.
+        If images are not used, or if nothing moved, the observations are returned unchanged. An
+        idle environment may have omitted its images when it last moved. Images of an environment
+        that moved then replace them.
         """
         if len(observations) == 1 or not moved or not self.looked_at:
             return observations
@@ -503,8 +514,10 @@ def _first_obs(env: EvalEnv, seed: int, options: Options | None) -> Obs:
 
 
 def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
-    """Return the number of episodes that `seeds` begin; raises `ConfigError` if there are too
-    many or none.
+    """Return the number of episodes that `seeds` begin.
+
+    Raises:
+        ConfigError: There are more seeds than environments, or none.
     """
     if not 1 <= len(seeds) <= num_envs:
         raise ConfigError(

@@ -1,11 +1,10 @@
-"""The device that renders an env's images: EGL's devices, their CUDA numbers, and a check that the
-chosen one is used.
+"""The choice of the device that renders an env's images.
 
-Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each
-would take its first device, which may be the GPU that a policy uses. This module therefore chooses
-the device, unless CUDA_VISIBLE_DEVICES is not set.
+Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it. Each
+would use its first device, which may be the GPU that a policy uses. If CUDA_VISIBLE_DEVICES is set,
+this module therefore chooses the device, and checks that it is used.
 
-Its probes render one frame in a child process with a time-out, because a broken driver may hang or
+The probes render one frame in a child process with a time-out, because a broken driver may hang or
 crash the process that loads it. Their results are cached for the life of the process.
 
     probe = render_probe()                  # Vulkan, as SAPIEN (ManiSkill 3) uses it
@@ -33,10 +32,11 @@ import vlagents_ray
 from vlagents_ray.errors import ConfigError
 
 _MOST_DEVICES = 64
-_EXTENSIONS = 0x3055
+# Constants of EGL's and OpenGL's headers.
+_EXTENSIONS = 0x3055  # string of a device: its extensions
 _DEVICE = 0x322C  # attribute of a display: its device
-_CUDA_DEVICE = 0x323A
-_GL_RENDERER = 0x1F01
+_CUDA_DEVICE = 0x323A  # attribute of a device: its CUDA number
+_GL_RENDERER = 0x1F01  # string of a context: the name of the device
 _SOFTWARE = "EGL_MESA_device_software"
 _CUDA = "EGL_NV_device_cuda"
 _Value = ctypes.c_ssize_t  # EGLAttrib
@@ -44,9 +44,11 @@ _Value = ctypes.c_ssize_t  # EGLAttrib
 
 @dataclass(frozen=True, slots=True)
 class EglDevice:
-    number: int  # in EGL's own order, as in MUJOCO_EGL_DEVICE_ID
+    """A device of EGL."""
+
+    number: int  # index in EGL's order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
-    # Its number among the CUDA devices that this process may use; None if CUDA does not know it.
+    # Index among the CUDA devices that this process may use; None if it is not one of them.
     cuda: int | None
 
 
@@ -57,8 +59,9 @@ def devices() -> list[EglDevice]:
 
 
 class _Functions:
-    """The EGL functions used here; the constructor raises `AttributeError` or `OSError` if one
-    is missing.
+    """The functions of EGL that this module uses.
+
+    The constructor raises `AttributeError` or `OSError` if one is missing.
     """
 
     def __init__(self) -> None:
@@ -66,7 +69,8 @@ class _Functions:
         self.library.eglGetProcAddress.restype = ctypes.c_void_p
         self.library.eglGetProcAddress.argtypes = [ctypes.c_char_p]
         self.library.eglGetCurrentDisplay.restype = ctypes.c_void_p
-        # The results and arguments of each function.
+
+        # Each function with the type of its result and the types of its arguments.
         pointers, integers = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
         self._query = self._extension(
             "eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, integers
@@ -85,14 +89,14 @@ class _Functions:
         if not self._query(_MOST_DEVICES, handles, ctypes.byref(number)):
             return []
 
-        listed = []
+        devices = []
         for i, handle in enumerate(handles[: number.value]):
             extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
             cuda = None
             if _CUDA in extensions:
                 cuda = self.value(self._attribute, handle, _CUDA_DEVICE)
-            listed.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
-        return listed
+            devices.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
+        return devices
 
     def value(self, query: Callable[..., int], handle: int | None, attribute: int) -> int | None:
         """Return the value of an attribute of a device or a display; None if it has no value."""
@@ -102,6 +106,7 @@ class _Functions:
         return value.value
 
     def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
+        """Return a function of EGL; `result` and `arguments` are its types."""
         address = self.library.eglGetProcAddress(name.encode())
         if not address:
             raise AttributeError(name)
@@ -117,10 +122,11 @@ def _functions() -> _Functions | None:
 
 GPUS = "CUDA_VISIBLE_DEVICES"
 EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
-# SAPIEN's older loader only reads the first.
+# Variables that name the files of Vulkan drivers. SAPIEN's older loader only reads the first.
 VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
 _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-# Of NVIDIA's driver, which SAPIEN names if it finds no other.
+# Part of the path to SAPIEN's description of NVIDIA's driver. SAPIEN sets it in the variables above
+# if it finds no other driver.
 _SAPIENS_OWN = "sapien/vulkan_library/"
 _SOFTWARE_VULKAN = "llvmpipe"  # lavapipe's name of its device
 
@@ -144,20 +150,26 @@ class Renderer:
     # The driver's name of the device: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2".
     name: str
     software: bool
-    # Its number among the CUDA devices that this process may use; None if CUDA does not know it.
+    # Index among the CUDA devices that this process may use; None if it is not one of them.
     cuda: int | None
-    asked_for: bool = False  # the environment's options name this very device
+    asked_for: bool = False  # whether the environment's options name this device
 
 
 def has_gpu() -> bool | None:
-    """Return whether this process was given a GPU; None if that is not stated."""
+    """Return whether this process has a GPU; None if CUDA_VISIBLE_DEVICES is not set."""
     visible = os.environ.get(GPUS)
     return None if visible is None else visible.strip() not in ("", "-1")
 
 
 def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
-    """Return the device to render on: CUDA's first one, or without `gpu` the software device;
-    None if there is none.
+    """Return the device to render on.
+
+    Args:
+        devices: The devices of EGL.
+        gpu: Whether to render on a GPU.
+
+    Returns:
+        CUDA's first device, or without `gpu` the software device; None if there is none.
     """
     if gpu:
         gpus = [device for device in devices if device.cuda is not None]
@@ -178,8 +190,9 @@ def prepare_rendering() -> None:
 
 
 def choose_devices() -> None:
-    """Set the variables that select the devices, before libraries are loaded; variables set by
-    the user are kept.
+    """Set the environment variables that select the devices, before libraries are loaded.
+
+    Variables set by the user are kept.
     """
     gpu = has_gpu()
     if gpu is None:
@@ -197,8 +210,10 @@ def choose_devices() -> None:
 
 
 def opengl_renderer() -> Renderer | None:
-    """Return the renderer of this thread's OpenGL context; None if there is none, or if it is
-    not EGL's.
+    """Return the renderer of this thread's OpenGL context.
+
+    Returns:
+        The renderer; None if there is no context, or if EGL did not make it.
     """
     functions = _functions()
     if functions is None:
@@ -217,8 +232,12 @@ def opengl_renderer() -> Renderer | None:
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
-    """Return the renderer for the device that SAPIEN uses; `asked_for` is whether the env's
-    options named it.
+    """Return the renderer for the device that SAPIEN uses.
+
+    Args:
+        name: SAPIEN's name of the device.
+        cuda: Its index among the CUDA devices; None if it is not one of them.
+        asked_for: Whether the env's options named the device.
     """
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
     driver_set = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
@@ -226,8 +245,11 @@ def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> 
 
 
 def require_own(renderer: Renderer) -> None:
-    """Raise `ConfigError` if `renderer` is not the GPU assigned to this process, or a GPU though
-    none is assigned.
+    """Check that a renderer is a device of this process.
+
+    Raises:
+        ConfigError: The renderer is not the GPU assigned to this process, or it is a GPU and none
+            is assigned.
     """
     gpu = has_gpu()
     if gpu is None or renderer.asked_for:
@@ -257,6 +279,7 @@ def _lavapipe() -> Path | None:
 
 
 def _has_egl() -> bool:
+    """Return whether EGL's library can be loaded."""
     try:
         # Without this library, `MUJOCO_GL=egl` makes `import mujoco` fail.
         ctypes.CDLL("libEGL.so.1")
@@ -265,7 +288,7 @@ def _has_egl() -> bool:
     return True
 
 
-# Whether this machine can render.
+# Probes: whether this machine can render.
 
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
 
@@ -300,7 +323,7 @@ class RenderProbe:
     """The outcome of rendering one frame."""
 
     ok: bool
-    seconds: float  # the child's run time, imports included
+    seconds: float  # run time of the child process, imports included
     # The driver's name of the device; "llvmpipe ..." is Mesa's software driver.
     device: str | None = None
     error: str | None = None
@@ -327,22 +350,31 @@ def vulkan_cure() -> str:
 
 
 def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
-    """Return the name and CUDA number of the device on which SAPIEN renders in this process; see
-    `usable_devices`.
+    """Return the name and the CUDA index of the device on which SAPIEN renders in this process.
+
+    Args:
+        on_gpu: Whether SAPIEN was made to render on a GPU.
+
+    Returns:
+        The device as in `usable_devices`; None if there is none.
     """
     import sapien.render
 
     usable = usable_devices(sapien.render.get_device_summary())
-    # A stable sort keeps SAPIEN's order otherwise.
+    # The sort is stable, so that SAPIEN's order is kept among devices of the same kind.
     usable.sort(key=lambda device: (device[1] is not None) != on_gpu)
     return usable[0] if usable else None
 
 
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
-    """List the devices that SAPIEN's `summary` calls supported, in its order.
+    """List the supported devices in a summary of SAPIEN, in its order.
 
-    Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA
-    devices of this process; None if CUDA does not know it.
+    Args:
+        summary: The text that `sapien.render.get_device_summary` returns.
+
+    Returns:
+        The name of each device, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its index among the
+        CUDA devices of this process; None if it is not one of them.
     """
     usable = []
     for block in summary.split("GPU:")[1:]:
@@ -360,7 +392,15 @@ def usable_devices(summary: str) -> list[tuple[str, int | None]]:
 def _probed(
     api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float
 ) -> RenderProbe:
-    """Render one frame in a child process with `module`, which the extra `extra` installs."""
+    """Render one frame in a child process.
+
+    Args:
+        api: The graphics interface.
+        module: The module that renders.
+        extra: The extra of this package that installs the module.
+        cure: The cure if rendering fails.
+        timeout_s: Time limit of the child process, s.
+    """
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
         return RenderProbe(ok=False, seconds=0.0, error=error, cure=cure)
@@ -396,6 +436,7 @@ def _probed(
 
 
 def _render_vulkan() -> str | None:
+    """Render a box with SAPIEN, and return the name of the device."""
     import numpy as np
     import sapien
 
@@ -403,6 +444,7 @@ def _render_vulkan() -> str | None:
         device = sapien.Device("cuda")
     except RuntimeError:
         device = sapien.Device("cpu")  # any Vulkan device, software included
+
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
     scene.set_ambient_light([1.0, 1.0, 1.0])
     box = scene.create_actor_builder()
@@ -410,6 +452,7 @@ def _render_vulkan() -> str | None:
     box.build_kinematic(name="box")
     camera = scene.add_camera("front", width=64, height=64, fovy=1.0, near=0.01, far=10.0)
     camera.set_local_pose(sapien.Pose([-3.0, 0.0, 0.0]))
+
     scene.update_render()
     camera.take_picture()
     _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
@@ -418,6 +461,7 @@ def _render_vulkan() -> str | None:
 
 
 def _render_egl() -> str | None:
+    """Render a box with MuJoCo, and return the name of the device."""
     import mujoco
     import numpy as np
     from OpenGL.GL import GL_RENDERER, glGetString
@@ -433,6 +477,7 @@ def _render_egl() -> str | None:
 
 
 def _require_contrast(image: object) -> None:
+    """Raise `RuntimeError` if all pixels of an image are equal."""
     import numpy as np
 
     if np.ptp(np.asarray(image)) == 0:
@@ -440,6 +485,7 @@ def _require_contrast(image: object) -> None:
 
 
 def _main(api: str) -> None:
-    device = _render_vulkan() if api == "vulkan" else _render_egl()
-    listed = [asdict(device) for device in devices()] if api == "egl" else []
-    sys.stdout.write("\n" + json.dumps({"device": device, "devices": listed}) + "\n")
+    """Render a frame, and print the name of the device and all devices, for `_probed`."""
+    name = _render_vulkan() if api == "vulkan" else _render_egl()
+    all_devices = [asdict(device) for device in devices()] if api == "egl" else []
+    sys.stdout.write("\n" + json.dumps({"device": name, "devices": all_devices}) + "\n")

@@ -1,8 +1,8 @@
-"""Environments of Gymnasium behind the interface of `EvalEnv`, and PushT by its published protocol.
+"""Environments of Gymnasium with the interface of `EvalEnv`, and PushT with its published protocol.
 
-`gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or `gymnasium/gym_pusht/PushT-v0`. Images and
-vectors in the observation space are found automatically; an environment without images is rendered.
-Everything else is an option of `Gymnasium`.
+An environment is named `gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or
+`gymnasium/gym_pusht/PushT-v0`. Images and vectors in the observation space are found automatically.
+An environment without images is rendered. Everything else is an option of `Gymnasium`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
 SUCCESS_KEYS = ("is_success", "success")
-RENDER = "render"  # in place of a path: the image of the environment's own renderer
+RENDER = "render"  # instead of a path, it selects the image that the environment renders
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """Defaults of the options of `Gymnasium` for one id; None uses the environment's own values."""
+class Defaults:
+    """Defaults of the options of `Gymnasium` for one id; None selects the environment's values."""
 
-    module: str | None = None  # registers the id
+    module: str | None = None  # the module that registers the id
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     cameras: Mapping[str, str] | None = None
     instruction: str = ""
@@ -48,14 +48,14 @@ class Known:
     protocol: BenchmarkProtocol | None = None
 
 
-def known(task: str) -> Known:
+def defaults_for(task: str) -> Defaults:
     """Return the default options for a Gymnasium id; empty if the id is not known."""
     if task == "gym_pusht/PushT-v0":
         return _PUSHT
     fetch = re.fullmatch(r"Fetch(\w+?)(?:Dense)?-v\d+", task)
     if fetch is None or fetch[1] not in _FETCH_INSTRUCTIONS:
-        return Known()
-    return Known(
+        return Defaults()
+    return Defaults(
         module="gymnasium_robotics",
         instruction=_FETCH_INSTRUCTIONS[fetch[1]],
         control_hz=_FETCH.control_hz,
@@ -63,7 +63,7 @@ def known(task: str) -> Known:
     )
 
 
-_PUSHT = Known(
+_PUSHT = Defaults(
     module="gym_pusht",
     kwargs={"obs_type": "pixels_agent_pos"},
     cameras={"front": "pixels"},
@@ -135,19 +135,19 @@ class Gymnasium(EvalEnv):
             task: The Gymnasium id.
             module: The module that registers the id; by default the id's namespace.
             kwargs: Arguments of `gymnasium.make`; `render_mode` is "rgb_array" by default.
-            cameras: name -> path of an (H, W, 3) uint8 image in the observation, or "render".
-            state: name -> path of a vector, optionally with a range: "robot/qpos[0:7]"; see `Pick`.
+            cameras: Name -> path of an (H, W, 3) uint8 image in the observation, or "render".
+            state: Name -> path of a vector, optionally with a range: "robot/qpos[0:7]"; see `Pick`.
             gripper: The path of a number in the observation.
-            gripper_range: The values of that number (closed, open).
+            gripper_range: The values of that number when the gripper is closed and when it is open.
             success: The path of a bool in the step's info, or "terminated".
             instruction: The task in words.
             control_hz: The rate of the steps, Hz.
-            unit_actions: Whether actions are in [-1, 1], and scaled here to the Box.
+            unit_actions: Whether actions are in [-1, 1], and are scaled to the Box.
             width: The width to which every image is stretched, pixels.
             height: The height to which every image is stretched, pixels.
             max_steps: The step limit, instead of the registered one.
-            remake: Whether each reset makes the simulator again, for one whose own reset keeps some
-                state.
+            remake: Whether each reset makes the simulator again. This is for simulators whose
+                `reset` does not reset all of their state.
 
         Raises:
             UnknownEnv: There is no such id.
@@ -159,7 +159,7 @@ class Gymnasium(EvalEnv):
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
 
         prepare_rendering()
-        defaults = known(task)
+        defaults = defaults_for(task)
         self._id, self._name = task, f"gymnasium/{task}"
         self._module = module if module is not None else defaults.module
         self._kwargs = {**defaults.kwargs, **(kwargs or {})}
@@ -180,11 +180,14 @@ class Gymnasium(EvalEnv):
                     f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}"
                 )
 
-            space_cameras, space_state = parts(self._env.observation_space, self._env.render_mode)
+            space_cameras, space_state = camera_and_state_paths(
+                self._env.observation_space, self._env.render_mode
+            )
             if cameras is None:
                 cameras = defaults.cameras
             self._cameras = _picks(cameras if cameras is not None else space_cameras)
             self._state = _picks(state if state is not None else space_state)
+
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._closed, self._open = gripper_range
             if self._closed == self._open:
@@ -192,16 +195,16 @@ class Gymnasium(EvalEnv):
                     f"{self._name}: gripper_range is {gripper_range}, want two different numbers"
                 )
 
-            first, _ = self._call("reset", seed=0)
-            self._contract = self._contract_of(
-                self._observe(first), control_hz or defaults.control_hz
+            nested, _ = self._call("reset", seed=0)
+            self._contract = self._make_contract(
+                self._observe(nested), control_hz or defaults.control_hz
             )
         except BaseException:
             self.close()
             raise
 
     def _step_limit(self, max_steps: int | None) -> int:
-        """Return `max_steps`, or by default the limit that the id was registered with."""
+        """Return `max_steps`; if it is None, return the limit with which the id was registered."""
         spec = self._env.spec
         limit = max_steps or (spec.max_episode_steps if spec is not None else None)
         if limit is None or limit < 1:
@@ -223,9 +226,7 @@ class Gymnasium(EvalEnv):
         return self._instruction
 
     def describe(self) -> dict[str, Any]:
-        """Return the id, the versions, and the settings with their deviations from the
-        protocol.
-        """
+        """Return the id, the versions, and the settings with their deviations from the protocol."""
         settings = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
         protocol = settings if self._protocol is None else self._protocol.describe(**settings)
         return {
@@ -241,8 +242,14 @@ class Gymnasium(EvalEnv):
     def reset(
         self, *, seed: int, options: Mapping[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, 0 or more; `options` are those of the environment's own
-        reset.
+        """Begin an episode.
+
+        Args:
+            seed: The seed, 0 or more.
+            options: The options of the environment's `reset`.
+
+        Returns:
+            The first observation, and the info of the environment.
         """
         if seed < 0:
             raise ConfigError(f"{self._name}: seed is {seed}, want 0 or more")
@@ -270,13 +277,14 @@ class Gymnasium(EvalEnv):
 
         success = self._is_success(terminated, info)
         is_truncated = bool(truncated) or self._steps >= self.max_steps
-        # Unused images are also rendered: rendering changes the state of some envs (the target of
-        # the Fetch tasks).
+        # Images are rendered even if they are not used: rendering changes the state of some envs,
+        # such as the target of the Fetch tasks.
         obs = self._observe(nested)
         info = {**plain(info), "success": success}
         return obs, float(reward), bool(terminated), is_truncated, info
 
     def _is_success(self, terminated: Any, info: Mapping[str, Any]) -> bool:
+        """Return whether the task is solved after a step."""
         if self._success == "terminated":
             return bool(terminated)
         if self._success is not None:
@@ -291,6 +299,7 @@ class Gymnasium(EvalEnv):
             env.close()
 
     def _make(self, max_steps: int | None) -> Any:
+        """Make Gymnasium's environment, and turn its errors into ours."""
         # Pygame, the renderer of several environments, otherwise prints a greeting on import.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
@@ -318,6 +327,7 @@ class Gymnasium(EvalEnv):
             ) from error
 
     def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        """Call a method of the environment, and turn its errors into `EnvFailed`."""
         try:
             return getattr(self._env, method)(*args, **kwargs)
         except VLAgentsError:
@@ -328,6 +338,7 @@ class Gymnasium(EvalEnv):
             ) from error
 
     def _observe(self, nested: Any) -> Obs:
+        """Convert an observation of the environment."""
         cameras = {}
         for name, pick in self._cameras.items():
             image = self._call("render") if pick.text == RENDER else pick.value(nested)
@@ -335,14 +346,17 @@ class Gymnasium(EvalEnv):
 
         gripper = None
         if self._gripper is not None:
-            share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
-            gripper = min(max(share, 0.0), 1.0)
+            travel = self._gripper.number(nested) - self._closed
+            gripper = min(max(travel / (self._open - self._closed), 0.0), 1.0)
 
         state = {name: pick.vector(nested) for name, pick in self._state.items()}
         return Obs(cameras, gripper, state)
 
-    def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
-        low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))
+    def _make_contract(self, obs: Obs, control_hz: float | None) -> Contract:
+        """Return the contract that describes an observation, and the actions."""
+        low, high = uniform(self._low), uniform(self._high)
+        if self._unit_actions:
+            low, high = -1.0, 1.0
         return Contract(
             cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
             state={name: StateSpec(len(vector)) for name, vector in obs.state.items()},
@@ -362,13 +376,13 @@ _TASKS: dict[str, Mapping[str, Any]] = {
 
 
 class PushT(Gymnasium):
-    """PushT by its published protocol, "image" or "keypoints".
+    """PushT with its published protocol, "image" or "keypoints".
 
-    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also
-    "front", (96, 96, 3) by default; with "keypoints" `state["environment_state"]`, (16,), x and y
-    of eight points of the block, in pixels. In `info["sim_state"]`, (7,) float64, the simulator's
-    state: x, y of the agent and its velocity, pixels and pixels/s; x, y and angle of the block,
-    pixels and rad.
+    Observation: `state["agent_pos"]`, (2,), in pixels of the field, which is 512 by 512. "image"
+    also has the camera "front", (96, 96, 3) by default. "keypoints" also has
+    `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
+    `info["sim_state"]`, (7,) float64, is the simulator's state: x, y and velocity of the agent,
+    pixels and pixels/s; x, y and angle of the block, pixels and rad.
 
     Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """
@@ -410,16 +424,22 @@ def _picks(paths: Mapping[str, str]) -> dict[str, Pick]:
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """The place of a value in a nested observation: its keys from the outside in, then a range."""
+    """The path of a value in a nested observation, and the range of its numbers."""
 
-    text: str
-    keys: tuple[str, ...]
+    text: str  # as in the options of `Gymnasium`
+    keys: tuple[str, ...]  # from the outermost to the innermost
     range: slice
 
     @classmethod
     def parse(cls, text: str) -> Pick:
-        """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is
-        the whole observation.
+        """Parse a path.
+
+        Args:
+            text: Such as `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"` or `"[2:]"`; `""` is
+                the whole observation.
+
+        Raises:
+            ConfigError: The text is not a path.
         """
         match = _PATH.fullmatch(text)
         if match is None:
@@ -433,9 +453,7 @@ class Pick:
         return cls(text, keys, slice(start, stop))
 
     def value(self, nested: Any) -> Any:
-        """Return the value under the keys, without the range; raises `ConfigError` if there is
-        none.
-        """
+        """Return the whole value under the keys; raises `ConfigError` if there is none."""
         for key in self.keys:
             if not isinstance(nested, Mapping):
                 kind = type(nested).__name__
@@ -471,8 +489,15 @@ class Pick:
 def as_image(
     value: Any, name: str, size: tuple[int | None, int | None] = (None, None)
 ) -> np.ndarray:
-    """Copy a value to an array (H, W, 3) uint8 RGB, stretched to `size` (height, width), px;
-    None keeps a side.
+    """Copy an image to an array (H, W, 3) uint8 RGB of a size.
+
+    Args:
+        value: The image.
+        name: The camera, for errors.
+        size: Height and width, px, to which the image is stretched; None keeps a side.
+
+    Raises:
+        ConfigError: The value is not an RGB image.
     """
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -488,10 +513,10 @@ def as_image(
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to one that a message can carry: numpy scalars to Python's, tuples to lists,
-    keys to strings.
+    """Convert a value to one that a message can contain.
 
-    Other values (objects, functions) become None; mappings omit None.
+    Scalars of numpy become numbers of Python, tuples become lists, and keys become strings. Other
+    values (objects, functions) become None. Mappings omit items that are None.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -520,9 +545,18 @@ def uniform(bounds: np.ndarray) -> float | None:
     return float(bounds[0]) if np.isfinite(bounds).all() and (bounds == bounds[0]).all() else None
 
 
-def parts(space: Any, render_mode: str | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the cameras and state parts of an observation space; adds a rendered camera if
-    there is no image.
+def camera_and_state_paths(
+    space: Any, render_mode: str | None
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Find the images and the vectors of an observation space.
+
+    Args:
+        space: A space of Gymnasium.
+        render_mode: The render mode of the environment.
+
+    Returns:
+        Camera -> path of its image, and name in the state -> path of its vector. If there is no
+        image, the environment's renderer is the camera "front".
     """
     cameras: dict[str, str] = {}
     state: dict[str, str] = {}

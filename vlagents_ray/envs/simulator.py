@@ -25,8 +25,9 @@ Size = tuple[int, int]  # height, width in pixels
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkProtocol:
-    """The settings that published numbers of a benchmark share, and their source;
-    `describe()["protocol"]` has it.
+    """The settings that published numbers of a benchmark share, and their source.
+
+    `describe()["protocol"]` of an environment contains them.
     """
 
     name: str
@@ -41,8 +42,14 @@ class BenchmarkProtocol:
     episodes: int | None = None  # episodes per task in published tables; None if they differ
 
     def describe(self, **settings: Any) -> dict[str, Any]:
-        """Return the protocol as plain values; `deviations` lists the fields of `settings` that
-        differ from it.
+        """Return the protocol as plain values.
+
+        Args:
+            settings: Fields of the protocol, with the values that are used.
+
+        Returns:
+            The fields of the protocol by name, and `deviations`, a sentence for each of `settings`
+            that differs.
         """
         deviations = []
         for name, value in settings.items():
@@ -86,8 +93,15 @@ class SimulatorEnv(EvalEnv):
     _steps: int | None = None  # steps of the current episode; None before the first reset
 
     def __init__(self, task: str, **sizes: int | None) -> None:
-        """Check the task, and that each of `sizes` is at least 1 or None; set the variables that
-        drivers read.
+        """Check the arguments, and set the environment variables that drivers read.
+
+        Args:
+            task: The name of the task.
+            sizes: Options of the constructor, each of which must be None or at least 1.
+
+        Raises:
+            UnknownEnv: The task is not known.
+            ConfigError: A size is below 1.
         """
         self.require_task(task)
         self._name = f"{self.suite}/{task}"
@@ -111,8 +125,9 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why the simulator cannot run here; the first call in a process renders one
-        frame in a child.
+        """Return why the simulator cannot run here; None if it can.
+
+        The first call in a process renders one frame in a child process.
         """
         missing = without(cls.packages, cls.cure)
         if missing is not None:
@@ -130,8 +145,8 @@ class SimulatorEnv(EvalEnv):
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32.
 
-        If the task has fixed initial states, the episode begins in state `options["init_state"]`,
-        or in one that the seed selects. There are no other options.
+        If the task has fixed initial states, the episode begins in the state
+        `options["init_state"]`, or in one that the seed selects. There are no other options.
         """
         self._alive()
         options = options or {}
@@ -186,17 +201,26 @@ class SimulatorEnv(EvalEnv):
 
     @abstractmethod
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode by its seed, 0 to 2^32 - 1, and the number of its initial state, 0 if
-        none is fixed.
+        """Begin an episode.
 
-        Returns the first observation, and further entries of `info`; `init_state` and `success`
-        (False) are added if missing.
+        Args:
+            seed: The seed, 0 to 2^32 - 1.
+            state: The number of the initial state; 0 if the task has no fixed initial states.
+
+        Returns:
+            The first observation, and entries of `info`. `init_state` and `success` (False) are
+            added if they are missing.
         """
 
     @abstractmethod
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for
-        `EvalEnv.step`.
+        """Execute an action.
+
+        Args:
+            action: (D,) float32.
+
+        Returns:
+            `(obs, reward, terminated, info)`, as for `EvalEnv.step`.
         """
 
     @classmethod
@@ -208,14 +232,16 @@ class SimulatorEnv(EvalEnv):
         return success and self._ends_on_success, {"success": success}
 
     def _alive(self) -> Any:
+        """Return the simulator; raises `EnvFailed` after `close`."""
         if self._env is None:
             raise EnvFailed(f"{self._name} is closed; make a new one")
         return self._env
 
     @contextmanager
     def _making(self) -> Iterator[None]:
-        """Guard the construction of the simulator: turn an error into `EnvFailed`, and free what
-        was made.
+        """Guard the construction of the simulator in the block.
+
+        An error becomes `EnvFailed`, and resources that were already made are freed.
         """
         try:
             with failing(self._name, "make"):
@@ -238,11 +264,19 @@ class MujocoCameras:
         upside_down: Collection[str] = (),
         shadows: bool = True,
     ) -> None:
-        """Make the renderer of a `mujoco.MjModel`, and grow the model's frame buffer if needed;
-        `env` is for errors.
+        """Make the renderer, and enlarge the model's frame buffer if needed.
 
-        Images of cameras in `upside_down` are turned by 180 degrees. Without `shadows` there are no
-        reflections and no smooth edges either, and an image in software takes a tenth of the time.
+        Args:
+            env: The name of the environment, for errors.
+            model: A `mujoco.MjModel`.
+            cameras: The names of the cameras to render.
+            size: Height and width of the images, px.
+            upside_down: The cameras whose images are rotated by 180 degrees.
+            shadows: Whether to render shadows, reflections and smooth edges. Without them, an image
+                that is rendered in software takes a tenth of the time.
+
+        Raises:
+            ConfigError: The model has no such camera.
         """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
@@ -261,7 +295,7 @@ class MujocoCameras:
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
     def render(self, data: Any) -> dict[str, np.ndarray]:
-        """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8."""
+        """Return the images of a `mujoco.MjData` by camera, (H, W, 3) uint8."""
         images = {}
         for camera in self._cameras:
             self._renderer.update_scene(data, camera=camera)
@@ -289,15 +323,20 @@ def camera_names(model: Any) -> list[str]:
 
 
 def without(modules: Sequence[str], cure: str) -> str | None:
-    """Return which of these modules are not installed, with the cure; None if all are."""
+    """Return the first of these modules that is not installed, with the cure; None if all are."""
     missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
     return None if missing is None else f"{missing} is not installed; {cure}"
 
 
 @contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
-    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's
-    own pass unchanged.
+    """Turn errors of a simulator in the block into `EnvFailed`.
+
+    Errors of drivers get a cure. The errors of this package are raised unchanged.
+
+    Args:
+        env: The name of the environment.
+        doing: What the simulator does in the block, as a verb.
     """
     try:
         yield

@@ -1,12 +1,11 @@
-"""ManiSkill 3: eleven table-top tasks that need no downloads, and any other task registered with
-ManiSkill.
+"""ManiSkill 3: eleven table-top tasks without downloads, and any other task of ManiSkill.
 
     with ManiSkill("PushCube-v1", width=224, height=224) as env:
         obs, _ = env.reset(seed=0)
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-It needs a Vulkan device, for example Mesa's software one; `ManiSkill.missing()` reports a missing
-one.
+It needs a Vulkan device, for example the software device of Mesa. `ManiSkill.missing()` reports
+whether there is one.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ PROTOCOL = {
     # The scene is rebuilt for each episode, with other objects if the task draws them.
     "reconfiguration_freq": 1,
     "metrics": ["success_once", "success_at_end"],
-    "metric": "success_once",  # the first of them, which ManiSkill's baselines compare
-    # Each episode has its own seed, which determines all its random draws.
+    "metric": "success_once",  # the metric that ManiSkill's baselines compare
+    # Each episode has a seed, which determines all its random draws.
     "seeds": "one an environment",
 }
 
@@ -42,20 +41,24 @@ PROTOCOL = {
 class ManiSkill(SimulatorEnv):
     """One environment of one ManiSkill task.
 
-    Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat`
-    and `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for
-    scripted experts only, `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation,
-    which includes the positions of objects. Some goals, such as PickCube's, are hidden from
-    cameras.
+    Observation: the task's cameras. `state` contains the arm's `joints` (without the fingers), and
+    `tquat` and `xyzrpy`, the pose of the tool centre point in the robot's base frame. `gripper` is
+    its opening. `info["sim_state"]`, (D,) float32, is for scripted experts only: ManiSkill's flat
+    state observation, which includes the positions of objects. Some goals, such as PickCube's, are
+    hidden from cameras.
 
-    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first
-    three move the tool by 0.1 m per unit along the base's axes; the next three turn it about the
-    base's axes by **minus** 0.1 rad per unit, since ManiSkill scales them by their lower bound; the
-    last is the gripper, 1 open, -1 closed. A robot without gripper takes (6,). The arm lags behind
-    its commands: a constant 1.0 moves it by about 0.03 m per step.
+    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], or (6,) for a robot
+    without a gripper.
+
+    - The first three values move the tool by 0.1 m per unit along the base's axes.
+    - The next three turn it about the base's axes by **minus** 0.1 rad per unit, since ManiSkill
+      scales them by their lower bound.
+    - The last value is the gripper, 1 open, -1 closed.
+
+    The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
 
     The env continues after success, so that success once and success at the end can both be
-    measured, and never reports `terminated`.
+    measured. It never reports `terminated`.
     """
 
     suite, known = "maniskill", tuple(INSTRUCTIONS)
@@ -80,17 +83,18 @@ class ManiSkill(SimulatorEnv):
         `SimulatorEnv`.
 
         Args:
-            task: ManiSkill's id.
-            cameras: Cameras of the task to return; None selects all.
-            control_mode: None selects `pd_ee_delta_pose`, or the robot's own default if it lacks
-                that.
-            instruction: None selects the task's, see `instruction_for`.
+            task: ManiSkill's id of the task.
+            cameras: The cameras of the task to return; None selects all of them.
+            control_mode: ManiSkill's name; None selects `pd_ee_delta_pose`, or the robot's default
+                if the robot lacks that mode.
+            instruction: None selects the instruction of the task, see `instruction_for`.
             sim_backend: "physx_cpu", which is faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
-            shader: ManiSkill's name, e.g. "minimal", "default"; None selects the task's own.
-            reward_mode: ManiSkill's name; None selects the task's own.
-            reconfigure: Rebuild the scene for each episode. Without it the dynamics of some tasks
-                (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
+            shader: ManiSkill's name, e.g. "minimal", "default"; None selects the task's shader.
+            reward_mode: ManiSkill's name; None selects the task's mode.
+            reconfigure: Whether to rebuild the scene for each episode. Without that, a reset takes
+                about 15 ms less, but the dynamics of some tasks (PlugCharger, PushT) depend on the
+                previous episode.
         """
         super().__init__(task)
         self.max_steps, self._task_limit = step_limits(self._name, task, max_steps)
@@ -119,8 +123,14 @@ class ManiSkill(SimulatorEnv):
         return instructions[0]
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's
-        own reset.
+        """Begin an episode.
+
+        Args:
+            seed: The seed, taken modulo 2^32.
+            options: The options of ManiSkill's reset.
+
+        Returns:
+            The first observation, and the info of the environment.
         """
         self._options = options or {}
         return super().reset(seed=seed)
@@ -172,10 +182,10 @@ class ManiSkill(SimulatorEnv):
 
 
 class ManiSkillBatch(BatchEnv):
-    """`num_envs` environments of one ManiSkill task; observations and actions are those of
-    `ManiSkill`.
+    """Environments of one ManiSkill task in one simulator.
 
-    Physics on the GPU and on the CPU are not bit-identical: do not mix their results.
+    Observations and actions are those of `ManiSkill`. Physics on the GPU and on the CPU are not
+    bit-identical: do not mix their results.
     """
 
     def __init__(
@@ -189,9 +199,16 @@ class ManiSkillBatch(BatchEnv):
         reconfigure: bool = True,
         **options: Any,
     ) -> None:
-        """Make the environments with the options of `ManiSkill`, whose errors this raises.
+        """Make the environments; raises the errors of `ManiSkill`.
 
-        `sim_backend` "physx_cpu" can only simulate a single environment.
+        Args:
+            task: ManiSkill's id of the task.
+            num_envs: The number of environments.
+            instruction: As for `ManiSkill`.
+            max_steps: As for `ManiSkill`.
+            sim_backend: "physx_cuda", or "physx_cpu", which simulates a single environment.
+            reconfigure: As for `ManiSkill`.
+            options: Further options of `ManiSkill`.
         """
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
@@ -211,7 +228,7 @@ class ManiSkillBatch(BatchEnv):
 
     @property
     def instructions(self) -> list[str]:
-        """The instruction of the constructor, or those of the tasks."""
+        """The instruction of the constructor, or the instructions of the tasks."""
         if self._instruction is not None:
             return [self._instruction] * self._playing
         return self._simulator.instructions()[: self._playing]
@@ -219,14 +236,20 @@ class ManiSkillBatch(BatchEnv):
     def reset(
         self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None
     ) -> list[Obs]:
-        """Begin the episodes of `seeds`, taken modulo 2^32; the options are passed to
-        ManiSkill's own reset.
+        """Begin an episode for each seed.
+
+        Args:
+            seeds: The seeds, taken modulo 2^32.
+            options: The options of ManiSkill's reset for each episode.
+
+        Returns:
+            The first observation of each episode.
         """
         self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
         if not options:
             options = [None] * self._playing
 
-        # Idle environments begin an episode as well, whose results are not used.
+        # Idle environments also begin an episode, whose results are not used.
         idle = self.num_envs - self._playing
         all_seeds = [*seeds, *[seeds[-1]] * idle]
         all_options: list[Options] = [env_options or {} for env_options in options]
@@ -268,6 +291,7 @@ class ManiSkillBatch(BatchEnv):
 def _simulator(
     task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
 ) -> Simulator:
+    """Make the simulator of a task, with images of a size, px."""
     name = f"maniskill/{task}"
     require_sizes(name, width=width, height=height)
     sensors: dict[str, Any] = {"width": width, "height": height}

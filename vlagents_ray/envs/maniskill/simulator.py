@@ -1,5 +1,6 @@
-"""ManiSkill's tasks in words, and the construction of its environments in processes without a
-terminal.
+"""The simulator of ManiSkill's tasks, and their instructions.
+
+Environments are made in processes without a terminal.
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ INSTRUCTIONS: dict[str, str] = {
 
 
 def instruction_for(task: str) -> str:
-    """Return the task's instruction, or its name in words: "PickSingleYCB-v1" is "pick single
-    ycb".
+    """Return the instruction of a task, or its name in words.
+
+    The words for "PickSingleYCB-v1" are "pick single ycb".
     """
     if task in INSTRUCTIONS:
         return INSTRUCTIONS[task]
@@ -57,16 +59,19 @@ def instruction_for(task: str) -> str:
 
 
 def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | None]:
-    """Return the step limit to use, and the task's own; prepares the process for ManiSkill.
+    """Return the step limits of a task, and prepare the process for ManiSkill.
 
     Args:
         env: The env's name, for errors.
         task: ManiSkill's id.
-        max_steps: The limit to use; None: the task's own.
+        max_steps: The limit to use; None selects the limit of the task.
+
+    Returns:
+        The limit to use, and the limit of the task, if it has one.
 
     Raises:
         UnknownEnv: There is no such task.
-        ConfigError: There is no limit of 1 or more.
+        ConfigError: There is no limit, or it is below 1.
     """
     prepare_rendering()
     require("sapien")
@@ -88,8 +93,10 @@ def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | 
 
 
 def chosen_backend(render_backend: str) -> str:
-    """Resolve the render backend: "auto" is the GPU if SAPIEN can render and torch can wait
-    there, else the CPU.
+    """Resolve the render backend "auto"; other values are returned unchanged.
+
+    "auto" selects the GPU if SAPIEN can render on it and torch can synchronize with it. Otherwise
+    it selects the CPU.
     """
     if render_backend != "auto":
         return render_backend
@@ -105,8 +112,13 @@ def make_bare(
 ) -> Any:
     """Make the bare environment, without Gymnasium's wrappers.
 
-    A `control_mode` of None selects the default mode, or the robot's own if the robot lacks that.
-    ManiSkill's defaults replace `options` that are None.
+    Args:
+        task: ManiSkill's id.
+        control_mode: None selects `DEFAULT_CONTROL_MODE`, or the robot's default if the robot lacks
+            that mode.
+        sim_backend: ManiSkill's name.
+        render_backend: ManiSkill's name.
+        options: Further arguments of `gymnasium.make`; None selects ManiSkill's default.
 
     Raises:
         ConfigError: The robot lacks the control mode.
@@ -116,7 +128,7 @@ def make_bare(
     arguments |= {"sim_backend": sim_backend, "render_backend": render_backend}
     gymnasium = require("gymnasium")
     with _no_prompts(task), failing(f"maniskill/{task}", "make"), warnings.catch_warnings():
-        # The digital twin of the cubes makes a tensor from a list of arrays: 24 rows, once.
+        # Making the digital twin of the cubes causes this warning, for a list of 24 arrays.
         warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
 
@@ -133,8 +145,9 @@ def make_bare(
 
 @contextlib.contextmanager
 def _no_prompts(task: str) -> Iterator[None]:
-    """Turn ManiSkill's prompt on stdin, which offers to download missing assets, into
-    `EnvFailed`.
+    """Turn ManiSkill's prompt in the block into `EnvFailed`.
+
+    If assets are missing, ManiSkill offers on stdin to download them.
     """
     output = io.StringIO()
     stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
@@ -156,11 +169,9 @@ def _no_prompts(task: str) -> Iterator[None]:
 
 @functools.cache
 def _prepare_process() -> None:
-    """Make rebuilding a scene cheap, and keep repeated warnings out of the log; once per
-    process.
-    """
-    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, is spent on
-    # modules just imported, which are not garbage.
+    """Make reconfigurations cheap, and suppress repeated warnings; once per process."""
+    # ManiSkill collects garbage at each reconfiguration, which takes 150 ms. Most of that time is
+    # spent on imported modules, which are not garbage.
     gc.collect()
     gc.freeze()
     # Tasks and robots repeat these warnings at each reconfiguration, and no user can act on them.
@@ -173,10 +184,10 @@ def _prepare_process() -> None:
 
 @functools.cache
 def _keep_renderer(sim_backend: str, render_backend: str) -> object:
-    """Hold one renderer for the life of the process.
+    """Keep a renderer for the life of the process.
 
-    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the next
-    environment would then take 5 s instead of 0.1 s.
+    SAPIEN frees its device and its compiled shaders with the last scene that uses them. Making the
+    next environment would then take 5 s instead of 0.1 s.
     """
     import sapien.render
 
@@ -185,8 +196,8 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     return None if device is None else sapien.render.RenderSystem(device)
 
 
-# Position of a finger's joint when closed and when open, m, by ManiSkill's name of the robot. The
-# last component of an action for their controllers is -1 closed, 1 open. Other robots have no
+# ManiSkill's name of a robot -> position of a finger's joint when closed and when open, m. In an
+# action for these robots, the last value is the gripper, -1 closed, 1 open. Other robots have no
 # gripper in the contract.
 _FINGER_M = {
     "panda": (0.0, 0.04),
@@ -194,10 +205,11 @@ _FINGER_M = {
     "widowx250s_bridgedataset_flat_table": (0.015, 0.037),
     "widowx250s_bridgedataset_sink": (0.015, 0.037),
 }
-_TOOL_LINK = "ee_gripper_link"  # of robots for which ManiSkill names no tool centre point
+# The link whose pose is the tool's, if ManiSkill names no tool centre point.
+_TOOL_LINK = "ee_gripper_link"
 
-# The part of the action that moves the arm, from mani_skill/agents/controllers. The rotation of
-# "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+# Control mode -> the values of an action that move the arm, from mani_skill/agents/controllers. The
+# rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
 _EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
 _EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
 _JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
@@ -218,6 +230,7 @@ class ManiSkillRobot:
     """Reads proprioception from ManiSkill's `agent`, which each reconfiguration replaces."""
 
     def __init__(self, agent: Any) -> None:
+        """Read the names of the joints of an `agent` of ManiSkill."""
         names = [joint.name for joint in agent.robot.active_joints]
         arm_joints = getattr(agent, "arm_joint_names", names)
         finger_joints = getattr(agent, "gripper_joint_names", ())
@@ -231,8 +244,14 @@ class ManiSkillRobot:
             self.state |= {"tquat": StateSpec(7, "m+quat_xyzw"), "xyzrpy": StateSpec(6, "m+rad")}
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
-        """Return the state of each environment, each part (D,) float32, and the gripper in [0,
-        1], 1 = open.
+        """Read the proprioception of all environments.
+
+        Args:
+            agent: The current `agent`.
+
+        Returns:
+            For each environment, the state, whose values are (D,) float32, and the gripper in
+            [0, 1], 1 = open, or None without a gripper.
         """
         rows = agent.robot.get_qpos().cpu().numpy()
         states = [{"joints": qpos[self._arm]} for qpos in rows]
@@ -245,6 +264,7 @@ class ManiSkillRobot:
         return [(state, self._opening(qpos)) for state, qpos in zip(states, rows, strict=True)]
 
     def _opening(self, qpos: np.ndarray) -> float | None:
+        """Return the gripper's opening in [0, 1] for joint positions (D,)."""
         if self._finger_m is None:
             return None
 
@@ -260,8 +280,12 @@ def _tool(agent: Any) -> Any:
 
 
 def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:
-    """Return the actions of a control mode, as far as they are known, with the bounds of its
-    space.
+    """Return the description of actions for the contract.
+
+    Args:
+        control_mode: ManiSkill's name; the meaning of actions is known for `CONTROL_MODES`.
+        space: The space of actions, Box (D,).
+        has_gripper: Whether the last value of an action is a gripper.
     """
     normalized = bool((space.low == -1.0).all() and (space.high == 1.0).all())
     return ActionSpec(
@@ -274,19 +298,22 @@ def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSp
     )
 
 
-_LOCKED = 1e-4  # bound on the cosine of the pitch
+_LOCKED = 1e-4  # cosine of the pitch below which roll and yaw are not separately determined
 
 
 def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two (7,) world poses, metres and quaternion wxyz, as in SAPIEN, to the tool's pose in
-    the base frame.
+    """Compute the tool's pose in the base frame.
+
+    Args:
+        base: Pose of the base in the world frame, (7,), m and quaternion wxyz, as in SAPIEN.
+        tool: Pose of the tool in the world frame, (7,).
 
     Returns:
-        `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and radians,
-        where R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
+        `tquat` (7,), m and quaternion xyzw with w >= 0, and `xyzrpy` (6,), m and rad, where
+        R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
     """
-    bw, bx, by, bz = (float(v) for v in base[3:])
-    tw, tx, ty, tz = (float(v) for v in tool[3:])
+    bw, bx, by, bz = base[3:].astype(float).tolist()
+    tw, tx, ty, tz = tool[3:].astype(float).tolist()
 
     # The rotation: conj(base) * tool.
     w = bw * tw + bx * tx + by * ty + bz * tz
@@ -296,8 +323,8 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
 
-    # The offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part.
-    px, py, pz = (float(t - b) for t, b in zip(tool[:3], base[:3], strict=True))
+    # The offset p, rotated by conj(base): p + 2 b x (b x p - bw p), where b = (bx, by, bz).
+    px, py, pz = (tool[:3] - base[:3]).astype(float).tolist()
     cx = by * pz - bz * py - bw * px
     cy = bz * px - bx * pz - bw * py
     cz = bx * py - by * px - bw * pz
@@ -305,15 +332,15 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     py += 2 * (bz * cx - bx * cz)
     pz += 2 * (bx * cy - by * cx)
 
-    # Sine and cosine of the roll, times the cosine of the pitch.
-    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
+    # Sine and cosine of the roll, both multiplied by the cosine of the pitch.
+    roll_sine, roll_cosine = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
-    # Gimbal lock: only the sum or the difference of roll and yaw is determined.
-    if math.hypot(*rolls) < _LOCKED:
+    if math.hypot(roll_sine, roll_cosine) < _LOCKED:
+        # Gimbal lock: only the sum or the difference of roll and yaw is determined.
         roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
         yaw = math.remainder(yaw, 2 * math.pi)
     else:
-        roll = math.atan2(*rolls)
+        roll = math.atan2(roll_sine, roll_cosine)
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
     tquat = np.array([px, py, pz, x, y, z, w], dtype=np.float32)
@@ -330,7 +357,7 @@ class Moment:
 
 
 class Simulator:
-    """The `num_envs` environments of a task, each of which continues after success."""
+    """The environments of one ManiSkill task, each of which continues after success."""
 
     def __init__(
         self,
@@ -346,8 +373,23 @@ class Simulator:
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
-        """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with
-        its cure.
+        """Make the simulator.
+
+        Args:
+            name: The env's name, for errors.
+            task: ManiSkill's id.
+            obs_mode: ManiSkill's name.
+            num_envs: The number of environments.
+            cameras: The cameras of the task to render; None selects all.
+            sim_backend: ManiSkill's name.
+            render_backend: "cpu", "gpu", or "auto".
+            control_mode: As for `make_bare`.
+            reward_mode: ManiSkill's name; None selects the task's mode.
+            sensors: ManiSkill's options of the cameras.
+
+        Raises:
+            ConfigError: The task has no success or not exactly one robot, or a name is unknown.
+            EnvFailed: The simulator cannot be made; the message has the cure.
         """
         self.name, self._task = name, task
         self._asked_for = render_backend != "auto"
@@ -386,8 +428,10 @@ class Simulator:
             raise
 
     def contract(self, action: ActionSpec | None = None) -> Contract:
-        """Return the contract; `action` describes the actions, by default as ManiSkill's control
-        mode has them.
+        """Return the contract.
+
+        Args:
+            action: The description of actions; None selects that of the control mode.
         """
         env, has_gripper = self.alive(), self._robot.has_gripper
         if action is None:
@@ -439,20 +483,27 @@ class Simulator:
             return self.moment(env.get_obs(info), info)
 
     def step(self, actions: np.ndarray, *, look: bool = True) -> Moment:
-        """Execute one action in each environment, (N, D) float32; without `look`, render
-        nothing.
+        """Execute an action in each environment.
+
+        Args:
+            actions: (N, D) float32.
+            look: Whether to render images.
+
+        Returns:
+            The observations, the successes and the rewards after the step.
         """
         env = self.alive()
         observing = contextlib.nullcontext() if look else self._observing("state_dict")
         with failing(self.name, "step"), observing:
-            # A copy, since torch shares the memory, and warns of read-only arrays, such as Ray's.
+            # A copy, since torch shares the memory, and warns about read-only arrays like Ray's.
             raw, rewards, _, _, info = env.step(actions.copy())
             moment = self.moment(raw, info)
             return replace(moment, rewards=rewards.cpu().numpy().astype(float).tolist())
 
     def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
-        """Convert ManiSkill's observation and info. The images of a camera share one array, (N,
-        H, W, 3).
+        """Convert ManiSkill's observation and info.
+
+        The images of a camera are rows of one array, (N, H, W, 3) uint8.
         """
         env = self.alive()
         images = {}
@@ -515,8 +566,9 @@ class Simulator:
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:
-        """Switch the observation mode; tasks still choose their additions to the state by their
-        original mode.
+        """Switch the observation mode in the block.
+
+        Tasks still choose their additions to the state by the original mode.
         """
         env = self.alive()
         original_mode, env._obs_mode = env._obs_mode, mode

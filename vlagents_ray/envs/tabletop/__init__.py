@@ -1,7 +1,6 @@
-"""The built-in tabletop: coloured pucks and pads, a gripper, and instructions that select among
-them.
+"""The built-in tabletop: coloured pucks and pads, a gripper, and instructions about them.
 
-It is plain numpy, without simulator or graphics driver, so that a first run works anywhere.
+It needs only numpy, without a simulator or a graphics driver, so that a first run works anywhere.
 
 Base frame: origin in the middle of the table's surface, x to the right in the image, y away from
 the camera, z up; metres. The camera "front" looks down at an elevation of 70 degrees without
@@ -10,7 +9,7 @@ perspective: the view's shorter side spans 0.66 m and the origin lies in the ima
     u = width / 2 + s * x,   v = height / 2 - s * (y * sin 70° + z * cos 70°),   s = min(width,
     height) / 0.66 m
 
-The camera "wrist" shows a third of that, enlarged, with the fingertips in its centre.
+The camera "wrist" shows an enlarged third of that image, with the fingertips in its centre.
 """
 
 from __future__ import annotations
@@ -40,29 +39,31 @@ from vlagents_ray.interface import Act, Obs
 MIXED = "mixed"
 _RENDERERS = {"front": TabletopRenderer, "wrist": WristRenderer}
 _TASKS: tuple[Task, ...] = get_args(Task)
-_DISTURBED = 0.1  # share of steps
-_VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
-_POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, constant
+_DISTURBED = 0.1  # share of the steps to which `disturbance` applies
+# Version of the scenes and the physics; results of different versions are not comparable.
+_VERSION = 1
+_POINTING_DOWN = (math.pi, 0.0, 0.0)  # constant roll, pitch and yaw of the gripper, rad
 
 
 class Tabletop(EvalEnv):
-    """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue
-    pad".
+    """Four pucks, three pads and an instruction, e.g. "put the red puck on the blue pad".
 
     Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
-    which draws one of them for each episode.
+    which draws one of the others for each episode.
 
-    Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist";
-    `state["xyzrpy"]` (6,), the fingertips' position in m and the gripper's constant orientation in
-    rad, in the base frame of the package's docstring; `gripper` in [0, 1], 1 = open, about 0.58
-    around a puck. With `object_state`, also `state["puck"]` (3,), the position of the underside of
-    the instruction's puck, and `state["target"]` (3,), its target; m, in the base frame.
+    Observation: the cameras "front" and "wrist", by default only "front", (height, width, 3).
+    `state["xyzrpy"]` (6,) is the position of the fingertips, m, and the constant orientation of the
+    gripper, rad, in the base frame of the package's docstring. `gripper` is in [0, 1], 1 = open,
+    and about 0.58 around a puck. With `object_state`, the state also contains `puck` (3,), the
+    position of the underside of the instruction's puck, and `target` (3,), its target, both in m
+    in the base frame.
 
-    Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the
-    gripper, 1 = open, -1 = closed. Components outside [-1, 1] are clipped, as by a robot's
+    Action: (4,). `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the
+    gripper, 1 = open, -1 = closed. Values outside of [-1, 1] are clipped, as by a robot's
     controller.
 
-    The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
+    The reward is 1.0 in each step after which the task is solved, and otherwise 0.0. An episode is
+    never terminated.
     """
 
     known = (MIXED, *_TASKS)
@@ -85,15 +86,15 @@ class Tabletop(EvalEnv):
             task: One of `tasks()`; None selects `mixed`.
             width: The width of the image, at least 32 pixels.
             height: The height of the image, at least 32 pixels.
-            cameras: Of "front" and "wrist".
-            max_steps: Steps until truncation.
-            pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck
-                only if it is alone.
-            object_state: Whether the state has the positions of the instruction's puck and of its
-                target.
-            disturbance: Standard deviation of what is added to the motion of one step in ten, in
-                units of an action; demonstrations with it show how to recover from errors (DART,
-                arXiv 1703.09327).
+            cameras: Some of "front" and "wrist".
+            max_steps: The number of steps until truncation.
+            pucks: The number of pucks on the table, 1 to 4. A policy without instructions can
+                identify its puck only if there is one.
+            object_state: Whether the state contains the positions of the instruction's puck and of
+                its target.
+            disturbance: Standard deviation of the noise that is added to the motion in one step of
+                ten, in units of an action. Demonstrations with such noise show how to recover from
+                errors (DART, arXiv 1703.09327).
 
         Raises:
             ConfigError: There is no such task, or a number is out of its range.
@@ -125,6 +126,7 @@ class Tabletop(EvalEnv):
     def _require_in_range(
         self, option: str, value: float, low: int, high: int | None = None
     ) -> None:
+        """Raise `ConfigError` unless an option is between `low` and `high`, if that is not None."""
         if value >= low and (high is None or value <= high):
             return
         allowed = f"at least {low}" if high is None else f"{low} to {high} in {self._task!r}"
@@ -227,6 +229,7 @@ class Tabletop(EvalEnv):
         self._world = self._goal = None
 
     def _observe(self, world: TabletopWorld, goal: Goal, *, look: bool = True) -> Obs:
+        """Return the current observation; without `look` it has no images."""
         state = {"xyzrpy": np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)}
         if self._object_state:
             puck = world.puck(goal.puck)
@@ -239,9 +242,7 @@ class Tabletop(EvalEnv):
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
-        """Return the goal of an instruction in this scene; raises `ConfigError` if it is not
-        possible.
-        """
+        """Return the goal of an instruction; raises `ConfigError` if the scene has none."""
         possible: dict[str, Goal] = {}
         for task in self._tasks:
             possible |= {goal.instruction: goal for goal in goals(world, task)}

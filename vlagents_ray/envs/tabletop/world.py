@@ -1,7 +1,7 @@
 """The physics of the table, and the goals of its episodes.
 
-Quasi-static: a puck moves where it is carried or pushed and otherwise rests or falls. Plain floats
-replace arrays: for a handful of bodies they are several times faster.
+The physics is quasi-static: a puck that is not carried or pushed rests or falls. Positions are
+plain floats, which are several times faster than arrays for so few bodies.
 """
 
 from __future__ import annotations
@@ -22,27 +22,32 @@ HOME = (0.0, 0.20, 0.16)  # m, initial position of the fingertips
 STEP_LIMIT = 0.03  # m, travel of one control step along each axis
 
 _TABLE = (0.30, 0.24)  # m, half extents; a rim keeps the pucks on it
-_SUBSTEPS = 3  # so that between contact checks a finger moves at most 1 cm, less than its width
-_OPENING_RATE = 0.5 / _SUBSTEPS  # share of the whole opening
-_CONTACT_PASSES = 4  # enough for a puck cradled by two fingers to come to rest
-_FALL = 0.06 / _SUBSTEPS  # m
+# Between two checks of contacts, a finger moves by at most 1 cm, which is less than its width.
+_SUBSTEPS = 3
+_OPENING_RATE = 0.5 / _SUBSTEPS  # share of the whole opening in a substep
+_CONTACT_PASSES = 4  # enough for a puck between two fingers to come to rest
+_FALL = 0.06 / _SUBSTEPS  # m, by which a puck falls in a substep
 # m, largest distance of a grasped puck's centre from the line between the fingers.
 _GRASP_DEPTH = 0.012
-_LIFTED = 0.01  # m
+_LIFTED = 0.01  # m, height above which a puck counts as lifted
 _EPSILON = 1e-6  # m
 
 
 @dataclass(slots=True)
 class Puck:
+    """A puck; x, y and z are the centre of its underside in the base frame, m."""
+
     colour: str
     x: float
     y: float
-    z: float = 0.0  # m, of its underside
+    z: float = 0.0
     lifted: bool = False  # whether it has left the table in this episode
 
 
 @dataclass(frozen=True, slots=True)
 class Pad:
+    """A pad on the table; x and y are its centre in the base frame, m."""
+
     colour: str
     x: float
     y: float
@@ -54,7 +59,7 @@ class TabletopWorld:
     def __init__(self, pucks: list[Puck], pads: list[Pad]) -> None:
         self.pucks, self.pads = pucks, pads
         self.x, self.y, self.z = HOME  # m, midway between the fingertips
-        self.gap = GAP_OPEN  # m
+        self.gap = GAP_OPEN  # m, from the gripper's centre to each finger
         self.held_puck: Puck | None = None
 
     @property
@@ -82,18 +87,21 @@ class TabletopWorld:
                 puck.lifted = puck.lifted or puck.z > _LIFTED
 
     def _travel(self, dx: float, dy: float) -> None:
+        """Move the fingertips and carried pucks horizontally, and push pucks in the way."""
         x, y = _clip(self.x + dx, REACH[0]), _clip(self.y + dy, REACH[1])
         dx, dy = x - self.x, y - self.y
         for puck in self._carried():
             puck.x += dx
             puck.y += dy
         self.x, self.y = x, y
+
         lowest = self.z if self.held_puck is None else min(self.z, self.held_puck.z)
-        if any(lowest < puck.z + PUCK_HEIGHT for puck in self.pucks if puck is not self.held_puck):
+        free_pucks = [puck for puck in self.pucks if puck is not self.held_puck]
+        if any(lowest < puck.z + PUCK_HEIGHT for puck in free_pucks):
             self._push()
 
     def _push(self) -> None:
-        """Move the pucks that the fingers touch, and those that these touch."""
+        """Move the pucks that the fingers touch, and the pucks that are touched by those."""
         reach, offset = PUCK_RADIUS + FINGER_RADIUS, self.gap + FINGER_RADIUS
         for puck in self.pucks:
             if puck is self.held_puck or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
@@ -119,11 +127,13 @@ class TabletopWorld:
     def _separate(self) -> bool:
         """Move overlapping pucks apart, once for each pair; return whether any moved."""
         moved = False
-        for i, a in enumerate(self.pucks):
-            for b in self.pucks[i + 1 :]:
-                if abs(a.z - b.z) >= PUCK_HEIGHT - _EPSILON:
+        for i, first in enumerate(self.pucks):
+            for second in self.pucks[i + 1 :]:
+                if abs(first.z - second.z) >= PUCK_HEIGHT - _EPSILON:
                     continue
-                still, loose = (b, a) if b is self.held_puck else (a, b)
+                still, loose = first, second
+                if second is self.held_puck:
+                    still, loose = second, first
                 push = _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS)
                 if push is not None:
                     loose.x += push[0]
@@ -136,6 +146,7 @@ class TabletopWorld:
         return moved
 
     def _raise(self, dz: float) -> None:
+        """Move the fingertips and carried pucks vertically, down to the next obstacle."""
         z = _clip(self.z + dz, REACH[2])
         if self.held_puck is not None:
             z = max(z, self.z + self._support(self.held_puck) - self.held_puck.z)
@@ -149,6 +160,7 @@ class TabletopWorld:
         self.z = z
 
     def _grip(self, opening: float) -> None:
+        """Move the fingers towards an opening in [0, 1], and grasp or release a puck."""
         change = _clip(opening - self.opening, (-_OPENING_RATE, _OPENING_RATE))
         gap = _clip(self.gap + change * GAP_OPEN, (0.0, GAP_OPEN))
         if self.held_puck is not None:
@@ -168,17 +180,15 @@ class TabletopWorld:
         self.gap = gap
 
     def _support(self, puck: Puck) -> float:
-        """Return the height of the support of `puck`, m: the table, or a puck under its centre
-        of mass.
+        """Return the height at which `puck` rests, m: on the table, or on a puck.
+
+        A puck supports another one if it is below the other's centre of mass.
         """
         height = 0.0
-        for other in self.pucks:
-            top = other.z + PUCK_HEIGHT
-            if (
-                other is not puck
-                and top <= puck.z + _EPSILON
-                and _distance(puck, other) < PUCK_RADIUS
-            ):
+        for lower in self.pucks:
+            top = lower.z + PUCK_HEIGHT
+            is_below = lower is not puck and top <= puck.z + _EPSILON
+            if is_below and _distance(puck, lower) < PUCK_RADIUS:
                 height = max(height, top)
         return height
 
@@ -197,6 +207,7 @@ class TabletopWorld:
         return carried
 
     def _between_fingers(self, puck: Puck) -> bool:
+        """Return whether a puck's centre is between the fingers."""
         return (
             abs(puck.y - self.y) < _GRASP_DEPTH
             and abs(puck.x - self.x) < max(self.gap, _EPSILON)
@@ -204,6 +215,7 @@ class TabletopWorld:
         )
 
     def _finger_over(self, puck: Puck) -> bool:
+        """Return whether a finger is above or inside a puck, whatever its height."""
         reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
         offset = self.gap + FINGER_RADIUS
         finger_xs = (self.x - offset, self.x + offset)
@@ -211,8 +223,10 @@ class TabletopWorld:
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
-    """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far
-    enough away.
+    """Return the shift (dx, dy) that moves a puck to a distance from the point (x, y), m.
+
+    Returns:
+        The shift; None if the puck is at least that far away.
     """
     dx, dy = puck.x - x, puck.y - y
     current = math.hypot(dx, dy)
@@ -253,11 +267,11 @@ _LIFT_HEIGHT = 0.08  # m
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """The goal of an instruction; `target` is the colour of a pad, or of the puck to stack on."""
+    """The goal of an instruction."""
 
     task: Task
-    puck: str
-    target: str | None = None
+    puck: str  # colour of the puck
+    target: str | None = None  # colour of the pad, or of the puck to stack on
 
     @property
     def instruction(self) -> str:
@@ -278,9 +292,7 @@ class Goal:
         return at_pad and not (self.task == "slide" and puck.lifted)
 
     def target_position(self, world: TabletopWorld) -> tuple[float, float, float]:
-        """Return the target of the centre of the puck's underside: x, y, z in m, in the base
-        frame.
-        """
+        """Return the target of the centre of the puck's underside in the base frame, x, y, z, m."""
         if self.target is None:
             puck = world.puck(self.puck)
             return puck.x, puck.y, _LIFT_HEIGHT
@@ -309,8 +321,14 @@ def goals(world: TabletopWorld, task: Task) -> list[Goal]:
 def draw_episode(
     task: Task, rng: np.random.Generator, pucks: int = PUCKS
 ) -> tuple[TabletopWorld, Goal]:
-    """Draw a scene with `pucks` pucks, and a goal; a slide is drawn only if no puck is in its
-    way.
+    """Draw a scene and a goal.
+
+    A goal of the task "slide" is drawn only if no other puck is in the way.
+
+    Args:
+        task: The task of the goal.
+        rng: Determines the scene and the goal.
+        pucks: The number of pucks.
     """
     while True:
         world = _draw_scene(rng, pucks)
@@ -360,14 +378,14 @@ def _draw_positions(rng: np.random.Generator, count: int) -> list[tuple[float, f
 
 
 def _is_clear(world: TabletopWorld, goal: Goal) -> bool:
-    """Return whether no other puck is on the way of a slide."""
+    """Return whether no other puck is in the way of a slide."""
     start, end = world.puck(goal.puck), world.pad(goal.target or "")
     dx, dy = end.x - start.x, end.y - start.y
     length = math.hypot(dx, dy)
     for other in world.pucks:
         if other is start:
             continue
-        # The nearest point of the way to the other puck, as a share of the way.
+        # The point of the slide that is nearest to the other puck, as a share of the slide.
         share = ((other.x - start.x) * dx + (other.y - start.y) * dy) / length**2
         share = _clip(share, (0.0, 1.0))
         x, y = start.x + share * dx, start.y + share * dy
