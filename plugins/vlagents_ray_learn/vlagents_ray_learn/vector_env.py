@@ -264,7 +264,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
                 f"{_RESET_MASK}: expected a bool array of shape {shape}, true somewhere, got "
                 f"{mask!r}"
             )
-        return mask
+        selected: np.ndarray = mask
+        return selected
 
     def step(
         self, actions: np.ndarray
