@@ -1,5 +1,6 @@
-"""The wrapper that makes a policy's relative actions absolute, by the state from which their
-chunk was computed.
+"""The wrapper that makes a policy's relative actions absolute.
+
+It adds the state from which a chunk was computed.
 """
 
 from __future__ import annotations
@@ -43,12 +44,13 @@ class AbsoluteActionsConfig(BaseModel, extra="forbid"):
 class AbsoluteActions(Wrapper):
     """Adds the state of an observation to all rows of the chunk that a policy computes from it.
 
-    Afterwards rows of several chunks have one meaning, however late each arrives: they can be
+    Rows of several chunks then have the same meaning, however late each chunk arrives: they can be
     merged, delayed and continued. A leftover plan, which is absolute, is made relative to the state
-    of the new observation. Policies of LeRobot, openpi and GR00T do this by their checkpoints' own
-    processors. The wrapper is for any other policy that was trained with actions relative to the
-    state at the beginning of a chunk; not for actions that are each relative to the pose before,
-    such as LIBERO's.
+    of the new observation.
+
+    The checkpoints of LeRobot, openpi and GR00T have processors that do this. The wrapper is for
+    any other policy that was trained with actions relative to the state at the beginning of a
+    chunk. It is not for actions that are each relative to the pose before, such as LIBERO's.
 
     Args:
         agent: The policy, with whole chunks of relative actions that add up with states: joints or
@@ -75,24 +77,25 @@ class AbsoluteActions(Wrapper):
 
     @property
     def contract(self) -> Contract | None:
-        """The contract of the policy, with absolute actions and the parts of the state that they
-        need.
-        """
-        inner, parts = self.agent.contract, self.config.state
+        """The contract of the policy, with absolute actions and the state that they need."""
+        inner, state_names = self.agent.contract, self.config.state
         if inner is None:
             return None
         dim = inner.action.dim
-        state = state_specs(parts, None if dim is None else dim - len(self.config.absolute))
+        relative_dim = None if dim is None else dim - len(self.config.absolute)
+        state = state_specs(state_names, relative_dim)
         return replace(
             inner,
             state=state | dict(inner.state or {}),
-            gripper=needs_gripper(parts) or inner.gripper,
+            gripper=needs_gripper(state_names) or inner.gripper,
             action=replace(inner.action, delta=False),
         )
 
     def initialize(self) -> None:
-        """Initialize the policy; raises `ConfigError` if its actions are not relative to a
-        state.
+        """Initialize the policy.
+
+        Raises:
+            ConfigError: The actions of the policy are not relative to a state.
         """
         super().initialize()
         inner = self.agent.contract
@@ -131,12 +134,15 @@ class AbsoluteActions(Wrapper):
         return absolute
 
     def _with_relative_plan(self, obs: Obs) -> Obs:
+        """Return an observation whose leftover plan, if any, is relative to its state."""
         if obs.info.get(LEFTOVER) is None:
             return obs
         plan = leftover_plan(obs, self.agent.contract)
-        return replace(obs, info={**obs.info, LEFTOVER: plan - self._origin(obs, plan.shape[-1])})
+        relative_plan = plan - self._origin(obs, plan.shape[-1])
+        return replace(obs, info={**obs.info, LEFTOVER: relative_plan})
 
     def _absolute(self, obs: Obs, act: Act) -> Act:
+        """Return an answer with the state of its observation added to all actions."""
         origin = self._origin(obs, act.action.shape[-1])
         info = act.info
         if DISTRIBUTION in info:
@@ -148,8 +154,9 @@ class AbsoluteActions(Wrapper):
         return Act(act.action + origin, act.done, info)
 
     def _origin(self, obs: Obs, dim: int) -> np.ndarray:
-        """Return the pose to which actions are relative, (dim,) float32; zeros in absolute
-        columns.
+        """Return the state to which actions are relative, (dim,) float32.
+
+        Absolute columns are zeros.
         """
         outside = [column for column in self.config.absolute if not -dim <= column < dim]
         if outside:

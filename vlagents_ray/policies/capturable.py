@@ -12,18 +12,18 @@ _COPIES = (torch.tensor, torch.as_tensor, torch.Tensor.to, torch.Tensor.cuda)
 
 
 class Capturable(TorchFunctionMode):  # type: ignore[misc]
-    """A core whose later calls use the tensors that its first call copied from the host, as no
-    capture may do that.
+    """A core whose later calls reuse the tensors that its first call copied from the host.
 
-    They are the same in each call, as a core depends on nothing but its arguments, and are found by
-    their order. Casts of weights by `autocast` are not cached, as the cache ends with its context,
-    and the graph does not.
+    A capture may not copy from the host. The copies are the same in each call, because a core
+    depends on nothing but its arguments. They are identified by their order. Casts of weights by
+    `autocast` are not cached: the cache ends with its context, while the graph continues to exist.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__()
         self._function, self._calls = function, 0
-        self._copied: list[Any] = []  # results of `_COPIES`; None: it was no copy from the host
+        # The results of calls of `_COPIES`; None if a call did not copy from the host.
+        self._copied: list[Any] = []
 
     def __call__(self, *tensors: Any) -> Any:
         cached, self._calls = torch.is_autocast_cache_enabled(), 0

@@ -1,6 +1,4 @@
-"""Wrappers, which change the observations of any policy, and the construction of a policy with
-its wrappers.
-"""
+"""Wrappers, which change the observations of a policy, and the construction of wrapped policies."""
 
 from __future__ import annotations
 
@@ -18,8 +16,8 @@ from vlagents_ray.settings import wrong_settings
 class Wrapper(Agent):
     """An agent that passes changed observations to an inner agent.
 
-    `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of
-    the inner agent.
+    `Config` and `shared` have the same meaning as for any agent. Each session has a copy of the
+    wrapper and of the inner agent.
 
     Args:
         agent: The inner agent.
@@ -31,8 +29,14 @@ class Wrapper(Agent):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap an agent with the wrapper's settings from the deployment file; raises
-        `ConfigError` if any is wrong.
+        """Wrap an agent.
+
+        Args:
+            agent: The inner agent.
+            settings: The settings of the wrapper in the deployment file.
+
+        Raises:
+            ConfigError: A setting is wrong.
         """
         try:
             if cls.Config is None and not settings:
@@ -43,19 +47,21 @@ class Wrapper(Agent):
             raise ConfigError(f"wrapper {cls.__name__}: {message}") from error
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Begin an episode with its first observation; returns the observation for the inner
-        agent.
-        """
+        """Begin an episode with its first observation, and return that of the inner agent."""
         return obs
 
     def change_batch(
         self, obs: Sequence[Obs], sessions: Sequence[Wrapper]
     ) -> list[Obs | Exception]:
-        """Change an observation of each session, given the sessions' copies of the wrapper.
+        """Change an observation of each session.
+
+        Args:
+            obs: The observations.
+            sessions: The copy of the wrapper of each session.
 
         Returns:
-            The observations for the inner agent; an exception in the place of one fails that
-            session's request alone.
+            The observations for the inner agent. An exception instead of an observation is the
+            result of that session's request; the other requests continue.
         """
         return list(obs)
 
@@ -92,8 +98,9 @@ class Wrapper(Agent):
         self.agent.observe(changed)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Change the observations, and compute the inner agent's actions for those without an
-        exception.
+        """Change the observations, and compute the inner agent's actions.
+
+        Observations that could not be changed have an exception as their result.
         """
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         inner_sessions = []
@@ -124,11 +131,20 @@ def build_agent(
     config: Mapping[str, Any],
     wrappers: Sequence[str | Mapping[str, Mapping[str, Any]]] = (),
 ) -> Agent:
-    """Make a policy, named or "module:Class", with its wrappers; raises `ConfigError` for a wrong
-    name or setting.
+    """Make a policy with its wrappers.
 
-    Wrappers are names, or {name: settings}; the first is the outermost one, which receives the
-    robot's observations and is returned.
+    Args:
+        policy: A registered name, or "module:Class".
+        config: The settings of the policy.
+        wrappers: Names, or {name: settings}. The first one is the outermost wrapper, which receives
+            the robot's observations.
+
+    Returns:
+        The outermost wrapper, or the policy.
+
+    Raises:
+        UnknownPolicy: There is no such policy.
+        ConfigError: A setting or the name of a wrapper is wrong.
     """
     cls = policy_class(policy)
     if not issubclass(cls, Agent):
@@ -151,7 +167,7 @@ def build_agent(
 
 
 def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrapper:
-    """Return an agent within the wrapper of one entry: a name, or {name: settings}."""
+    """Return an agent in the wrapper that an entry describes: a name, or {name: settings}."""
     settings_by_name = {entry: {}} if isinstance(entry, str) else dict(entry)
     if len(settings_by_name) != 1:
         raise ConfigError(
@@ -170,8 +186,10 @@ def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrap
 
 
 def _example_of(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> str:
-    """Return the end of a message that names a file and a page with the settings that `config`
-    lacks, if any.
+    """Return the end of an error message: where to find examples of missing settings.
+
+    Returns:
+        A sentence that names a file and a page; empty if `config` lacks no setting.
     """
     fields = getattr(cls.Config, "model_fields", {})
     missing = any(field.is_required() and name not in config for name, field in fields.items())
@@ -182,15 +200,15 @@ def _example_of(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> str
     if "://" in page:
         return f". {page} explains it"
     file, _, section = page.partition("#")
-    where = f"docs/policies/{file}.md" + (f"#{section}" if section else "")
+    docs_page = f"docs/policies/{file}.md" + (f"#{section}" if section else "")
     return (
         f". deployments/{entry.deployment or policy}.yaml of a checkout has an example, and "
-        f"{where} explains it"
+        f"{docs_page} explains it"
     )
 
 
 def unloaded_contract(agent: Agent) -> Contract | None:
-    """Return the contract of a policy that is not loaded; None if it cannot state one yet."""
+    """Return the contract of a policy that is not loaded; None if it is known only later."""
     try:
         return agent.contract
     except Exception:  # noqa: BLE001 - a policy may raise any error before `initialize`

@@ -1,5 +1,6 @@
-"""The rows of a model, and their inputs from an observation: cameras, state vector, and requests
-in `Obs.info`.
+"""The rows of a model's batch, and their inputs.
+
+The inputs are read from observations: cameras, the state vector, and requests in `Obs.info`.
 """
 
 from __future__ import annotations
@@ -21,23 +22,24 @@ from vlagents_ray.registry import require
 T = TypeVar("T")
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
-CLOSED = "gripper_closed"  # the part that is the closedness: 1 - `Obs.gripper`
-KEPT = 256  # cached instructions with their tokens: more than a server has tasks
-# Characters of a cached instruction, which clients choose: the cache takes at most about 10 MB.
+CLOSED = "gripper_closed"  # the part of the state that is 1 - `Obs.gripper`
+KEPT = 256  # number of cached instructions with their tokens, which is more than a server needs
+# Longest cached instruction, characters. Clients choose them; the cache needs about 10 MB at most.
 KEPT_CHARACTERS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One chunk to compute: the session's own, or a sample of its distribution."""
+    """One chunk to compute: the answer to a session, or a sample of its distribution."""
 
     # The results of `ModelPolicy.perceive` for the last observations, oldest first.
     frames: tuple[Any, ...]
     instruction: str
-    rng: np.random.Generator  # of the session, so that other rows have no influence
+    rng: np.random.Generator  # the session's, so that other rows have no influence
     # (H', D) float32, real-time chunking: see LEFTOVER in the interface.
     leftover: np.ndarray | None = None
-    delay: int = 0  # DELAY: the number of first rows of the chunk that are the leftover's
+    # The number of the chunk's first rows that are those of the leftover: see DELAY.
+    delay: int = 0
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # The session's memory, for families that store more than frames.
     memory: dict[str, Any] = field(default_factory=dict)
@@ -45,7 +47,7 @@ class Row:
     # Whether the chunk is drawn from the distribution, as samples and requested outputs need it;
     # otherwise it is the likeliest one.
     sample: bool = False
-    # Fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: no adapter.
+    # Fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty without an adapter.
     adapter: str = ""
 
     def noise(self, *shape: int) -> np.ndarray:
@@ -53,21 +55,21 @@ class Row:
         return self.rng.standard_normal(shape, dtype=np.float32)
 
     def history(self, length: int) -> tuple[Any, ...]:
-        """Return the last `length` frames; at the beginning of an episode, repeat its first one."""
+        """Return the last `length` frames; if there are fewer, the first frame is repeated."""
         return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
 
 
 def drawn(row: Row, draws: np.random.Generator) -> Row:
-    """Return the row with noise and memory that are separate from the session's."""
+    """Return a row for a sample, with a generator and a memory separate from the session's."""
     return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)
 
 
 def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-    """Return the rows to encode: the samples of a session share the observations of its row.
+    """Return which rows to encode: the samples of a session share the observations of its row.
 
     Returns:
         The indices of rows with distinct observations, and for each row the index of its
-        observations among them.
+        observations among these.
     """
     owners: dict[int, int] = {}
     firsts: list[int] = []
@@ -81,11 +83,15 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
 def choose_cameras(
     chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]
 ) -> dict[str, str]:
-    """Map the model's name of each camera to the observation's: `chosen`, or the family's usual
-    mapping.
+    """Map the model's name of each camera to the name in observations.
 
-    `known` are the model's cameras, in the order of the result. An unknown or missing camera raises
-    `ConfigError`; it is never replaced by zeros.
+    Args:
+        chosen: The mapping in the policy's settings; None selects `usual`.
+        usual: The usual mapping of the model's family.
+        known: The model's cameras, in the order of the result.
+
+    Raises:
+        ConfigError: A camera is unknown or missing. It is never replaced by zeros.
     """
     mapping = usual if chosen is None else chosen
     if set(mapping) != set(known):
@@ -106,14 +112,19 @@ def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]
 
 
 def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.ndarray:
-    """Return parts of the proprioception as one new (dim,) float32 vector.
+    """Return parts of the proprioception as one new vector.
 
     Args:
+        obs: The observation.
         parts: The names of the parts in order; `GRIPPER` and `CLOSED` select `Obs.gripper`.
-        dim: The length of the vector; None accepts any.
+        dim: The length of the vector; None accepts any length.
+
+    Returns:
+        (dim,) float32.
 
     Raises:
-        MissingState, InvalidObservation: A part is missing, or the length is wrong.
+        MissingState: A part is missing.
+        InvalidObservation: The gripper is missing, or the length is wrong.
     """
     values = []
     for name in parts:
@@ -144,8 +155,11 @@ def needs_gripper(parts: Sequence[str]) -> bool:
 
 
 def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, StateSpec]:
-    """Return the states of a contract: the parts, and the length of a part that is the whole
-    vector.
+    """Return the state of a contract.
+
+    Args:
+        parts: The parts of a state vector, as for `state_vector`.
+        dim: The length of the vector, which is that of its part if there is only one.
     """
     names = [name for name in parts if name not in (GRIPPER, CLOSED)]
     is_whole_vector = list(parts) == names and len(names) == 1
@@ -153,8 +167,10 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
-    """Return the number of samples that an observation requests; raises `InvalidObservation` if
-    the policy does not offer so many.
+    """Return the number of samples that an observation requests.
+
+    Raises:
+        InvalidObservation: The policy does not offer so many samples.
     """
     samples = count_in(obs, SAMPLES)
     if samples > config.max_samples:
@@ -171,7 +187,7 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
 
 
 def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
-    """Return the names of the extra outputs that an observation requests beside the action."""
+    """Return the names of the outputs that an observation requests besides the action."""
     if WANT not in obs.info:
         return ()
     if obs.info.get(LEFTOVER) is not None:
@@ -189,18 +205,20 @@ def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
     try:
         plan = np.array(leftover, np.float32)
     except (TypeError, ValueError):
-        plan = np.zeros(0, np.float32)  # Values that are no numbers are rejected below.
+        plan = np.zeros(0, np.float32)  # values that are not numbers are rejected below
     if plan.ndim != 2 or dim not in (None, plan.shape[1]) or not np.isfinite(plan).all():
-        kind = leftover.shape if isinstance(leftover, np.ndarray) else type(leftover).__name__
+        content = leftover.shape if isinstance(leftover, np.ndarray) else type(leftover).__name__
         raise InvalidObservation(
-            f"info[{LEFTOVER!r}]: got {kind}, want (H, {dim or 'D'}) finite float32"
+            f"info[{LEFTOVER!r}]: got {content}, want (H, {dim or 'D'}) finite float32"
         )
     return plan
 
 
 def count_in(obs: Obs, name: str) -> int:
-    """Return a number in an observation's info, by default 0; raises `InvalidObservation` if it
-    is no int from 0.
+    """Return a number in an observation's info, 0 if it is missing.
+
+    Raises:
+        InvalidObservation: The value is not an int, or it is negative.
     """
     value = obs.info.get(name) or 0
     if not isinstance(value, int | np.integer) or value < 0:
@@ -209,21 +227,30 @@ def count_in(obs: Obs, name: str) -> int:
 
 
 def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale the whole (H, W, 3) uint8 image and centre it on black (height, width, 3); always
-    returns a copy.
+    """Scale a whole image to fit into a size, and pad it with black.
 
-    Bilinear, by Pillow, and rounded as in openpi's `image_tools.resize_with_pad`, which produced
-    the training images of its policies.
+    Pillow's bilinear interpolation is used, with the rounding of openpi's
+    `image_tools.resize_with_pad`, which produced the training images of openpi's policies.
+
+    Args:
+        image: (H, W, 3) uint8.
+        height: Height of the result, px.
+        width: Width of the result, px.
+
+    Returns:
+        A new array, (height, width, 3) uint8, with the scaled image in its centre.
     """
     have_height, have_width = image.shape[:2]
     if (have_height, have_width) == (height, width):
         return image.copy()
+
     ratio = max(have_width / width, have_height / height)
     inner_height, inner_width = max(1, int(have_height / ratio)), max(1, int(have_width / ratio))
     pil = require("PIL.Image")
     small = pil.fromarray(np.ascontiguousarray(image)).resize(
         (inner_width, inner_height), pil.Resampling.BILINEAR
     )
+
     padded = np.zeros((height, width, 3), np.uint8)
     top, left = (height - inner_height) // 2, (width - inner_width) // 2
     padded[top : top + inner_height, left : left + inner_width] = small
@@ -231,8 +258,15 @@ def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def keeping_tokens(tokenize: Callable[[str], T]) -> Callable[[str], T]:
-    """Return `tokenize` with a cache of its results for recent instructions, except for very
-    long ones.
+    """Return `tokenize` with a cache of its results for recent instructions.
+
+    Very long instructions are not cached.
     """
-    cached = lru_cache(maxsize=KEPT)(tokenize)
-    return lambda text: cached(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)
+    cached_tokenize = lru_cache(maxsize=KEPT)(tokenize)
+
+    def tokenize_with_cache(text: str) -> T:
+        if len(text) > KEPT_CHARACTERS:
+            return tokenize(text)
+        return cached_tokenize(text)
+
+    return tokenize_with_cache

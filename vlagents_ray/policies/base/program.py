@@ -1,6 +1,4 @@
-"""Digests of the files of a policy or an environment: the code of its class, and the files in
-its settings.
-"""
+"""Digests of the files of a policy or an environment: its code, and the files in its settings."""
 
 from __future__ import annotations
 
@@ -21,28 +19,26 @@ from typing import Any
 from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, files_in
 
-# Its classes are identified by the version of this package, which results record.
+# Classes of this package are identified by its version, which results record.
 _PACKAGE = "vlagents_ray"
-_LIBRARIES = tuple(
-    Path(sysconfig.get_path(name)).resolve()
-    for name in ("stdlib", "platstdlib", "purelib", "platlib")
-)
+_LIBRARY_NAMES = ("stdlib", "platstdlib", "purelib", "platlib")
+_LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in _LIBRARY_NAMES)
 _SITES = {"site-packages", "dist-packages"}
-# Largest number of files of a folder with their own digests; a larger folder has a single one.
+# A folder with at most this many files has a digest for each of them; a larger one has one digest.
 _LISTED = 32
-_LONGEST = 4096  # characters of a path
+_LONGEST = 4096  # characters of the longest path
 
-Program = dict[str, str]  # digest, or the version of an installed package, by name
+Program = dict[str, str]  # name -> digest, or the version of an installed package
 
 
 def code_of_class(target: str) -> Program:
-    """Return the digests of the module of "module:Class", and of all modules that it imports,
-    directly or indirectly.
+    """Return the digests of the module of a class, and of all modules that it imports.
 
-    Modules are found as Python's `import` would find them, but nothing is imported: import
-    statements are read from the source, including those within functions. Installed packages and
-    the standard library do not count. A class in an installed package is identified by the version
-    of its distribution; a class of this package has no entry.
+    Modules that are imported indirectly are included. They are found as Python's `import` would
+    find them, but nothing is imported: import statements are read from the source, including those
+    in functions. Installed packages and the standard library are not included. A class in an
+    installed package is identified by the version of its distribution. A class of this package has
+    no entry.
 
     Args:
         target: "module:Class" or "module".
@@ -57,14 +53,14 @@ def code_of_class(target: str) -> Program:
         return {}
 
     digests: Program = {}
-    waiting, visited = [module], set()
-    while waiting:
-        name = waiting.pop()
+    pending, visited = [module], set()
+    while pending:
+        name = pending.pop()
         if name in visited:
             continue
         visited.add(name)
         if "." in name:
-            waiting.append(name.rpartition(".")[0])  # A package is executed before its modules.
+            pending.append(name.rpartition(".")[0])  # a package is executed before its modules
 
         file = _file(name)
         if file is None or not _is_own(file):
@@ -74,7 +70,7 @@ def code_of_class(target: str) -> Program:
         folder = Path(*package.split(".")) if package else Path()
         digests[(folder / file.name).as_posix()] = f"sha256:{hashlib.sha256(content).hexdigest()}"
         if file.suffix == ".py":
-            waiting += _imports(content, package)
+            pending += _imports(content, package)
 
     if digests or top == "__main__":
         return digests
@@ -82,26 +78,28 @@ def code_of_class(target: str) -> Program:
     return {name: f"version {version(name)}" for name in distributions}
 
 
-# Takes half a second, since it reads the list of files of each installed package, and runs for each
-# env.
+# A call takes half a second, since it reads the list of files of each installed package.
 _distributions = functools.cache(packages_distributions)
 
 
 loaded_code = functools.cache(code_of_class)
-"""`code_of_class` with the result of the first call in this process: later edits do not change
-running code.
+"""`code_of_class` with the result of the first call in this process.
+
+Later edits of the files do not change the code that is running.
 """
 
 
 def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program:
-    """Return the digests of the files that settings name, by setting and path: "checkpoint:
-    runs/a/w.npz".
+    """Return the digests of the files that settings name.
 
     Args:
-        settings: Each text that is the path of an existing file or folder counts, with `{step}`
-            replaced by the setting `checkpoint_step`.
-        folders: Whether the files of folders count. A folder that holds the working directory never
-            does.
+        settings: Each text that is the path of an existing file or folder is included, after
+            `{step}` has been replaced by the setting `checkpoint_step`.
+        folders: Whether the files of folders are included. A folder that contains the working
+            directory never is.
+
+    Returns:
+        Setting and path, such as "checkpoint: runs/a/w.npz" -> digest.
     """
     step = settings.get("checkpoint_step")
     digests: Program = {}
@@ -120,12 +118,12 @@ def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program
 
 def digest_of(files: Program) -> str:
     """Return one digest for all these files, independent of their paths on this machine."""
-    parts = json.dumps(list(files.values())).encode()
-    return f"{METHOD}:{hashlib.sha256(parts).hexdigest()}"
+    digests = json.dumps(list(files.values())).encode()
+    return f"{METHOD}:{hashlib.sha256(digests).hexdigest()}"
 
 
 def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `settings` over the defaults of the class's `Config` or of its constructor."""
+    """Return settings, and the defaults of the class's `Config` and constructor for the others."""
     fields = getattr(getattr(cls, "Config", None), "model_fields", {})
     defaults = {name: field.default for name, field in fields.items()}
     parameters = inspect.signature(cls.__init__).parameters.values()
@@ -136,8 +134,10 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that `import name` would execute; None if there is none, or if it is
-    installed.
+    """Return the file that `import name` would execute.
+
+    Returns:
+        The file; None if there is none, or if it is in an installed package.
     """
     if name == "__main__":
         path = getattr(sys.modules[name], "__file__", None)
@@ -149,14 +149,16 @@ def _file(name: str) -> Path | None:
 
 
 def _spec(name: str) -> ModuleSpec | None:
-    """Return the spec of a module without importing its packages; None for a module in an
-    installed package, or a missing one.
+    """Return the spec of a module without importing its packages.
+
+    Returns:
+        The spec; None if there is no such module, or if it is in an installed package.
     """
     parent, _, _ = name.rpartition(".")
     if not parent:
         try:
-            return find_spec(name)  # It imports nothing, since the name has no parent.
-        except (ImportError, ValueError):  # The module has no spec.
+            return find_spec(name)  # imports nothing, since the name has no parent
+        except (ImportError, ValueError):  # the module has no spec
             return None
 
     package = _spec(parent)
@@ -168,8 +170,9 @@ def _spec(name: str) -> ModuleSpec | None:
 
 
 def _is_own(file: Path) -> bool:
-    """Return whether a file is outside of installed packages, this package and the standard
-    library.
+    """Return whether a file belongs to the user.
+
+    Other files are in installed packages, in this package or in the standard library.
     """
     path = file.resolve()
     if _SITES & set(path.parts):
@@ -179,8 +182,11 @@ def _is_own(file: Path) -> bool:
 
 
 def _imports(source: bytes, package: str) -> Iterator[str]:
-    """Yield the full names of the modules that a source may import; `package` is the package of
-    the source.
+    """Yield the full names of the modules that a source may import.
+
+    Args:
+        source: The code of a module.
+        package: The package of the module.
     """
     try:
         tree = ast.parse(source)
@@ -204,17 +210,19 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
 
 
 def _texts(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the texts in nested settings, each with the dotted name of its setting."""
     if isinstance(value, str | Path):
         yield name, str(value)
     elif isinstance(value, Mapping):
-        for key, below in value.items():
-            yield from _texts(below, f"{name}.{key}" if name else str(key))
+        for key, nested in value.items():
+            yield from _texts(nested, f"{name}.{key}" if name else str(key))
     elif isinstance(value, list | tuple):
-        for below in value:
-            yield from _texts(below, name)
+        for nested in value:
+            yield from _texts(nested, name)
 
 
 def _existing(text: str) -> Path | None:
+    """Return the path that a text names; None if there is no such file or folder."""
     if not text.strip() or len(text) > _LONGEST or STEP in text or not text.isprintable():
         return None
     try:

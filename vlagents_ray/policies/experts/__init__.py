@@ -35,8 +35,10 @@ class Expert(Protocol):
 
 
 def expert_class(env_name: str) -> type[Expert]:
-    """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is
-    none.
+    """Return the expert for an env, e.g. "tabletop/slide".
+
+    Raises:
+        ContractMismatch: There is no expert for this env.
     """
     target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
     if target is None:
@@ -51,13 +53,25 @@ def expert_class(env_name: str) -> type[Expert]:
 def sim_vector(
     obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images"
 ) -> np.ndarray:
-    """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if
-    there is none.
+    """Return `info["sim_state"]` of an observation.
+
+    Args:
+        obs: The observation.
+        size: The expected length.
+        env_name: The name of the env, for errors.
+        cure: The end of the error message.
+
+    Returns:
+        (`size`,).
+
+    Raises:
+        InvalidObservation: The observation has no such state.
     """
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
-        kind = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+        content = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
         raise InvalidObservation(
-            f"info['sim_state']: got {kind}, want ({size},), as the env {env_name} gives it; {cure}"
+            f"info['sim_state']: got {content}, want ({size},), as the env {env_name} gives it; "
+            f"{cure}"
         )
     return state

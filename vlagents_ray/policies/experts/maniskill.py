@@ -13,9 +13,9 @@ _CURE = "this expert is for the env's own robot, in the control mode pd_ee_delta
 
 
 class _CubeExpert:
-    """Moves the tool in phases, of which "over" is the first."""
+    """Moves the tool in phases; the first phase is "over"."""
 
-    _SIZE: int  # of the simulator's state
+    _SIZE: int  # length of the simulator's state
 
     def __init__(self, env_name: str) -> None:
         self._name, self._phase, self._closing, self._hand = env_name, "over", 0, _Hand()
@@ -29,13 +29,11 @@ class _CubeExpert:
 
 
 class PushCube(_CubeExpert):
-    """Moves around and behind the cube, down to the table, and pushes it along x onto the
-    target.
-    """
+    """Moves behind the cube and down to the table, and pushes the cube along x onto the target."""
 
     _SIZE = 35
     _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
-    _OVER_M = 0.15  # height of the tool on the way there, clear of the cube
+    _OVER_M = 0.15  # height of the tool before that, above the cube
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
     _FAR_M = 0.28  # distance of the target from the centre of the table, along x
     _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
@@ -73,8 +71,8 @@ class PickCube(_CubeExpert):
 
     _SIZE = 42
     _OVER_M = 0.08  # height of the tool over the cube before it descends
-    _GRASP_STEPS = 3  # until the fingers hold the cube
-    _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
+    _GRASP_STEPS = 3  # steps until the fingers hold the cube
+    _GIVE_UP_STEPS = 8  # steps without contact on both fingers, after which it tries again
 
     def act(self, obs: Obs) -> Act:
         """Return the next action of the pick, (7,)."""
@@ -115,8 +113,13 @@ class _Hand:
         self._scale = 1.0
 
     def move(self, tool: np.ndarray, target: np.ndarray, gripper: float, limit: float = 1.0) -> Act:
-        """Return an action from `tool` towards `target`, (3,) m, of at most `limit` units along
-        each axis.
+        """Return an action that moves the tool towards a target.
+
+        Args:
+            tool: The position of the tool, (3,) m.
+            target: The target position, (3,) m.
+            gripper: The command of the gripper.
+            limit: The largest command along each axis, units.
         """
         moved_m = np.inf if self._at is None else float(np.linalg.norm(tool - self._at))
         stuck = moved_m < self._STUCK_M and self._commanded_m > 10 * self._STUCK_M

@@ -1,8 +1,8 @@
-"""An expert for the tabletop that uses only the camera image, the gripper's proprioception and the
-instruction.
+"""An expert for the tabletop that uses the image, the proprioception and the instruction.
 
-Like a calibrated robot cell, it knows the pose of the camera (see `vlagents_ray.envs.tabletop`) and
-the height of a puck. It locates objects in the image.
+It does not read the state of the simulator. As in a calibrated robot cell, the pose of the camera
+(see `vlagents_ray.envs.tabletop`) and the height of a puck are known, and objects are located in
+the image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState,
 from vlagents_ray.interface import Act, Obs
 
 _VIEW = 0.66  # m, along the image's shorter side
-_UP, _DEEP = math.sin(math.radians(70)), math.cos(math.radians(70))
+# Factors that project lengths along y and along z onto the image's vertical axis.
+_Y_FACTOR, _Z_FACTOR = math.sin(math.radians(70)), math.cos(math.radians(70))
 _METRES_PER_UNIT = 0.03
 
 _HUES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}  # degrees
@@ -30,7 +31,7 @@ _PUCK_REACH, _PAD_REACH = 0.034, 0.06
 _TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
 _AWAY = (0.0, 0.20, 0.16)  # m, a position in which the gripper occludes no objects
 _ARRIVED = 0.003  # m, tolerance of reached positions
-_HOLDING = 0.4  # fingers with a larger opening hold a puck
+_HOLDING = 0.4  # closed fingers with a larger opening hold a puck
 _OPEN, _CLOSED = 1.0, -1.0
 
 _INSTRUCTIONS = {
@@ -43,17 +44,17 @@ _INSTRUCTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """Go to `xyz` m with the gripper's command at `grip`, then stay for `wait` steps."""
+    """A position of the fingertips, and what to do there."""
 
-    xyz: tuple[float, float, float]
-    grip: float
-    wait: int = 0
-    grasps: bool = False  # a puck must be held when this waypoint is left
-    looks: bool = False  # take a new image and plan again at this waypoint
+    xyz: tuple[float, float, float]  # m
+    grip: float  # command of the gripper
+    wait: int = 0  # steps to stay at the position
+    grasps: bool = False  # whether a puck must be held when this waypoint is left
+    looks: bool = False  # whether to plan again from a new image
 
 
 class TabletopExpert:
-    """Plans waypoints from one image and follows them; plans again after a failed grasp."""
+    """Plans waypoints from one image and follows them. After a failed grasp, it plans again."""
 
     def __init__(self, env_name: str) -> None:
         self._env_name = env_name
@@ -89,7 +90,7 @@ class TabletopExpert:
             self._waited += 1
 
         offset = (np.array(self._plan[0].xyz) - position) / _METRES_PER_UNIT
-        # Scaled as a whole, to stay on the straight line.
+        # All axes are scaled by the same factor, to stay on the straight line.
         offset /= max(1.0, float(np.abs(offset).max()))
         return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
 
@@ -105,12 +106,21 @@ class TabletopExpert:
         return plan_so_far[1:]
 
     def _has_arrived(self, position: np.ndarray) -> bool:
+        """Return whether the fingertips are at the first waypoint of the plan."""
         return bool(np.abs(np.array(self._plan[0].xyz) - position).max() < _ARRIVED)
 
 
 def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
-    """Plan waypoints that fulfil an instruction in the scene of an image, (H, W, 3) uint8."""
-    kind, puck, target = _parse(instruction)
+    """Plan waypoints that fulfil an instruction.
+
+    Args:
+        image: The image of the scene, (H, W, 3) uint8.
+        instruction: An instruction of the tabletop.
+
+    Raises:
+        InvalidObservation: The instruction is unknown, or an object is not in the image.
+    """
+    task, puck, target = _parse(instruction)
     objects = _ColouredObjects(image)
     x, y = objects.puck(puck)
     grasp = [
@@ -118,26 +128,35 @@ def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
         Waypoint((x, y, _GRASP_Z), _OPEN),
         Waypoint((x, y, _GRASP_Z), _CLOSED, wait=2, grasps=True),
     ]
-    if kind == "lift":
+    if task == "lift":
         return [*grasp, Waypoint((x, y, 0.13), _CLOSED, wait=1)]
 
-    to_x, to_y = objects.puck(target) if kind == "stack" else objects.pad(target)
-    low = _GRASP_Z + (_PUCK_HEIGHT + 0.003 if kind == "stack" else 0.0)
+    if task == "stack":
+        to_x, to_y = objects.puck(target)
+        low = _GRASP_Z + (_PUCK_HEIGHT + 0.003)
+    else:
+        to_x, to_y = objects.pad(target)
+        low = _GRASP_Z
     carry = [Waypoint((x, y, _TRAVEL_Z), _CLOSED), Waypoint((to_x, to_y, _TRAVEL_Z), _CLOSED)]
-    return [
-        *grasp,
-        *([] if kind == "slide" else carry),
+    place = [
         Waypoint((to_x, to_y, low), _CLOSED),
         Waypoint((to_x, to_y, low), _OPEN, wait=2),
         Waypoint((to_x, to_y, _TRAVEL_Z), _OPEN),
     ]
+    if task == "slide":
+        return [*grasp, *place]
+    return [*grasp, *carry, *place]
 
 
 def _parse(instruction: str) -> tuple[str, str, str]:
-    for kind, pattern in _INSTRUCTIONS.items():
+    """Return the task, the colour of the puck, and the colour of the target.
+
+    The target of a lift is the puck itself.
+    """
+    for task, pattern in _INSTRUCTIONS.items():
         match = pattern.fullmatch(instruction.strip().lower().rstrip("."))
         if match and all(colour in _HUES for colour in match.groups()):
-            return kind, match[1], match[match.re.groups]
+            return task, match[1], match[match.re.groups]
     raise InvalidObservation(
         f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the "
         f"blue pad', 'slide ... onto ...', 'stack ...' or 'lift ...', with colours of "
@@ -146,17 +165,20 @@ def _parse(instruction: str) -> tuple[str, str, str]:
 
 
 class _ColouredObjects:
-    """The coloured objects in an image, in metres on the table."""
+    """The positions on the table of the coloured objects in an image."""
 
     def __init__(self, image: np.ndarray) -> None:
+        """Find the coloured pixels of an image, (H, W, 3) uint8, with their hue and saturation."""
         height, width = image.shape[:2]
         self._centre = (width / 2, height / 2)
         self._scale = min(width, height) / _VIEW  # px/m
+
         red, green, blue = (image[..., i].astype(np.float32) for i in range(3))
         brightest = np.maximum(np.maximum(red, green), blue)
         chroma = brightest - np.minimum(np.minimum(red, green), blue)
         rows, columns = np.nonzero((brightest > 50) & (chroma > _PASTEL[0] * brightest))
-        self._u, self._v = columns + 0.5, rows + 0.5
+        self._columns, self._rows = columns + 0.5, rows + 0.5  # centres of the pixels, px
+
         red, green, blue = red[rows, columns], green[rows, columns], blue[rows, columns]
         brightest, chroma = brightest[rows, columns], chroma[rows, columns]
         self._saturation = chroma / brightest
@@ -169,19 +191,21 @@ class _ColouredObjects:
         self._hue = sextant * 60  # degrees, from -60
 
     def puck(self, colour: str) -> tuple[float, float]:
+        """Return the position of the puck of a colour, (x, y) m."""
         return self._find(colour, "puck", _FULL, _PUCK_REACH, _PUCK_HEIGHT / 2)
 
     def pad(self, colour: str) -> tuple[float, float]:
+        """Return the position of the pad of a colour, (x, y) m."""
         return self._find(colour, "pad", _PASTEL, _PAD_REACH, 0.0)
 
     def _find(
-        self, colour: str, kind: str, saturation: tuple[float, float], reach: float, z: float
+        self, colour: str, noun: str, saturation: tuple[float, float], reach: float, z: float
     ) -> tuple[float, float]:
         """Return the position of an object, (x, y) m, by its colour.
 
         Args:
             colour: One of `_HUES`.
-            kind: "puck" or "pad", for errors.
+            noun: "puck" or "pad", for errors.
             saturation: The bounds of its pixels' saturation.
             reach: The largest distance of its pixels from its centre, m.
             z: The height of its pixels' centre, m.
@@ -194,19 +218,21 @@ class _ColouredObjects:
         )
         if np.count_nonzero(fits) < 3:
             raise InvalidObservation(
-                f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?"
+                f"tabletop expert: sees no {colour} {noun}; is this image the tabletop's 'front'?"
             )
 
-        u, v = self._u[fits], self._v[fits]
-        # The blurred edge of a puck looks like a pad. The median ignores these few pixels; the mean
-        # is more precise.
-        near = np.hypot(u - np.median(u), v - np.median(v)) < reach * self._scale
-        x = (float(u[near].mean()) - self._centre[0]) / self._scale
-        y = ((self._centre[1] - float(v[near].mean())) / self._scale - z * _DEEP) / _UP
-        return x, y
+        columns, rows = self._columns[fits], self._rows[fits]
+        # The blurred edge of a puck looks like a pad. The median is robust against these few
+        # pixels. The mean of the pixels around it is more precise.
+        distance = np.hypot(columns - np.median(columns), rows - np.median(rows))
+        near = distance < reach * self._scale
+        x = (float(columns[near].mean()) - self._centre[0]) / self._scale
+        height = (self._centre[1] - float(rows[near].mean())) / self._scale
+        return x, (height - z * _Z_FACTOR) / _Y_FACTOR
 
 
 def _image(obs: Obs) -> np.ndarray:
+    """Return the image of the camera "front"."""
     if "front" not in obs.cameras:
         raise MissingCamera("front", have=obs.cameras)
     return obs.cameras["front"]
