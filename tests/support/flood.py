@@ -70,6 +70,7 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.launch.haproxy import haproxy_binary, ingress_environment
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.wire import json_numpy
@@ -86,6 +87,8 @@ HEIGHT, WIDTH = 2304, 4096  # of the largest image
 GATEWAYS_IN_FLIGHT = 256 * 2**20  # bytes; a key or an address may take half of it
 IMAGES = 4  # of these in the largest request
 SLOW_S = 6.0  # time in which a message must arrive
+# Time after which a silent client ends: over that of all rows, between which a robot is silent.
+IDLE_S = 7200.0
 UNIX = socket.AF_UNIX, socket.SOCK_SEQPACKET
 
 
@@ -108,8 +111,8 @@ def serve() -> None:
     rated = [_key(key_of(way), rate=1, priority="simulation") for way in (*WAYS, *HTTP)]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     admit, limits = partial(keys.check, app="app"), MessageLimits()
-    engine = Engine(_Policy())
-    own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S)
+    engine = Engine(_Policy(), EngineSettings(session_idle_s=IDLE_S))
+    own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S, idle_s=IDLE_S)
     near = ShmServer(engine, limits, admit)
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         plasma = plasma_server(engine, limits, patch, Path(folder))
@@ -148,7 +151,9 @@ def _serve_replica(
     engine.start()
     routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
     inside = build_http_app(engine, lambda: METADATA, limits, more=routes)
-    guarded = AccessMiddleware(inside, keys, "app", slow_s=SLOW_S, admission=engine.admission)
+    guarded = AccessMiddleware(
+        inside, keys, "app", slow_s=SLOW_S, idle_s=IDLE_S, admission=engine.admission
+    )
     with served(_with_health_check(FrontMiddleware(guarded))) as port, _haproxy(port) as proxied:
         found = {
             "port": port,
@@ -247,7 +252,7 @@ def serve_gateways() -> None:
         ("lerobot", NoKey.OPEN),
     ):
         admission = Admission(GATEWAYS_IN_FLIGHT)
-        context = GatewayContext("app", _no_replica, limits, 100, 600.0, None, check, admission)
+        context = GatewayContext("app", _no_replica, limits, 100, IDLE_S, None, check, admission)
         cls = dialect_class(name)
         listener = reserve(name, "127.0.0.1", 0)
         ports[name] = listener.getsockname()[1]
