@@ -8,6 +8,7 @@ import select
 import socket
 import threading
 import time
+from collections.abc import Callable
 
 logger = logging.getLogger(__name__)
 
@@ -21,13 +22,23 @@ class SendBuffer:
     acquires the same lock.
     """
 
-    def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
+    def __init__(
+        self,
+        connection: socket.socket,
+        lock: threading.Lock,
+        limit: int,
+        lost: Callable[[], None],
+    ) -> None:
         """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it
         reads none for 10 s.
+
+        `lost` is called, with the lock held, if the client has ended the connection: requests of
+        it that are still unread must do nothing more.
         """
         self._connection = connection
         self._lock = lock
         self._limit = limit
+        self._lost = lost
         self._unsent = bytearray()
         self._thread: threading.Thread | None = None  # sends the rest to a slow client
         self._slow = False  # whether the thread is sending the rest
@@ -77,9 +88,9 @@ class SendBuffer:
         except BlockingIOError:
             return
         except OSError as error:
-            # the client is gone; the reading thread handles the end of the connection
             logger.info("client: %s", error)
             sent = len(self._unsent)
+            self._lost()
         del self._unsent[:sent]
 
         if self._last and not self._unsent:

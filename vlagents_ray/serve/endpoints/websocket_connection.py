@@ -163,7 +163,9 @@ class WebSocketConnection(PolledConnection):
         self._arriving: ArrivingBytes | None = None  # bytes of a partly received message
         self._message_count = 0  # number of messages received so far
 
-        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._out = SendBuffer(
+            connection, self._sending, STREAM_BYTES, lambda: self._call_soon(self.disconnect)
+        )
         self._unanswered = 0  # number of unanswered messages
         self._unanswered_bytes = 0  # size of the unanswered messages with their decoded images
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
@@ -537,16 +539,17 @@ class WebSocketConnection(PolledConnection):
         """Ping a client that is silent at `now`, s; return a reason and a close code if it does
         not answer.
         """
-        if now - self._alive_at <= _PING_S:
+        if self._alive_at > self._pinged_at:
             self._pinged_at = 0.0
-        elif not self._pinged_at:
+        if self._pinged_at:
+            if now - self._pinged_at > _PING_S:
+                return f"no answer to a ping within {_PING_S:g} s", GOING_AWAY
+        elif now - self._alive_at > _PING_S:
             self._pinged_at = now
             with self._sending:
                 if not self._ended and self._protocol.state is State.OPEN:
                     self._protocol.send_ping(b"")
                     self._flush()
-        elif now - self._pinged_at > _PING_S:
-            return f"no answer to a ping within {_PING_S:g} s", GOING_AWAY
         return None
 
     @property
