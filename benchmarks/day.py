@@ -48,7 +48,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
-from vlagents_ray.robot import Guard, MotionLimits, Watchdog, loop, run_loop, watchdog
+from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, Watchdog, loop, run_loop, watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
@@ -489,7 +489,7 @@ def play_day(
                     hz=HZ,
                     seconds=left_s,
                     watchdog=world.watchdog,
-                    commands=world.commands,
+                    options=LoopOptions(commands=world.commands),
                 )
                 held.update({str(cause): ticks for cause, ticks in done.safe.items()})
                 held.update({"waiting": done.waiting, "paused": done.paused})

@@ -22,7 +22,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
 from vlagents_ray.robot.guard import Guard
-from vlagents_ray.robot.loop import run_loop
+from vlagents_ray.robot.loop import LoopOptions, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
@@ -206,7 +206,7 @@ def drive(
             instruction="go round",
             watchdog=watchdog,
             until=until,
-            real_time=True,
+            options=LoopOptions(real_time=True),
         )
         found = {
             "ticks": asdict(robot.ticks),

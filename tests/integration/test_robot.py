@@ -20,7 +20,7 @@ from vlagents_ray import Act, Agent, Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import main
 from vlagents_ray.client.transports.select import TransportName
-from vlagents_ray.robot import Watchdog, run_loop
+from vlagents_ray.robot import LoopOptions, Watchdog, run_loop
 from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 
 HZ = 50.0
@@ -168,8 +168,8 @@ def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_els
             seen,
             hz=HZ,
             watchdog=Watchdog(barks.append, {"server": 2.0}),
-            restart="auto",
             until=lambda: time.monotonic() > deadline or next(script, True),
+            options=LoopOptions(restart="auto"),
         )
         assert next(script, True), f"no resumption: {report}"
     # Both times, the server was gone for longer than a chunk lasts.

@@ -30,7 +30,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import OF_THE_LOOP, SAFE
-from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, Watchdog, run_loop
 
 HUMANS, WILD = 0.5, 9.0  # actions; the policy's are below 0.3
 GARBAGE = st.one_of(
@@ -199,11 +199,13 @@ class Machine(RuleBasedStateMachine):
                 self,
                 self.agent,
                 hz=50,
-                guard=None if self.played else self.guard,
                 watchdog=self.watchdog,
-                restart="auto" if self.simulated else "manual",
-                commands=self.inbox,
                 until=gate,
+                options=LoopOptions(
+                    guard=None if self.played else self.guard,
+                    restart="auto" if self.simulated else "manual",
+                    commands=self.inbox,
+                ),
             )
             interventions = report.interventions
             if interventions != self.humans:

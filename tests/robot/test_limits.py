@@ -23,7 +23,7 @@ from vlagents_ray import (
 )
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.errors import InvalidAction
-from vlagents_ray.robot import Guard, MotionLimits, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, run_loop
 
 HZ = 50.0
 LIMITS = MotionLimits(velocity=1.0, acceleration=10.0, jerk=500.0)
@@ -113,7 +113,7 @@ def test_limits_need_the_rate_and_as_many_numbers_as_an_action_has() -> None:
     with pytest.raises(ConfigError, match="want one number, or 3"):
         Guard(Contract(action=ActionSpec(dim=3)), limits=MotionLimits(velocity=(1.0, 1.0)), hz=HZ)
     with pytest.raises(ConfigError, match=r"limits for 50.0 Hz in a loop of 20"):
-        run_loop(Arm(), Line(), hz=20, seconds=0.1, guard=guard())
+        run_loop(Arm(), Line(), hz=20, seconds=0.1, options=LoopOptions(guard=guard()))
 
 
 class Arm:
@@ -148,7 +148,7 @@ class Line(Agent):
         return Act(np.stack([column, column], 1).astype(np.float32), done=True)
 
 
-def driven(arm: Arm, agent: Agent, limits: MotionLimits, **options: float) -> np.ndarray:
+def driven(arm: Arm, agent: Agent, limits: MotionLimits) -> np.ndarray:
     checked = Guard(
         agent.contract,
         limits=limits,
@@ -157,7 +157,7 @@ def driven(arm: Arm, agent: Agent, limits: MotionLimits, **options: float) -> np
         soft_start_s=0,
     )
     with ChunkPlayer(agent, PlayerSettings(deadline_s=5.0), check=checked) as player:
-        report = run_loop(arm, player, hz=200, seconds=2, **options)
+        report = run_loop(arm, player, hz=200, seconds=2)
     assert report.safe == {}
     return np.array(arm.path)[:, 0].astype(np.float64)
 
@@ -201,7 +201,13 @@ def test_a_stopped_robot_does_not_go_to_rest() -> None:
 
     arm = Arm()
     limits = MotionLimits(velocity=4.0, rest=(-0.2, 0.1))
-    run_loop(arm, Stopping(), hz=200, seconds=0.2, guard=Guard(limits=limits, hz=200))
+    run_loop(
+        arm,
+        Stopping(),
+        hz=200,
+        seconds=0.2,
+        options=LoopOptions(guard=Guard(limits=limits, hz=200)),
+    )
     assert len(arm.path) == 5
     assert np.allclose(arm.path[-1], 0.004)
 

@@ -26,7 +26,7 @@ from vlagents_ray import (
 )
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction
-from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, Watchdog, run_loop
 from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -252,9 +252,9 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]  # neither what is planned nor the 9
     assert report.safe_ticks == 3
-    run_loop(robot, player, hz=HZ, seconds=0.05, guard=guard)
+    run_loop(robot, player, hz=HZ, seconds=0.05, options=LoopOptions(guard=guard))
     with pytest.raises(ConfigError, match="one of them"):
-        run_loop(robot, player, hz=HZ, guard=Guard(high=0.025))
+        run_loop(robot, player, hz=HZ, options=LoopOptions(guard=Guard(high=0.025)))
     player.close()
 
 
@@ -362,7 +362,9 @@ def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_
             told.append((watchdog.restart(), agent.tick))
         return since > 80
 
-    report = run_loop(robot, agent, hz=HZ, until=over, watchdog=watchdog, restart=restart)
+    report = run_loop(
+        robot, agent, hz=HZ, until=over, watchdog=watchdog, options=LoopOptions(restart=restart)
+    )
     ticks = [round(100 * value) for value in robot.commanded]
     again = min(tick for tick in ticks if tick > barked_at[0] + 2)
     assert told[0][0] is False  # while it was silent
@@ -435,11 +437,17 @@ def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where
 ):
     guard = Guard(Going.contract, max_step=0.05, measure=lambda obs: obs.state["joints"])
     robot = Watched(Going.contract)
-    run_loop(robot, Going(), hz=HZ, until=lambda: len(robot.commanded) >= 3, guard=guard)
+    run_loop(
+        robot,
+        Going(),
+        hz=HZ,
+        until=lambda: len(robot.commanded) >= 3,
+        options=LoopOptions(guard=guard),
+    )
     away = Watched(Going.contract)
     away._joints = away._target = np.full(2, 0.5, np.float32)
     with pytest.raises(InvalidAction, match=r"after 0\.5"):
-        run_loop(away, Going(), hz=HZ, guard=guard)
+        run_loop(away, Going(), hz=HZ, options=LoopOptions(guard=guard))
     assert away.commanded == []
 
     class Still(Silenced):
@@ -457,7 +465,9 @@ def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where
 
     watchdog = Watchdog(bark, {"server": 0.1})
     with pytest.raises(InvalidAction, match=r"after -0\.9"):
-        run_loop(moved, agent, hz=HZ, seconds=60.0, guard=guard, watchdog=watchdog)
+        run_loop(
+            moved, agent, hz=HZ, seconds=60.0, watchdog=watchdog, options=LoopOptions(guard=guard)
+        )
 
 
 def test_before_the_first_action_no_safe_one_is_commanded() -> None:
@@ -508,18 +518,15 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(
     assert jitter(pacer.late_s, pacer.missed, pacer.ticks)["ticks"] == 30
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"hz": 0.0}, "above 0"),
-        ({"hz": float("nan")}, "above 0"),
-        ({"hz": 50.0, "seconds": 0.0}, "above 0"),
-        ({"hz": HZ, "restart": "later"}, "want one of"),
-    ],
-)
-def test_options_that_mean_nothing_are_refused(options: dict, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        run_loop(Watched(), Going(), **options)
+@pytest.mark.parametrize(("hz", "seconds"), [(0.0, None), (float("nan"), None), (50.0, 0.0)])
+def test_a_rate_and_a_length_are_above_zero(hz: float, seconds: float | None) -> None:
+    with pytest.raises(ConfigError, match="above 0"):
+        run_loop(Watched(), Going(), hz=hz, seconds=seconds)
+
+
+def test_a_restart_is_manual_or_automatic() -> None:
+    with pytest.raises(ConfigError, match="want one of"):
+        LoopOptions(restart="later")  # type: ignore[arg-type]
 
 
 def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:

@@ -19,7 +19,7 @@ from vlagents_ray.chunking import control as control_module
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot import Watchdog, loop, run_loop
+from vlagents_ray.robot import LoopOptions, Watchdog, loop, run_loop
 from vlagents_ray.robot.loop import Restart
 
 HZ = 1000.0
@@ -127,7 +127,14 @@ class Run:
             return arm.observations > (stopped_at[0] if stopped_at else 2 * EVENT_AT) + AFTER
 
         until = until or over
-        run_loop(arm, Standing(arm), hz=HZ, watchdog=self.dog, restart=restart, until=until)
+        run_loop(
+            arm,
+            Standing(arm),
+            hz=HZ,
+            watchdog=self.dog,
+            until=until,
+            options=LoopOptions(restart=restart),
+        )
         if self.stopper is not None:
             self.stopper.join(LIMIT_S)
             assert not self.stopper.is_alive()

@@ -31,7 +31,7 @@ from vlagents_ray.evaluate.robot import (
     evaluate_on_robot,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot import Guard, MotionLimits, Watchdog, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 
 HZ = 200.0
@@ -223,8 +223,8 @@ def test_nothing_is_applied_after_a_stop(
                 hz=HZ,
                 seconds=0.1,
                 watchdog=run.dog,
-                commands=run.inbox,
                 recorder=recorder,
+                options=LoopOptions(commands=run.inbox),
             )
     require_still(arm)
 
@@ -391,8 +391,8 @@ def test_a_stop_of_one_robot_leaves_the_loop_of_another_running() -> None:
                 player,
                 hz=HZ,
                 watchdog=dogs[number],
-                restart="manual",
                 until=ends[number],
+                options=LoopOptions(restart="manual"),
             )
 
     ended = threading.Event()
@@ -439,5 +439,7 @@ def test_after_a_lost_leader_and_a_stop_a_restart_alone_moves_nothing() -> None:
         return arm.observations > EVENT_AT + 30
 
     with ChunkPlayer(policy, PlayerSettings("async"), override=leader) as player:
-        run_loop(arm, player, hz=HZ, watchdog=dog, restart="manual", until=over)
+        run_loop(
+            arm, player, hz=HZ, watchdog=dog, until=over, options=LoopOptions(restart="manual")
+        )
     assert "apply" in arm.trace[resumed[0] :]

@@ -13,7 +13,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot.loop import run_loop
+from vlagents_ray.robot.loop import LoopOptions, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.watchdog import Watchdog
@@ -70,8 +70,8 @@ def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
         arm,
         Commanding(inbox, {5: "pause", 8: "resume", 9: "instruct"}),
         hz=200,
-        commands=inbox,
         until=over,
+        options=LoopOptions(commands=inbox),
     )
     assert not set(range(5, 12)) & set(applied(arm))
     assert {4, 12} <= set(applied(arm))
@@ -82,7 +82,11 @@ def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
 def test_a_mark_ends_the_loop_before_another_action(label: str) -> None:
     arm, inbox = Arm(simulated=True), CommandInbox()
     report = run_loop(
-        arm, Commanding(inbox, {6: label}), hz=200, commands=inbox, until=lambda: arm.ticks > 20
+        arm,
+        Commanding(inbox, {6: label}),
+        hz=200,
+        until=lambda: arm.ticks > 20,
+        options=LoopOptions(commands=inbox),
     )
     assert report.outcome == label
     assert applied(arm)[-1] == 5
@@ -97,7 +101,7 @@ def test_a_stop_from_the_page_is_over_when_a_person_restarts(
     dog = Watchdog(lambda _: None, {"loop": 10.0}) if watched else None
     arm, inbox = Arm(simulated=simulated), CommandInbox()
     agent = Commanding(inbox, {5: "stop", 8: "resume", 9: "instruct", 12: "success"})
-    report = run_loop(arm, agent, hz=200, commands=inbox, watchdog=dog)
+    report = run_loop(arm, agent, hz=200, watchdog=dog, options=LoopOptions(commands=inbox))
     assert (report.outcome, report.barks, applied(arm)) == (
         "success",
         ["the live page"],
@@ -110,7 +114,7 @@ def test_a_stop_from_the_page_is_over_when_a_person_restarts(
             assert inbox.control.restart()
         return again.ticks > 8
 
-    run_loop(again, agent, hz=200, commands=inbox, watchdog=dog, until=over)
+    run_loop(again, agent, hz=200, watchdog=dog, until=over, options=LoopOptions(commands=inbox))
     assert applied(again)[0] == 5, "not a tick before the restart"
 
 
@@ -173,7 +177,13 @@ def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_epi
 
     with player, Recorder(tmp_path, 200, interventions=True) as recorder:
         report = run_loop(
-            arm, player, hz=200.0, seconds=60.0, commands=inbox, recorder=recorder, until=state
+            arm,
+            player,
+            hz=200.0,
+            seconds=60.0,
+            recorder=recorder,
+            until=state,
+            options=LoopOptions(commands=inbox),
         )
     changes = [state for state, before in zip(states[1:], states, strict=False) if state != before]
     assert changes == ["paused", "human", "autonomous", "paused"]

@@ -12,7 +12,7 @@ import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
-from vlagents_ray.robot import run_loop
+from vlagents_ray.robot import LoopOptions, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.viewers import EpisodeViewer, LoopView, ViewerFrame
 
@@ -177,7 +177,12 @@ def run(viewer: EpisodeViewer) -> None:
     player = ChunkPlayer(agent, PlayerSettings(mode="open_loop"))
     robot = SimulatedRobot(agent.contract)
     run_loop(
-        robot, player, hz=HZ, instruction="count", viewer=viewer, until=lambda: agent.asked > CHUNKS
+        robot,
+        player,
+        hz=HZ,
+        instruction="count",
+        until=lambda: agent.asked > CHUNKS,
+        options=LoopOptions(viewer=viewer),
     )
 
 

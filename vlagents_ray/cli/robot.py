@@ -4,11 +4,11 @@ end.
 With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator
 corrects.
 
-The server's API key is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own CA
-from SSL_CERT_FILE.
+The API key of the server is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own
+CA from SSL_CERT_FILE.
 
-Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if
-it could not run.
+Exit status: 0 if every tick had an action of the policy, 1 if some had none, 3 if more than half
+had none, 2 if the loop could not run.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import entries, names, not_installed, pip_install, registered_function
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.guard import SOFT_START_S, Guard, measured_state
-from vlagents_ray.robot.leaders import leader_named
+from vlagents_ray.robot.leaders import Leader, OpenLeader, leader_named
 from vlagents_ray.robot.limits import MotionLimits
 from vlagents_ray.robot.loop import (
+    LoopOptions,
     LoopReport,
     Restart,
     Robot,
@@ -58,13 +59,12 @@ logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
 # Deadline of a tick in the modes that wait for an answer; half of the default of --silent-s.
 WAIT_S = 1.0
-_HZ = 50.0  # of a robot
+_HZ = 50.0  # the control rate of a robot, unless --hz sets it
 _MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
 _LABELS = {"y": "success", "n": "failure"}
 KEYS = (
     "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and "
-    "stop the robot; "
-    "c or Enter restarts it after a stop"
+    "stop the robot; c or Enter restarts it after a stop"
 )
 # Messages for options that other programs have. An option with a key would be readable in the list
 # of processes.
@@ -120,14 +120,14 @@ def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
-    parser, of_robot, of_env = command_parser()
+    parser, robot_actions, env_actions = command_parser()
     options = parse_all(parser, arguments, _CURES)
     in_env = options.env is not None
-    refused = [
-        action.option_strings[0]
-        for action in (of_robot if in_env else of_env)
-        if getattr(options, action.dest) != action.default
-    ]
+
+    refused: list[str] = []
+    for action in robot_actions if in_env else env_actions:
+        if getattr(options, action.dest) != action.default:
+            refused.append(action.option_strings[0])
     if refused:
         condition = "with" if in_env else "without"
         parser.error(f"got {', '.join(refused)} {condition} --env; leave them out")
@@ -165,7 +165,7 @@ def _ended_by_signals() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
-                # Another signal is ignored, as SIGHUP by nohup, or the caller has its own handler.
+                # Keep a signal that is ignored, as SIGHUP under nohup, and the caller's handler.
                 if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                     undo.callback(signal.signal, number, signal.signal(number, end))
         yield
@@ -180,12 +180,15 @@ def _run(options: argparse.Namespace) -> LoopReport:
     """Connect to the policy, open the robot, run the control loop, and print the report."""
     say = _say
     hz = options.hz or _HZ
+    report = LoopReport(hz)
+    failure: BaseException | None = None
+
+    # Wrong names are errors before anything is connected.
     make_robot = None
     if options.robot:
         make_robot = robot_factory("--robot", options.robot, options.robot_set)
     open_leader = leader_named("--leader", options.leader) if options.leader else None
-    ended: BaseException | None = None
-    report = LoopReport(hz)
+
     with contextlib.ExitStack() as stack:
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
@@ -198,24 +201,13 @@ def _run(options: argparse.Namespace) -> LoopReport:
         contract = agent.contract
         leader = None
         if open_leader is not None:
-            measure = measured_state(options.measure)
-            leader = stack.enter_context(open_leader(contract, step=options.step, measure=measure))
-            help_text = getattr(leader, "help", "")
-            if help_text:
-                say(help_text)
+            leader = stack.enter_context(_opened_leader(open_leader, options, contract, say))
 
         deadline_s = _deadline_s(options)
         settings = _player_settings(options, contract, deadline_s)
-        guard = Guard(
-            contract,
-            max_step=options.max_step,
-            measure=measured_state(options.measure),
-            limits=options.limits,
-            hz=hz,
-            soft_start_s=options.soft_start_s,
-        )
+        guard = _guard(options, contract, hz)
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
-        player.initialize()  # refuses unfit settings before anything is timed or moves
+        player.initialize()  # rejects unfit settings before anything is timed or moves
 
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot = stack.enter_context(opened(make_robot))
@@ -224,12 +216,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
         recorder = None
         if options.record:
-            recorder = stack.enter_context(
-                Recorder(options.record, hz, interventions=leader is not None)
-            )
-        viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
+            opened_recorder = Recorder(options.record, hz, interventions=leader is not None)
+            recorder = stack.enter_context(opened_recorder)
+        viewer = None
+        if options.rerun is not None:
+            viewer = stack.enter_context(open_viewer(options.rerun))
 
         def stop(reason: str) -> None:
+            """Stop the robot, and print why."""
             robot.stop()
             say(f"stopped by the watchdog: {reason}")
 
@@ -242,31 +236,30 @@ def _run(options: argparse.Namespace) -> LoopReport:
         else:
             say("keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
 
+        loop_options = LoopOptions(
+            restart=options.restart,
+            commands=commands,
+            fit=fit,
+            viewer=viewer,
+            real_time=options.real_time,
+            report=report,
+        )
         try:
             run_loop(
                 robot,
                 player,
                 hz=hz,
+                seconds=options.seconds,
+                until=lambda: keys.over,
+                instruction=options.instruction,
                 watchdog=watchdog,
                 recorder=recorder,
-                viewer=viewer,
-                commands=commands,
-                instruction=options.instruction,
-                seconds=options.seconds,
-                restart=options.restart,
-                real_time=options.real_time,
-                fit=fit,
-                until=lambda: keys.over,
-                report=report,
+                options=loop_options,
             )
         except BaseException as error:  # noqa: BLE001 - raised again below, after the report
-            ended = error
+            failure = error
 
-        if report.outcome:
-            say(f"marked as a {report.outcome}")
-        if report.jitter:
-            _say_table(report, f"{options.mode}, {agent.transport}", say)
-            _say_outcome(report, say, led=leader is not None)
+        _say_report(report, f"{options.mode}, {agent.transport}", say, led=leader is not None)
 
     if recorder is not None:  # it is closed, so that everything is written
         say(
@@ -275,9 +268,37 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
     if viewer is not None:
         say(viewer.report())
-    if ended is not None:
-        raise ended
+    if failure is not None:
+        raise failure
     return report
+
+
+@contextlib.contextmanager
+def _opened_leader(
+    open_leader: OpenLeader,
+    options: argparse.Namespace,
+    contract: Contract | None,
+    say: Callable[[str], None],
+) -> Iterator[Leader]:
+    """Open the operator's device within the context, and print how to use it."""
+    measure = measured_state(options.measure)
+    with open_leader(contract, step=options.step, measure=measure) as leader:
+        help_text = getattr(leader, "help", "")
+        if help_text:
+            say(help_text)
+        yield leader
+
+
+def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) -> Guard:
+    """Return the guard of a policy with this contract, with the limits of the options."""
+    return Guard(
+        contract,
+        max_step=options.max_step,
+        measure=measured_state(options.measure),
+        limits=options.limits,
+        hz=hz,
+        soft_start_s=options.soft_start_s,
+    )
 
 
 def _deadline_s(options: argparse.Namespace) -> float:
@@ -329,20 +350,23 @@ def _require_fit(
     limits: MotionLimits | None,
     say: Callable[[str], None],
 ) -> Fit:
-    """Show the first chunk beside the training of the checkpoint and the limits of the arm, and
-    compare them.
+    """Compare the policy's first chunk with the training of the checkpoint and the limits of the
+    arm, and print all three.
+
+    Raises:
+        ContractMismatch: They do not fit, and --accept-misfit is not given.
     """
     trained = None if options.trained_on is None else Trained.read(options.trained_on)
     fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
 
     is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
-        text = (
+        message = (
             "the policy states no ranges of its training, so this arm's pose and the first chunk "
             "are not compared with them; --trained-on FILE names them"
         )
-        say(text)
-        logger.info("%s", text)
+        say(message)
+        logger.info("%s", message)
 
     if fit.compares and not (is_default and trained is None):
         obs = robot.observe()
@@ -355,6 +379,22 @@ def _require_fit(
     return fit
 
 
+def _say_report(report: LoopReport, name: str, say: Callable[[str], None], *, led: bool) -> None:
+    """Print the report of a run; without its timing if the run ended before the first tick.
+
+    Args:
+        report: The report of the loop.
+        name: The title of the row of numbers.
+        say: Prints a line.
+        led: Whether an operator could move the robot.
+    """
+    if report.outcome:
+        say(f"marked as a {report.outcome}")
+    if report.jitter:
+        _say_table(report, name, say)
+        _say_outcome(report, say, led=led)
+
+
 def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> None:
     """Print the table of the loop's jitter."""
     jitter = report.jitter
@@ -363,15 +403,13 @@ def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> Non
         f"{jitter['missed']:.0f}",
         f"{100 * jitter['on_time']:.2f} %",
     ]
-    times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
-    for first, *cells in (_HEADER, (name, *numbers, *times)):
-        say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
+    times = [f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms")]
+    for title, *cells in (_HEADER, (name, *numbers, *times)):
+        say(f"{title:<20}" + "".join(f"{cell:>13}" for cell in cells))
 
 
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
-    """Print the delays, the ticks without an action of the policy, and the stops; `led` is whether
-    an operator could move the robot.
-    """
+    """Print the delays, the ticks without an action of the policy, and the stops."""
     say(
         f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 "
         f"{report.work_p99_ms:.2f} ms"
@@ -478,18 +516,18 @@ def _names_of_plugins() -> str:
     not installed.
     """
     lines: list[str] = []
-    for title, kind, prefix in (
+    for title, group, prefix in (
         ("subcommands", "commands", "robot."),
         ("robots by name", "robots", ""),
         ("leaders by name", "leaders", ""),
     ):
         lines.append(f"{title}:")
-        for name, entry in entries(kind).items():
+        for name, entry in entries(group).items():
             if name.startswith(prefix):
-                suffix = entry.tasks if kind == "robots" else ""
-                shown = name.removeprefix(prefix) + suffix
-                lines.append(f"  {shown:<21} {entry.about}")
-        for name, distribution in not_installed(kind).items():
+                suffix = entry.tasks if group == "robots" else ""
+                typed_name = name.removeprefix(prefix) + suffix
+                lines.append(f"  {typed_name:<21} {entry.about}")
+        for name, distribution in not_installed(group).items():
             if name.startswith(prefix):
                 cure = pip_install(distribution=distribution)
                 lines.append(f"  {name.removeprefix(prefix):<21} not installed: {cure}")
@@ -509,7 +547,11 @@ class _RobotParser(argparse.ArgumentParser):
 def command_parser() -> tuple[
     argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]
 ]:
-    """Return the parser, the options that are refused with --env, and those that need it."""
+    """Return the parser of `vlagents-ray robot`.
+
+    Returns:
+        The parser, the options that are rejected with --env, and the options that need --env.
+    """
     parser = _RobotParser(
         prog="vlagents-ray robot",
         description=__doc__,
@@ -517,87 +559,110 @@ def command_parser() -> tuple[
     )
     # By default, each error would list all options.
     parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"
-    groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
-    of_robot: list[argparse.Action] = []
-    of_env: list[argparse.Action] = []
+    robot_group = parser.add_argument_group("a robot")
+    env_group = parser.add_argument_group("a simulation")
+    robot_actions: list[argparse.Action] = []
+    env_actions: list[argparse.Action] = []
     add = parser.add_argument
     seconds = number(above=True)
     rows = number(int, minimum=1)
 
     def real(*names: str, **settings: Any) -> None:
-        of_robot.append(groups[0].add_argument(*names, **settings))
+        """Add an option of a robot."""
+        robot_actions.append(robot_group.add_argument(*names, **settings))
 
     def simulated(*names: str, **settings: Any) -> None:
-        of_env.append(groups[1].add_argument(*names, **settings))
+        """Add an option of a simulation."""
+        env_actions.append(env_group.add_argument(*names, **settings))
 
     add(
         "policy",
         nargs="?",
-        help="URL of its server; with --env also a registered policy, 'module:Class', or nothing",
+        help="URL of the policy's server; with --env also a registered policy, 'module:Class', or "
+        "nothing",
     )
     add(
         "--hz",
         type=number(above=True, maximum=_MOST_HZ),
         help=f"control rate (default: {_HZ:g}, or the environment's)",
     )
-    real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
+    real(
+        "--seconds",
+        type=seconds,
+        default=60.0,
+        help="length of the run in seconds (default: %(default)s)",
+    )
     real("--instruction", help="the task in words")
     real(
         "--robot",
         metavar="ROBOT",
-        help="a name as below, or your MODULE:CLASS; default: a simulated one",
+        help="a name from the list below, or your MODULE:CLASS (default: a simulated robot)",
     )
     real(
         "--robot-set",
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="an argument of the robot, repeatable",
+        help="an argument of the robot; may be repeated",
     )
     add(
         "--leader",
         metavar="LEADER",
-        help="device for taking over: a name as below, or your MODULE:CLASS",
+        help="device with which an operator takes over: a name from the list below, or your "
+        "MODULE:CLASS",
     )
     add(
         "--step",
         type=seconds,
-        help="what a key or axis of these adds to a number of the action at a tick",
+        help="increment of the leader: what a key or an axis adds to a number of the action at "
+        "each tick",
     )
     add(
         "--mode",
         **one_of(*get_args(Mode)),
-        help="see PlayerSettings (default: async; with --env open_loop)",
+        help="mode of the chunk player, see PlayerSettings (default: async; with --env: open_loop)",
     )
-    add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
-    real("--horizon", type=rows, metavar="N", help="rows of a chunk that may be executed at all")
+    add(
+        "--execute",
+        type=rows,
+        metavar="N",
+        help="number of rows of a chunk that are executed before the next request",
+    )
+    real(
+        "--horizon",
+        type=rows,
+        metavar="N",
+        help="largest number of rows of a chunk that may be executed",
+    )
     real(
         "--max-age-s",
         type=seconds,
         metavar="S",
-        help="largest age of the observation of an executed action",
+        help="largest age of the observation from which an executed action was computed, in "
+        "seconds",
     )
     real(
         "--merge",
         **one_of(*MERGES, ENSEMBLE),
         default="newest",
-        help="how overlapping chunks merge (%(default)s)",
+        help="how overlapping chunks are merged (default: %(default)s)",
     )
     real(
         "--rtc",
         action="store_true",
-        help="real-time chunking: send the rest of the plan, and the delay",
+        help="real-time chunking: send the leftover plan and the expected delay with each request",
     )
     real(
         "--deadline-ms",
         type=number(),
-        help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})",
+        help="time for which a tick waits for an action, in ms (default: async 0, other modes "
+        f"{WAIT_S * 1e3:.0f})",
     )
     real(
         "--safe",
         **one_of("auto", "hold", "zero"),
         default="auto",
-        help="at a tick without an action (%(default)s)",
+        help="action at a tick for which the policy has none (default: %(default)s)",
     )
     add(
         "--max-step",
@@ -607,79 +672,102 @@ def command_parser() -> tuple[
     real(
         "--measure",
         metavar="PART",
-        help="part of the state with the measured pose, for --max-step, e.g. joints",
+        help="part of the state with the measured pose, such as joints; the first action is "
+        "compared with it",
     )
     add(
         "--limits",
         metavar="PATH",
-        help="limits of motion: .yaml, .json, .urdf or dataset; see docs/control_loop.md",
+        help="file with limits of motion: .yaml, .json, .urdf, or the folder of a dataset; see "
+        "docs/control_loop.md",
     )
     add(
         "--soft-start-s",
         type=number(),
         default=SOFT_START_S,
-        help="in which these rise from half (%(default)s)",
+        help="time over which the limits of --limits rise from 50 %% to 100 %%, in seconds of "
+        "motion (default: %(default)s)",
     )
-    trained = (
-        "file with statistics of the training, which arm and first chunk must fit (default: "
-        "the server's, if any)"
+    real(
+        "--trained-on",
+        metavar="FILE",
+        help="file with the statistics of the training, which the arm's pose and the first chunk "
+        "must fit (default: the server's statistics, if it has any)",
     )
-    real("--trained-on", metavar="FILE", help=trained)
     real(
         "--accept-misfit",
         action="store_true",
-        help="move although they do not fit; the log shows it",
+        help="move although they do not fit; the log records it",
     )
     real(
         "--restart",
         **one_of(*get_args(Restart)),
-        help="after a stop: by Enter, C or SIGUSR1; if simulated: auto",
+        help="restart after a stop: manual by Enter, C or SIGUSR1, or auto when the server answers "
+        "again (default: manual; for a simulated robot: auto)",
     )
     real(
         "--silent-s",
         type=seconds,
         default=2.0,
-        help="stop the robot if the server is silent this long (%(default)s)",
+        help="stop the robot if the server is silent for this number of seconds (default: "
+        "%(default)s)",
     )
     real(
         "--timeout-s",
         type=seconds,
         default=10.0,
-        help="time after which a request is given up (%(default)s)",
+        help="timeout of a request in seconds (default: %(default)s)",
     )
     real(
         "--transport",
         **one_of("auto", "shm", "websocket", "http"),
         default="auto",
-        help="(%(default)s)",
+        help="transport to the server (default: %(default)s)",
     )
     add(
         "--record",
         metavar="DIR",
-        help="record a LeRobotDataset v3.0 there; needs the extra 'record'",
+        help="record a LeRobotDataset v3.0 in this folder; needs the extra 'record'",
     )
     add(
         "--rerun",
         metavar="DIR",
-        help="write a .rrd file there for Rerun, or 'live': show the run in its viewer",
+        help="folder in which a .rrd file for Rerun is written, or 'live' to show the run in "
+        "Rerun's viewer",
     )
     real(
         "--operate",
         action="store_true",
-        help="obey the server's live page: pause, stop, success, failure",
+        help="obey commands of the server's live page: pause, stop, success, failure",
     )
-    real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    groups[1].add_argument(
-        "--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …"
+    real(
+        "--real-time",
+        action="store_true",
+        help="run the loop with SCHED_FIFO instead of a higher priority (nice)",
+    )
+
+    env_group.add_argument(
+        "--env", metavar="NAME", help="the environment, such as tabletop or maniskill/PickCube-v1"
     )
     settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
-    simulated("--env-set", **settings, help="an option of the environment: width=256")
-    simulated("--set", **settings, help="a setting of the policy, repeatable")
-    simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
+    simulated(
+        "--env-set",
+        **settings,
+        help="an option of the environment, such as width=256; may be repeated",
+    )
+    simulated("--set", **settings, help="a setting of the policy; may be repeated")
+    simulated(
+        "--episodes",
+        type=rows,
+        default=10,
+        metavar="N",
+        help="number of episodes (default: %(default)s)",
+    )
     simulated(
         "--seed",
         type=number(int),
         default=0,
-        help="of the first episode; the others count on (%(default)s)",
+        help="seed of the first episode; each further episode has the next number (default: "
+        "%(default)s)",
     )
-    return parser, of_robot, of_env
+    return parser, robot_actions, env_actions

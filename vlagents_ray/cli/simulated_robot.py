@@ -21,7 +21,7 @@ from vlagents_ray.envs.base import EvalEnv, make_env
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
-from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, run_loop
 from vlagents_ray.robot.leaders import TeleoperatedAgent, leader_named
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
@@ -152,17 +152,20 @@ class RobotRun:
             self._print_source_of_motion(has_begun=robot.steps > 0)
             return robot.ended or self.verdict is not None
 
-        options = {} if self.options.policy is None else {"seed": seed, "env": self.options.env}
+        has_policy = self.options.policy is not None
+        options = LoopOptions(
+            guard=None if has_policy else guard,  # a policy's player has it already
+            reset_options={"seed": seed, "env": self.options.env} if has_policy else {},
+            viewer=self._viewer,
+        )
         report = run_loop(
             robot,
             agent,
             hz=hz,
-            instruction=env.instruction,
-            reset_options=options,
-            guard=guard if self.options.policy is None else None,
-            recorder=recorder,
-            viewer=self._viewer,
             until=check_end,
+            instruction=env.instruction,
+            recorder=recorder,
+            options=options,
         )
         out.print(
             f"  {label()}: {robot.steps} steps, {report.interventions} by the operator; paused for "

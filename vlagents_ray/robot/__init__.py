@@ -6,12 +6,13 @@ from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.limits import MotionLimits
-from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
+from vlagents_ray.robot.loop import LoopOptions, LoopReport, Robot, run_loop
 from vlagents_ray.robot.watchdog import Watchdog
 
 __all__ = [
     "CommandInbox",
     "Guard",
+    "LoopOptions",
     "LoopReport",
     "MotionLimits",
     "Robot",

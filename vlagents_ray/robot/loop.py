@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Protocol, get_args
@@ -57,18 +57,23 @@ class Robot(Protocol):
     """The interface of a robot that the control loop drives.
 
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a
-    stop (see `restart` of `run_loop`). A robot may have an attribute `holds`, the reason why it
+    stop (see `LoopOptions.restart`). A robot may have an attribute `holds`, the reason why it
     must not move now, such as a camera that hangs. While it is not None the robot is stopped; then
     the loop continues with a new observation. A class around another robot derives from
     `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
 
     `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them:
-    `contract`, what it gives and takes; `joint_names`, its joints in the order of an action,
-    without grippers; `joint_limits`, (D, 2) in their units; `dates_pictures`, whether `captured_at`
-    is from the time stamps of its sensors, so that a camera that hangs is found by them; of a
-    simulated one `operator`, which answers the check in place of the person at the robot, and
-    `clock`, the module `time` of its simulation; and `close`, called at the end. A robot that is a
-    context manager is entered before its first use and left at the end, in place of `close`.
+
+    - `contract`: its observations and actions.
+    - `joint_names`: its joints in the order of an action, without grippers.
+    - `joint_limits`: the range of each joint, (D, 2) in the joints' units.
+    - `dates_pictures`: whether `captured_at` is from the time stamps of its sensors, so that they
+      show when a camera hangs.
+    - `operator`: of a simulated robot, an object that answers the questions of the check in place
+      of the operator.
+    - `clock`: of a simulated robot, a replacement of the module `time` with the simulated time.
+    - `close`: called at the end. A robot that is a context manager is entered before its first use
+      and left at the end instead.
     """
 
     def observe(self) -> Obs:
@@ -88,8 +93,8 @@ class Robot(Protocol):
 
 
 def contract_of(robot: Robot) -> Contract:
-    """Return the contract of a robot with the names of its joints; an empty one if the robot has
-    none.
+    """Return the contract of a robot, with the names of its joints; an empty contract if the robot
+    has none.
     """
     contract = getattr(robot, "contract", None) or Contract()
     joint_names = tuple(getattr(robot, "joint_names", ()))
@@ -112,10 +117,13 @@ def fit_of(
         agent: The policy, after `initialize`.
         robot: The robot.
         limits: The limits of the robot.
-        trained: The ranges of the policy's training; default: those of `agent.statistics`. A
-            simulated robot without a contract is not compared with them, as it follows numbers of
+        trained: The ranges of the policy's training; default: the ranges in `agent.statistics`.
+            A simulated robot without a contract is not compared with them, as it follows numbers of
             any unit.
         accept: Whether numbers that do not fit are only logged.
+
+    Returns:
+        The comparison, whose `require` raises if numbers do not fit.
 
     Raises:
         ContractMismatch: The contracts differ.
@@ -128,10 +136,12 @@ def fit_of(
         trained = Trained.from_statistics(agent.statistics or {}) if has_units else Trained()
 
     contract = agent.contract or Contract()
-    parts = list(contract.state or {})
+    state_names = list(contract.state or {})
     if contract.gripper:
-        parts.append("gripper")
-    return Fit(trained, limits, tuple(getattr(robot, "joint_names", ())), tuple(parts), accept)
+        state_names.append("gripper")
+
+    joint_names = tuple(getattr(robot, "joint_names", ()))
+    return Fit(trained, limits, joint_names, tuple(state_names), accept)
 
 
 def robot_watchdog(
@@ -143,19 +153,32 @@ def robot_watchdog(
         robot: The robot. Its attribute `silent_s`, if any, has further sources and their longest
             silences, s; its attribute `watchdog`, if any, is set, so that the robot records their
             signs of life.
-        stop: As of `Watchdog`.
-        silent_s: As of `Watchdog`.
+        stop: Stops the robot; its argument is the reason (see `Watchdog`).
+        silent_s: The longest silence of each source by name, s.
+
+    Returns:
+        The watchdog, which is not started yet.
     """
-    watchdog = Watchdog(stop, {**getattr(robot, "silent_s", {}), **silent_s})
+    limits_s = {**getattr(robot, "silent_s", {}), **silent_s}
+    watchdog = Watchdog(stop, limits_s)
     if hasattr(robot, "watchdog"):
         robot.watchdog = watchdog
     return watchdog
 
 
 def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
-    """Import the class "module:Class" that an option such as "--robot" names.
+    """Import a class that an option of the command line names.
 
-    Raises `ConfigError` if there is none, or if it lacks one of the `methods`.
+    Args:
+        option: The option for messages, such as "--robot".
+        name: The class as "module:Class".
+        methods: The methods that the class must have.
+
+    Returns:
+        The class.
+
+    Raises:
+        ConfigError: There is no such class, its module cannot be imported, or it lacks a method.
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -174,14 +197,18 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
 
     cls = getattr(imported, attribute, None)
     if cls is None:
-        public = [known for known in vars(imported) if not known.startswith("_")]
-        hint = did_you_mean(attribute, public) or "; write the name of a class in it"
+        public_names = [key for key in vars(imported) if not key.startswith("_")]
+        hint = did_you_mean(attribute, public_names) or "; write the name of a class in it"
         raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{hint}")
     return _with_methods(f"{option} {name}", cls, methods)
 
 
 def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
-    """Return the class; raises `ConfigError` if it lacks one of the methods."""
+    """Return a class, after a check that it has all the methods.
+
+    Raises:
+        ConfigError: It lacks a method.
+    """
     missing = [method for method in methods if not callable(getattr(cls, method, None))]
     if missing:
         raise ConfigError(
@@ -195,8 +222,11 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
 
     Args:
         option: The option of the command line that names the robot, for messages.
-        name: "module:Class", or a registered name and its argument, "mujoco:so101".
+        name: "module:Class", or a registered name and its argument, such as "mujoco:so101".
         settings: Further arguments of the robot as KEY=VALUE; a value that is not JSON is text.
+
+    Returns:
+        The function, which takes no arguments.
 
     Raises:
         ConfigError: The name is unknown, its class is no robot, or a setting is wrong.
@@ -227,11 +257,16 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
 
 @contextlib.contextmanager
 def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
-    """Yield a new robot, which is closed at the end: it is a context manager, or has `close`, or
-    needs neither.
+    """Make a robot, yield it, and close it at the end.
+
+    A robot that is a context manager is entered and left; another one's `close` is called, if it
+    has this method.
+
+    Args:
+        make: Makes the robot.
 
     Raises:
-        ConfigError: It cannot be made.
+        ConfigError: The robot cannot be made.
     """
     try:
         robot = make()
@@ -267,7 +302,9 @@ class LoopReport:
     safe: dict[Cause, int] = field(default_factory=dict)
     # The first reason of each cause, in words.
     reasons: dict[Cause, str] = field(default_factory=dict)
-    waiting: int = 0  # ticks at which the robot held still, with all rows used up and no new answer
+    # The number of ticks at which the robot held still, as all rows were executed and the next
+    # answer had not arrived.
+    waiting: int = 0
     barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
     interventions: int = 0  # ticks at which an operator moved the robot
     # The number of ticks at which the robot was paused (see `vlagents_ray.chunking.control`); they
@@ -291,9 +328,11 @@ class LoopReport:
         if 2 * self.safe_ticks <= ticks:
             return None
 
-        cause: Cause = max(self.safe, key=lambda cause: self.safe[cause], default="waiting")
-        if self.waiting >= self.safe.get(cause, 0):
-            cause = "waiting"
+        cause: Cause = "waiting"
+        most_ticks = self.waiting
+        for safe_cause, safe_ticks in self.safe.items():
+            if safe_ticks > most_ticks:
+                cause, most_ticks = safe_cause, safe_ticks
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
             f"of it, most often: {self.reasons.get(cause, cause)}. If answers come too late, use a "
@@ -318,15 +357,61 @@ class LoopReport:
             if warning is not None:
                 logger.warning("%s", warning)
 
-    def count(self, why: Held) -> None:
-        """Count a tick without an action of the policy."""
-        self.reasons.setdefault(why.cause, why.reason)
-        if why.cause == "paused":
+    def count(self, hold: Held) -> None:
+        """Count a tick without an action of the policy.
+
+        Args:
+            hold: The reason why the tick has none.
+        """
+        self.reasons.setdefault(hold.cause, hold.reason)
+        if hold.cause == "paused":
             self.paused += 1
-        elif why.cause == "waiting":
+        elif hold.cause == "waiting":
             self.waiting += 1
         else:
-            self.safe[why.cause] = self.safe.get(why.cause, 0) + 1
+            self.safe[hold.cause] = self.safe.get(hold.cause, 0) + 1
+
+
+@dataclass(frozen=True, slots=True)
+class LoopOptions:
+    """Options of the control loop that most callers leave at their defaults.
+
+    Args:
+        guard: Checks every action; a refused action ends the loop. The default is the agent's own
+            `check`, such as a chunk player's, which continues with a safe action instead; else a
+            guard of the agent's contract.
+        restart: With "manual", `watchdog.restart()` restarts motion after a stop; only an operator
+            who sees the robot may call it, and it has no effect while the silence lasts. With
+            "auto", the end of the silence restarts motion; a stop by a command still needs the
+            call. The default is "auto" for a simulated robot and "manual" for any other.
+        commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop,
+            mark.
+        fit: The comparison of policy and robot, for misfits that are accepted; default:
+            `fit_of(agent, robot, limits)`.
+        reset_options: Further arguments of `agent.reset`.
+        viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
+        real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
+        report: A new report, for a caller that reads it also if the loop ends with an exception;
+            by default the loop makes one.
+
+    Raises:
+        ConfigError: `restart` has a wrong value.
+    """
+
+    guard: Guard | None = None
+    restart: Restart | None = None
+    commands: CommandInbox | None = None
+    fit: Fit | None = None
+    reset_options: Mapping[str, Any] = field(default_factory=dict)
+    viewer: EpisodeViewer | None = None
+    real_time: bool = False
+    report: LoopReport | None = None
+
+    def __post_init__(self) -> None:
+        if self.restart is not None and self.restart not in get_args(Restart):
+            raise ConfigError(
+                f"restart: got {self.restart!r}, want one of {list(get_args(Restart))}"
+            )
 
 
 def run_loop(
@@ -335,18 +420,11 @@ def run_loop(
     *,
     hz: float,
     seconds: float | None = None,
-    instruction: str | None = None,
-    reset_options: dict[str, Any] | None = None,
-    guard: Guard | None = None,
-    watchdog: Watchdog | None = None,
-    restart: Restart | None = None,
-    recorder: Recorder | None = None,
-    viewer: EpisodeViewer | None = None,
-    real_time: bool = False,
     until: Callable[[], bool] = lambda: False,
-    commands: CommandInbox | None = None,
-    fit: Fit | None = None,
-    report: LoopReport | None = None,
+    instruction: str | None = None,
+    watchdog: Watchdog | None = None,
+    recorder: Recorder | None = None,
+    options: LoopOptions | None = None,
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is
     over.
@@ -367,66 +445,60 @@ def run_loop(
             rows.
         hz: The control rate, Hz.
         seconds: The length of the run, s; None runs until the policy or `until` ends it.
-        instruction: The task in words.
-        reset_options: Further arguments of `agent.reset`.
-        guard: Checks every action; a refused one ends the loop. The default is the agent's own
-            `check`, such as a chunk player's, which continues with a safe action instead; else a
-            guard of the agent's contract.
-        watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's
-            answers (`act.info["silent_s"]`) are those of "server". After it has stopped the robot,
-            nothing is commanded until motion is restarted, in this run or a later one. A chunk
-            player then has discarded its plan (`ChunkPlayer.interrupt`), so that the first command
-            is computed from new observations; a guard with `measure` compares it with the measured
-            pose.
-        restart: With "manual", `watchdog.restart()` restarts motion; only an operator who sees the
-            robot may call it, and it has no effect while the silence lasts. With "auto" the end of
-            the silence restarts it; a stop by a command still needs the call. The default is "auto"
-            for a simulated robot and "manual" for any other.
-        recorder: Records the run as one episode, also if it ends by an exception. A player with
-            `override` needs a recorder with `interventions=True`.
-        viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
-        real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         until: Ends the loop when it returns True; called before each tick, and after the last one.
             This is not a stop: with a rest pose the robot goes there. Use `Watchdog.trip` or
             `RobotControl.stop` for a stop.
-        commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop,
-            mark.
-        fit: The comparison of policy and robot, for misfits that are accepted; default:
-            `fit_of(agent, robot, limits)`.
-        report: A new report, which is also filled if the loop ends by an exception; by default one
-            is made.
+        instruction: The task in words.
+        watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's
+            answers (`act.info["silent_s"]`) are signs of life of "server". After the watchdog has
+            stopped the robot, nothing is commanded until motion is restarted, in this run or a
+            later one. A chunk player then has discarded its plan (`ChunkPlayer.interrupt`), so that
+            the first command is computed from new observations; a guard with `measure` compares it
+            with the measured pose.
+        recorder: Records the run as one episode, also if it ends with an exception. A player with
+            `override` needs a recorder with `interventions=True`.
+        options: The guard, the restart after a stop, commands of the live page, and other options.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the
-            agent's own or has limits for another rate, or the recorder has no columns for
-            interventions.
+        ConfigError: `hz` or `seconds` has a wrong value, the guard differs from the agent's own or
+            has limits for another rate, or the recorder has no columns for interventions.
         ContractMismatch: Before the first motion of the policy: it does not fit the robot.
         InvalidAction: An action is a chunk, or the guard refuses it.
     """
+    options = options or LoopOptions()
+    restart = options.restart
     if restart is None:
         restart = "auto" if getattr(robot, "simulated", False) else "manual"
-    if restart not in get_args(Restart):
-        raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
 
-    control = _shared_control(agent, watchdog, commands)
+    control = _shared_control(agent, watchdog, options.commands)
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, "
             "interventions=True)"
         )
 
-    report = report or LoopReport(hz)
+    report = options.report or LoopReport(hz)
     earlier_stops = len(control.stops)
+
     agent.initialize()
-    guard = _guard_of(agent, guard, hz)
-    fit = fit or fit_of(agent, robot, guard.limits)
+    guard = _guard_of(agent, options.guard, hz)
+    fit = options.fit or fit_of(agent, robot, guard.limits)
     run = _Run(
-        robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report, fit
+        robot=robot,
+        agent=agent,
+        control=control,
+        guard=guard,
+        watchdog=watchdog,
+        recorder=recorder,
+        commands=options.commands,
+        view=LoopView(options.viewer),
+        report=report,
+        fit=fit,
     )
 
     with contextlib.ExitStack() as stack:
@@ -434,12 +506,12 @@ def run_loop(
         try:
             obs = _observed(robot)
             fit.require(obs, None)
-            agent.reset(obs, instruction, **(reset_options or {}))
+            agent.reset(obs, instruction, **options.reset_options)
 
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
             stack.enter_context(run.view.episode(instruction or ""))
-            report.means = stack.enter_context(undisturbed(real_time=real_time))
+            report.means = stack.enter_context(undisturbed(real_time=options.real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
 
@@ -523,22 +595,24 @@ class _Run:
         timing in any case.
         """
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
-        collected = time.monotonic()
-        ticks = None if seconds is None else max(1, round(seconds / pacer.period_s))
+        collected_at = time.monotonic()
+        end_tick = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
             while not (until() or self.report.done):
                 # Collect the cycles of failed requests, as automatic collection is off.
-                if time.monotonic() - collected > _COLLECT_S:
+                if time.monotonic() - collected_at > _COLLECT_S:
                     gc.collect()
-                    collected = time.monotonic()
+                    collected_at = time.monotonic()
+
                 tick = pacer.wait()
-                if ticks is not None and tick >= ticks:
-                    pacer.forget(ticks)
+                if end_tick is not None and tick >= end_tick:
+                    pacer.forget(end_tick)
                     break
 
                 obs = _observed(self.robot)
-                if self.agent.control is not self.control:  # else `act` has changed it
+                if self.agent.control is not self.control:  # else `act` updates it
                     self.control.update()
+
                 act = self.agent.act(obs)
                 if act.action.ndim != 1:
                     raise InvalidAction(
@@ -548,17 +622,17 @@ class _Run:
                 self.report.done = act.done
 
                 # This comes before the sign of life of this tick, which may be late.
-                stop = self._held(act)
+                hold = self._reason_to_hold(act)
                 if self.control.over:
                     break
                 self._give_signs_of_life(act)
 
                 action = None
-                if stop is None:
-                    action, stop = self._applied(obs, act)
-                if stop is not None:
-                    self._stop(stop)
-                    self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
+                if hold is None:
+                    action, hold = self._apply_act(obs, act)
+                if hold is not None:
+                    self._keep_still(hold)
+                    self.view.add(obs, act, None, tick, pacer.since_tick_s(), hold.reason)
                 elif action is not None:
                     work_s.append(pacer.since_tick_s())
                     self._record(obs, act, action, tick)
@@ -605,8 +679,8 @@ class _Run:
                 pacer.wait()
                 _observed(self.robot)  # the robot may notice that it must not move (`holds`)
                 self.control.update()
-                held = self._held(Act(last))
-                if held is not None or self.control.state == "human" or self.control.over:
+                hold = self._reason_to_hold(Act(last))
+                if hold is not None or self.control.state == "human" or self.control.over:
                     break
 
                 if self.watchdog is not None:
@@ -618,52 +692,58 @@ class _Run:
         except InvalidAction as error:
             logger.warning("the way to the rest pose ends here: %s", error)
 
-    def _held(self, act: Act) -> Held | None:
+    def _reason_to_hold(self, act: Act) -> Held | None:
         """Apply new commands; return why this tick may command nothing, or None."""
         if self.commands is not None:
             self.commands.apply(self.control)
 
-        held = self.control.hold()
-        reason = getattr(self.robot, "holds", None)
-        if held is not None:
-            return held
-        if reason is not None:
-            return Held("robot", str(reason))
+        hold = self.control.hold()
+        robot_reason = getattr(self.robot, "holds", None)
+        if hold is not None:
+            return hold
+        if robot_reason is not None:
+            return Held("robot", str(robot_reason))
+
         # The cause of a safe action may have ended after the player's decision.
         safe = _safe(act)
         if safe is not None and safe.cause in ("stopped", "paused"):
             return safe
         return None
 
-    def _stop(self, why: Held) -> None:
+    def _keep_still(self, hold: Held) -> None:
         """Keep the robot at rest for this tick."""
         if not self.standing:
             # Stop it again, as the watchdog may have stopped it just before the last action.
             self.robot.stop()
         self.standing = True
         self.agent.interrupt()
-        self.report.count(why)
+        self.report.count(hold)
 
-    def _applied(self, obs: Obs, act: Act) -> tuple[np.ndarray | None, Held | None]:
-        """Apply the action, and return it, or why the robot was stopped meanwhile.
+    def _apply_act(self, obs: Obs, act: Act) -> tuple[np.ndarray | None, Held | None]:
+        """Apply the action of an agent.
 
-        A robot at rest gets no safe action: then both are None.
+        Returns:
+            The applied action, (D,), and None; or None and the reason why the robot was stopped
+            meanwhile. Both are None for a robot at rest, which gets no safe action.
         """
-        safe, action = _safe(act), act.action
+        safe = _safe(act)
+        action = act.action
         if safe is not None and self.standing:
             self.report.count(safe)
             return None, None
 
-        if self.fit is not None and safe is None and not act.info.get(INTERVENTION):
+        is_of_policy = safe is None and not act.info.get(INTERVENTION)
+        if self.fit is not None and is_of_policy:
             self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
             self.fit = None
+
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
             last = self.guard.reference(obs, self.last) if self.standing else self.last
             action = self.guard(action, last)
 
-        stop = self._command(action)
-        if stop is not None:
-            return None, stop
+        hold = self._command(action)
+        if hold is not None:
+            return None, hold
         if safe is not None:
             self.report.count(safe)
         return action, None
@@ -672,13 +752,16 @@ class _Run:
         """Apply an action, unless the robot has been stopped since this tick's check; return why
         it was not applied.
         """
-        with self.control.command() as held:
-            if held is not None:
-                return held
-            self.standing, self.last = False, action
+        with self.control.command() as hold:
+            if hold is not None:
+                return hold
+            self.standing = False
+            self.last = action
+
             began_s = time.perf_counter()
             self.robot.apply(action)
             self.apply_s.append(time.perf_counter() - began_s)
+
         if self.control.held is not None:  # the command may have ended after the stop
             self.robot.stop()
         return None

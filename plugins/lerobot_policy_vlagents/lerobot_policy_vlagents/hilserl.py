@@ -56,8 +56,8 @@ class Actor:
     """The recorder of a control loop whose episodes go to LeRobot's HIL-SERL learner.
 
         with Actor("train.json", Publisher("http://gpu-box:8000")) as actor:
-            run_loop(robot, player, hz=10, seconds=20, reset_options={"weights": "follow"},
-            recorder=actor)
+            options = LoopOptions(reset_options={"weights": "follow"})
+            run_loop(robot, player, hz=10, seconds=20, recorder=actor, options=options)
 
     The learner's parameters are pushed to the server as they come, where the next episode acts with
     them. An episode is sent when it ends, with the names of a recording by

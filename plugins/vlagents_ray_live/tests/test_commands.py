@@ -25,7 +25,7 @@ from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.robot.loop import LoopOptions, LoopReport, run_loop
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.sessions import SessionTable
 from vlagents_ray_live import live_page
@@ -169,7 +169,12 @@ def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str,
         thread = threading.Thread(
             target=lambda: reports.append(
                 run_loop(
-                    arm, player, hz=100, instruction="hold", commands=commands, until=over.is_set
+                    arm,
+                    player,
+                    hz=100,
+                    instruction="hold",
+                    until=over.is_set,
+                    options=LoopOptions(commands=commands),
                 )
             )
         )

@@ -23,7 +23,7 @@ from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import PriorityName
-from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.robot.loop import LoopOptions, LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.access import api_keys
 
@@ -188,8 +188,8 @@ def operated(
                     player,
                     hz=50,
                     instruction="wipe the table",
-                    commands=commands,
                     until=over.is_set,
+                    options=LoopOptions(commands=commands),
                 )
             )
         )

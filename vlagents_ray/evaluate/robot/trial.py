@@ -34,7 +34,7 @@ from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
-from vlagents_ray.robot import Guard, LoopReport, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, LoopReport, run_loop
 from vlagents_ray.robot.fit import Trained
 from vlagents_ray.robot.guard import measured_state
 from vlagents_ray.robot.limits import MotionLimits
@@ -266,21 +266,24 @@ def play(
         failed = None
         report = LoopReport(settings.hz)
         try:
+            options = LoopOptions(
+                restart="manual",
+                commands=_OperatorStop(operator),
+                # The rehearsal has compared the numbers with the training; in a trial, the policy's
+                # behaviour is its result.
+                fit=fit_of(player, robot, trained=Trained()),
+                reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
+            )
             report = run_loop(
                 robot,
                 player,
                 hz=settings.hz,
                 seconds=task.max_steps / settings.hz,
-                instruction=task.instruction,
-                reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
-                watchdog=watchdog,
-                restart="manual",
-                recorder=recorder,
                 until=until,
-                commands=_OperatorStop(operator),
-                # The rehearsal has compared the numbers with the training; in a trial, the policy's
-                # behaviour is its result.
-                fit=fit_of(player, robot, trained=Trained()),
+                instruction=task.instruction,
+                watchdog=watchdog,
+                recorder=recorder,
+                options=options,
             )
         except CheckpointFailed:
             raise

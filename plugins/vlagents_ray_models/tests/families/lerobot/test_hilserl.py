@@ -30,7 +30,7 @@ from lerobot_policy_vlagents.hilserl import Actor, transitions, write_checkpoint
 from plugins.vlagents_ray_models.tests.families.lerobot.commands import Server, serving
 from vlagents_ray import ChunkPlayer, Obs, PlayerSettings, RemoteAgent
 from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable
-from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot import Guard, LoopOptions, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.engine.engine import Engine
@@ -137,7 +137,14 @@ def play(server: Server, actor: Any, wants: ScriptedLeader | None = None) -> Non
     )
     with player:
         options, robot = {"weights": "follow"}, SimulatedRobot(agent.contract)
-        run_loop(robot, player, hz=HZ, seconds=FRAMES / HZ, reset_options=options, recorder=actor)
+        run_loop(
+            robot,
+            player,
+            hz=HZ,
+            seconds=FRAMES / HZ,
+            recorder=actor,
+            options=LoopOptions(reset_options=options),
+        )
 
 
 class Pushes(Publisher):
