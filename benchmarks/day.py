@@ -284,7 +284,7 @@ class DayWatchdog(Watchdog):
 
     def start(self) -> None:
         for name in self._limits:
-            self._heard[name] = self.clock.now
+            self._heard_at[name] = self.clock.now
 
     def close(self) -> None:
         pass

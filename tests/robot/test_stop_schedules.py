@@ -85,7 +85,7 @@ class UnwatchedWatchdog(Watchdog):
 
     def find_silence(self) -> None:
         """Do as the thread of a watchdog whose camera was silent for too long, and is no longer."""
-        self._heard["camera"] = -1e9
+        self._heard_at["camera"] = -1e9
         reason, _ = self.overdue()
         assert reason is not None
         self.control.heard("camera")

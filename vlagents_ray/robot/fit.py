@@ -1,4 +1,4 @@
-"""Whether a checkpoint fits an arm: the statistics of its training against the arm's present
+"""Whether a checkpoint fits an arm: compares the statistics of its training with the arm's present
 state and limits.
 """
 
@@ -38,23 +38,34 @@ class Trained:
 
     state: Span | None = None
     action: Span | None = None
-    parts: tuple[str, ...] | None = None  # of the state, in order; "gripper" is `Obs.gripper`
+    # The names of the state's parts, in order; "gripper" is `Obs.gripper`.
+    state_names: tuple[str, ...] | None = None
 
     @classmethod
     def read(cls, path: str | Path) -> Trained:
         """Read LeRobot's `stats.json`, openpi's `norm_stats.json` or GR00T's `statistics.json`.
 
-        The range is that from `min` to `max`, or else from `q01` to `q99`. Of GR00T's groups, which
-        are joined in the file's order, the file must have only one robot.
+        A range is from `min` to `max`, or else from `q01` to `q99`. GR00T's groups of numbers are
+        joined in the order of the file, which must have the statistics of only one robot.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The ranges of state and action.
 
         Raises:
-            ConfigError: The file is missing, or is none of these.
+            ConfigError: The file is missing, or has none of these formats.
         """
         try:
             statistics: Any = json.loads(Path(path).read_text(encoding="utf-8"))
             statistics = statistics.get("norm_stats", statistics)
-            if len(statistics) == 1 and {"state", "action"} <= set(next(iter(statistics.values()))):
-                [statistics] = statistics.values()  # GR00T's have the robot as the only key
+
+            # In GR00T's files, the robot is the only key.
+            if len(statistics) == 1:
+                [robot_statistics] = statistics.values()
+                if {"state", "action"} <= set(robot_statistics):
+                    statistics = robot_statistics
             trained = cls.from_statistics(statistics)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(
@@ -70,22 +81,35 @@ class Trained:
     def from_statistics(cls, statistics: Mapping[str, Any]) -> Trained:
         """Return the ranges in statistics, such as those in a server's metadata
         (`Agent.statistics`).
+
+        Args:
+            statistics: The ranges by the names "observation.state" or "state", and "action" or
+                "actions"; further "parts", the names of the state's parts.
+
+        Returns:
+            The ranges of state and action, None for one that the statistics lack.
         """
         state = _first_range(statistics, ("observation.state", "state"))
         action = _first_range(statistics, ("action", "actions"))
-        parts = tuple(statistics["parts"]) if "parts" in statistics else None
-        return cls(state, action, parts)
+        state_names = tuple(statistics["parts"]) if "parts" in statistics else None
+        return cls(state, action, state_names)
 
-    def vector(self, obs: Obs, parts: Sequence[str]) -> np.ndarray | None:
-        """Return the state in the order of the training, else of `parts`, (D,); None if it lacks
-        one of them.
+    def vector(self, obs: Obs, default_names: Sequence[str]) -> np.ndarray | None:
+        """Return the state of an observation in the order of the training.
+
+        Args:
+            obs: The observation.
+            default_names: The names of the state's parts, in order, if the training names none.
+
+        Returns:
+            The state, (D,); None if the observation lacks one of its parts.
         """
         values = dict(obs.state)
         if obs.gripper is not None:
             values["gripper"] = np.array([obs.gripper])
             values["gripper_closed"] = np.array([1 - obs.gripper])
 
-        names = parts if self.parts is None else self.parts
+        names = default_names if self.state_names is None else self.state_names
         if not names or not values.keys() >= set(names):
             return None
         return np.concatenate([values[name] for name in names])
@@ -104,7 +128,10 @@ class Trained:
             state: The arm's present state in the order of the training, (D,).
             chunk: The policy's first chunk, (H, D).
             limits: The limits of the arm.
-            names: The names of the numbers by the arm's driver; default: those of `limits`.
+            names: The names of the numbers by the arm's driver; default: the names in `limits`.
+
+        Returns:
+            The sentences; none if everything fits.
         """
         joints = () if limits is None else limits.joints
         sentences = []
@@ -121,20 +148,24 @@ class Trained:
             sentences += _outside("first chunk", chunk, *self.action, names)
 
         if limits is not None and self.action is not None:
-            bounds = limits.bounds(len(self.action[0]))
-            for limit, trained, sign in zip(bounds, self.action, (-1, 1), strict=True):
-                for i in np.flatnonzero(sign * (trained - limit) > 0):
-                    sentences.append(
-                        f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's "
-                        f"limit is {limit[i]:.4g}; are they of another arm, or in another order?"
-                    )
+            low_limits, high_limits = limits.bounds(len(self.action[0]))
+            low_trained, high_trained = self.action
+            sentences += _beyond(low_trained, low_limits, low_trained < low_limits, names)
+            sentences += _beyond(high_trained, high_limits, high_trained > high_limits, names)
         return sentences
 
     def draw(
         self, chunk: np.ndarray, limits: MotionLimits | None, names: Sequence[str] = ()
     ) -> list[str]:
-        """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for
-        each number.
+        """Draw the first chunk next to the training's actions and the limits.
+
+        Args:
+            chunk: The policy's first chunk, (H, D).
+            limits: The limits of the arm.
+            names: The names of the numbers of an action.
+
+        Returns:
+            A legend, and a line for each number.
         """
         dim = chunk.shape[1]
         trained = self.action
@@ -150,7 +181,10 @@ class Trained:
         lines = [f"{legend:<{_WIDTH + 22}}{'chunk':>20}{'training':>20}{'limits':>20}"]
         for i in range(dim):
             ranges = [(float(low[i]), float(high[i])) for low, high in spans]
-            numbers = "".join(f"{f'{low:.3g} … {high:.3g}':>20}" for low, high in reversed(ranges))
+            numbers = ""
+            for low_end, high_end in reversed(ranges):
+                text = f"{low_end:.3g} … {high_end:.3g}"
+                numbers += f"{text:>20}"
             lines.append(f"{_name(i, names):<20}|{_bars(ranges)}|{numbers}")
         return lines
 
@@ -164,7 +198,8 @@ class Fit:
     trained: Trained
     limits: MotionLimits | None = None  # the limits of the arm
     names: tuple[str, ...] = ()  # the names of the arm's joints, by its driver
-    parts: tuple[str, ...] = ()  # the parts of the state, in order, if the training names none
+    # The names of the state's parts, in order, if the training names none.
+    state_names: tuple[str, ...] = ()
     accept: bool = False  # whether misfits are only logged
 
     @property
@@ -173,8 +208,8 @@ class Fit:
         return self.trained != Trained() or self.limits is not None
 
     def draw(self, rows: np.ndarray) -> list[str]:
-        """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for
-        each number.
+        """Draw the first chunk, (H, D), next to the training's actions and the limits: a legend,
+        and a line for each number.
         """
         return self.trained.draw(rows, self.limits, self.names)
 
@@ -191,13 +226,25 @@ class Fit:
         """
         if not self.compares:
             return
-        state = None if obs is None else self.trained.vector(obs, self.parts)
-        limits = None if obs is None else self.limits
-        require_fit(self.trained.misfits(state, rows, limits, self.names), accept=self.accept)
+        state = None
+        limits = None
+        if obs is not None:
+            state = self.trained.vector(obs, self.state_names)
+            limits = self.limits
+        misfits = self.trained.misfits(state, rows, limits, self.names)
+        require_fit(misfits, accept=self.accept)
 
 
 def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
-    """Raise `ContractMismatch` with every misfit; with `accept`, log them as warnings instead."""
+    """Raise an error if a checkpoint does not fit an arm.
+
+    Args:
+        misfits: A sentence about each number that does not fit.
+        accept: Whether the misfits are only logged as a warning.
+
+    Raises:
+        ContractMismatch: There are misfits, and `accept` is off.
+    """
     if not misfits:
         return
     text = "the checkpoint does not fit this arm:\n" + "\n".join(f"- {line}" for line in misfits)
@@ -230,14 +277,15 @@ def _bars(ranges: Sequence[tuple[float, float]]) -> str:
     """Draw the ranges of a number in limits, training and chunk over each other, with `_WIDTH`
     characters.
     """
-    ends = [end for low_high in ranges for end in low_high]
-    finite = [end for end in ends if np.isfinite(end)] or [0.0]
+    ends = np.ravel(ranges)
+    finite = ends[np.isfinite(ends)].tolist() or [0.0]
     lowest, highest = min(finite), max(finite)
 
     characters = np.full(_WIDTH, " ")
+    width = max(highest - lowest, 1e-9)
     for mark, low_high in zip(".-#", ranges, strict=True):
         if np.isfinite(low_high).any():
-            shares = (np.clip(low_high, lowest, highest) - lowest) / max(highest - lowest, 1e-9)
+            shares = (np.clip(low_high, lowest, highest) - lowest) / width
             first, last = (shares * (_WIDTH - 1)).astype(int)
             characters[first : last + 1] = mark
     return "".join(characters)
@@ -254,6 +302,9 @@ def _outside(
         low: The lowest numbers of the training, (D,).
         high: The highest numbers of the training, (D,).
         names: The names of the numbers, if they are known.
+
+    Returns:
+        A sentence about each number.
     """
     if rows.shape[1] != len(low):
         sentence = (
@@ -281,6 +332,19 @@ def _outside(
         sentences.append(
             f"{vector}{_name(int(i), names)}: got {number:.4g}, was trained from {low[i]:.4g} to "
             f"{high[i]:.4g}{hint}"
+        )
+    return sentences
+
+
+def _beyond(
+    trained: np.ndarray, limits: np.ndarray, is_beyond: np.ndarray, names: Sequence[str]
+) -> list[str]:
+    """List the ends of the trained range, (D,), that are beyond the limits, (D,)."""
+    sentences = []
+    for i in np.flatnonzero(is_beyond):
+        sentences.append(
+            f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's limit is "
+            f"{limits[i]:.4g}; are they of another arm, or in another order?"
         )
     return sentences
 

@@ -16,23 +16,25 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
 SOFT_START_S = 120.0
-_ROUNDING = 2.0**-23  # of a float32, with a margin for actions of earlier ticks that were larger
-_FIRST_S = 0.5  # of the limit of velocity: how far the first action may be
-# How many times longer than its limits require the way from rest to the first action takes.
-_SLOWLY = 2.0
+# The relative rounding of a float32, with a margin for actions of earlier ticks that were larger.
+_ROUNDING = 2.0**-23
+# The first action may be as far away as this time at the limit of velocity, s.
+_FIRST_S = 0.5
+# The way from rest to the first action takes this many times longer than its limits require.
+_SLOWNESS = 2.0
 
 
 class Guard:
-    """A check that accepts an action or raises `InvalidAction`; it never clips one, as that would
-    be another motion.
+    """A check that accepts an action or raises `InvalidAction`; it never clips an action, as that
+    would be another motion.
 
     The guard checks the action's shape, that its numbers are finite and within the bounds, and that
-    it is not too far from the previous one. There is no previous action before the first one, and
-    after a stop the arm need not be where the last action commanded it. With `measure` these
+    it is not too far from the previous action. Before the first action there is no previous one,
+    and after a stop the arm need not be where the last action commanded it. With `measure` these
     actions are compared with the measured pose, and the grippers with their last command. Without
-    it the first absolute action may be anywhere within the bounds, and one after a stop is compared
-    with the last action. Relative actions are compared with no motion; their grippers, which are
-    positions, with the last command.
+    it, the first absolute action may be anywhere within the bounds, and an action after a stop is
+    compared with the last one. Relative actions are compared with no motion; their grippers, which
+    are positions, with the last command.
 
     With `limits`, speed, acceleration and jerk are also checked, and the position of the tip.
     Braking is always allowed, as the robot's own stop is harder. A chunk player then eases each
@@ -42,8 +44,8 @@ class Guard:
     Args:
         contract: The policy's contract, for the action's dimension and bounds; None checks neither.
         low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest
-            of this, the contract's and that of `limits` applies. Bounds of relative actions are of
-            the actions themselves.
+            of this bound, the contract's and the bound of `limits` applies. Bounds of relative
+            actions limit the actions themselves.
         high: Upper bound, as `low`.
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None
             checks none.
@@ -102,17 +104,17 @@ class Guard:
 
         self._measure = measure
         self._soft_ticks = soft_start_s * (hz or 0.0)
-        self._moved = 0  # the number of ticks with motion
+        self._ticks_with_motion = 0
 
         # For each of low, high, max_step, velocity, acceleration and jerk, the limit of each number
         # of an action, in its units and ticks.
         self._columns: list[list[float]] = []
-        self._grippers: list[int] = []
-        self._deltas: list[int] = []
+        self._grippers: list[int] = []  # the indices of the grippers in an action
+        self._deltas: list[int] = []  # the indices of the relative numbers
 
-        self._then: list[float] | None = None  # the last accepted action; None at rest
-        self._speed: list[float] = []  # its change from the action before, units a tick
-        self._change: list[float] = []  # the change of the speed
+        self._accepted: list[float] | None = None  # the last accepted action; None at rest
+        self._speeds: list[float] = []  # its difference from the action before, units a tick
+        self._changes: list[float] = []  # the difference of the speeds from those before
         if self._dim is not None:
             self._limits_of(self._dim)
 
@@ -130,11 +132,11 @@ class Guard:
             ConfigError: `measure` returns another number of values than an action has.
             InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
         """
-        self._then = None
+        self._accepted = None
         if last is not None and self._spec.relative:
             self._limits_of(len(last))
             standing = last.copy()
-            standing[self._deltas] = 0.0  # the robot stands
+            standing[self._deltas] = 0.0  # the robot does not move
             return standing
         if self._measure is None:
             return last
@@ -175,14 +177,14 @@ class Guard:
             raise InvalidAction(
                 f"action: got {action.shape} {action.dtype}, want ({dim},) float32, a single row"
             )
-        now = action.tolist()  # plain floats: for so few numbers they are faster than numpy
-        if not all(map(math.isfinite, now)):
+        numbers = action.tolist()  # plain floats: for so few numbers they are faster than numpy
+        if not all(map(math.isfinite, numbers)):
             raise InvalidAction(
-                f"action: got {now}, want finite numbers; the policy's output is broken"
+                f"action: got {numbers}, want finite numbers; the policy's output is broken"
             )
 
-        low, high, steps, *dynamic = self._limits_of(len(now))
-        for i, number in enumerate(now):
+        low, high, steps, *dynamic_limits = self._limits_of(len(numbers))
+        for i, number in enumerate(numbers):
             if not low[i] <= number <= high[i]:
                 name, limit = ("below", low[i]) if number < low[i] else ("above", high[i])
                 raise InvalidAction(
@@ -190,27 +192,30 @@ class Guard:
                     cause="limits",
                 )
         if self.limits is not None and self.limits.chain is not None:
-            self._check_workspace(self.limits, self.limits.chain.tip(now))
+            self._check_workspace(self.limits, self.limits.chain.tip(numbers))
 
         if last is not None and last.shape != action.shape:
             raise InvalidAction(
                 f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
             )
-        then = now.copy() if last is None else last.tolist()
         if last is None:  # from an unknown pose, but at rest
-            self._then = None
+            self._accepted = None
+            last_numbers = numbers.copy()
             for i in self._deltas:
-                then[i] = 0.0
+                last_numbers[i] = 0.0
+        else:
+            last_numbers = last.tolist()
 
-        for i, number in enumerate(now):
-            if abs(number - then[i]) > steps[i] + 2 * _ROUNDING * max(abs(number), abs(then[i])):
+        for i, (number, last_number) in enumerate(zip(numbers, last_numbers, strict=True)):
+            rounding = 2 * _ROUNDING * max(abs(number), abs(last_number))
+            if abs(number - last_number) > steps[i] + rounding:
                 raise InvalidAction(
-                    f"action[{i}]: got {number:g} after {then[i]:g}, a larger step than max_step "
-                    "allows",
+                    f"action[{i}]: got {number:g} after {last_number:g}, a larger step than "
+                    "max_step allows",
                     cause="max_step",
                 )
         if self.limits is not None:
-            self._check_dynamics(now, then, dynamic)
+            self._check_dynamics(numbers, last_numbers, dynamic_limits)
         return action
 
     def ease_in(
@@ -227,9 +232,9 @@ class Guard:
             start: The pose at rest, (D,) in the action's units; None if it is unknown. Of relative
                 actions only the grippers are used.
             goal: The first action, (D,).
-            plan: The rows of the plan from `goal` on, (H, D), whose speeds apply where the limits
-                have none.
-            far: Whether the distance is not checked.
+            plan: The rows of the plan that begins with `goal`, (H, D); its speeds apply where the
+                limits have none.
+            far: Whether the first action may be at any distance.
 
         Returns:
             The ease-in; None without limits of speed, acceleration and jerk, or from an unknown
@@ -251,30 +256,41 @@ class Guard:
         if all(limit is None for limit in dynamic_limits):
             return None
 
-        at_once = [
-            i for i in self._grippers if velocity[i] == acceleration[i] == jerk[i] == math.inf
-        ]
+        # Grippers without limits jump to their position.
+        at_once = []
+        for i in self._grippers:
+            if velocity[i] == acceleration[i] == jerk[i] == math.inf:
+                at_once.append(i)
+
         distances = np.abs(goal.astype(np.float64) - start)
         distances[self._deltas + at_once] = 0.0
-        speeds = self._speeds(goal if plan is None else plan)
-        ramp = approach = 0.0
-        for i, (distance, speed) in enumerate(
-            zip(distances.tolist(), speeds.tolist(), strict=True)
-        ):
-            v, a, j = (self._softness() * limit[i] for limit in (velocity, acceleration, jerk))
-            v_plan = v if v < math.inf else 2 * speed
-            if i not in at_once:  # the policy's own acceleration needs the other half
-                ramp = max(ramp, 2 * v_plan / a, 2 * v_plan / j)
-            # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
-            ticks_by_limit = (
-                1.875 * distance / v,
-                math.sqrt(5.7735 * distance / a),
-                (60 * distance / j) ** (1 / 3),
-            )
-            approach = max(approach, *(_SLOWLY * ticks for ticks in ticks_by_limit))
+        plan_speeds = self._plan_speeds(goal if plan is None else plan).tolist()
+        share = self._softness()
+        ramp_ticks = 0.0
+        approach_ticks = 0.0
+        for i, distance in enumerate(distances.tolist()):
+            max_speed = share * velocity[i]
+            max_acceleration = share * acceleration[i]
+            max_jerk = share * jerk[i]
 
-        ticks = math.ceil(approach) if self._deltas else max(1, math.ceil(approach))
-        return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), deltas=self._deltas, at_once=at_once)
+            if i not in at_once:
+                # Half of the acceleration and jerk is left to the policy's own motion.
+                speed = max_speed if max_speed < math.inf else 2 * plan_speeds[i]
+                ramp_ticks = max(ramp_ticks, 2 * speed / max_acceleration, 2 * speed / max_jerk)
+
+            # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
+            fastest_ticks = max(
+                1.875 * distance / max_speed,
+                math.sqrt(5.7735 * distance / max_acceleration),
+                (60 * distance / max_jerk) ** (1 / 3),
+            )
+            approach_ticks = max(approach_ticks, _SLOWNESS * fastest_ticks)
+
+        ticks = math.ceil(approach_ticks)
+        if not self._deltas:
+            ticks = max(1, ticks)
+        even_ramp_ticks = 2 * math.ceil(ramp_ticks / 2)
+        return EaseIn(start, ticks, even_ramp_ticks, deltas=self._deltas, at_once=at_once)
 
     def _check_first(
         self, limits: MotionLimits, start: np.ndarray, goal: np.ndarray, velocity: list[float]
@@ -296,7 +312,7 @@ class Guard:
                     cause="max_step",
                 )
 
-    def _speeds(self, plan: np.ndarray) -> np.ndarray:
+    def _plan_speeds(self, plan: np.ndarray) -> np.ndarray:
         """Return the largest speed of each number in the rows of a plan, (D,) units a tick."""
         rows = np.atleast_2d(plan).astype(np.float64)
         speeds: np.ndarray = np.abs(np.diff(rows, axis=0)).max(0, initial=0.0)
@@ -304,26 +320,37 @@ class Guard:
         return speeds
 
     def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the commands, (D,) float32, of the slow way from the last one to the rest pose,
-        if `limits` has one.
+        """Yield the commands of the slow way to the rest pose; none if `limits` has no rest pose.
+
+        Args:
+            last: The last command, (D,) float32.
+
+        Yields:
+            The commands, (D,) float32.
         """
         if self.limits is None or self.limits.rest is None:
             return
         self._limits_of(len(last))
-        rest = last.copy()
-        for number, pose in enumerate(self.limits.rest):
-            if pose is not None:
-                rest[number] = pose
+        rest_pose = last.copy()
+        for i, number in enumerate(self.limits.rest):
+            if number is not None:
+                rest_pose[i] = number
 
-        ease = self.ease_in(last, rest, far=True)
+        ease = self.ease_in(last, rest_pose, far=True)
         yield last  # the way begins at rest
         while ease is not None and not ease.arrived:
-            command, _ = ease.step(rest, None, 1)
+            command, _ = ease.step(rest_pose, None, 1)
             yield command
 
     def _limits_of(self, dim: int) -> list[list[float]]:
-        """Return the limits of each number of an action; raises `ConfigError` if they do not fit
-        its meaning.
+        """Return the limits of each number of an action (see `_columns`), and find out which
+        numbers are grippers and which are relative.
+
+        Args:
+            dim: The number of numbers of an action.
+
+        Raises:
+            ConfigError: The limits do not fit the meaning of an action.
         """
         if self._columns and len(self._columns[0]) == dim:
             return self._columns
@@ -361,8 +388,8 @@ class Guard:
             raise ConfigError(
                 f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}"
             )
-        rest = limits.rest or ()
-        moved_grippers = [i for i in self._grippers if rest and rest[i] is not None]
+        rest_pose = limits.rest or ()
+        moved_grippers = [i for i in self._grippers if rest_pose and rest_pose[i] is not None]
         if moved_grippers:
             raise ConfigError(
                 f"rest: expected null for the grippers, numbers {moved_grippers}, as the way to "
@@ -386,50 +413,75 @@ class Guard:
 
     def _softness(self) -> float:
         """Return the share of the limits of speed, acceleration and jerk that applies now."""
-        if self._moved >= self._soft_ticks:
+        if self._ticks_with_motion >= self._soft_ticks:
             return 1.0
-        return 0.5 + 0.5 * self._moved / self._soft_ticks
+        return 0.5 + 0.5 * self._ticks_with_motion / self._soft_ticks
 
     def _check_dynamics(
-        self, now: list[float], then: list[float], limits: Sequence[list[float]]
+        self, numbers: list[float], last_numbers: list[float], limits: Sequence[list[float]]
     ) -> None:
-        """Raise `InvalidAction` if the motion of this tick exceeds a limit of speed, acceleration
-        or jerk; else record it.
+        """Check the speed, acceleration and jerk of this tick's motion, and record it.
+
+        Args:
+            numbers: The numbers of the action.
+            last_numbers: The numbers of the action or pose from which the motion begins.
+            limits: The limits of velocity, acceleration and jerk of each number, in ticks.
+
+        Raises:
+            InvalidAction: The motion exceeds a limit.
         """
-        zeros = [0.0] * len(now)
-        if then == self._then:  # the motion continues
-            speeds, changes = self._speed, self._change
+        velocity_limits, acceleration_limits, jerk_limits = limits
+        zeros = [0.0] * len(numbers)
+        if last_numbers == self._accepted:  # the motion continues
+            last_speeds, last_changes = self._speeds, self._changes
         else:
-            speeds, changes = zeros.copy(), zeros
-        moved = [a - b for a, b in zip(now, then, strict=True)]
+            last_speeds, last_changes = zeros.copy(), zeros
+
+        pairs = zip(numbers, last_numbers, strict=True)
+        speeds = [number - last_number for number, last_number in pairs]
         for i in self._deltas:
-            moved[i] = now[i]
-            speeds[i] = then[i]
+            speeds[i] = numbers[i]
+            last_speeds[i] = last_numbers[i]
+        changes = [speed - last for speed, last in zip(speeds, last_speeds, strict=True)]
 
         share = self._softness()
-        for i, (v, u, c, *limit) in enumerate(zip(moved, speeds, changes, *limits, strict=True)):
+        for i, speed in enumerate(speeds):
             # An action's rounding to float32 counts twice in a speed, and twice as often in each
             # further difference.
-            rounding = 2 * _ROUNDING * max(abs(now[i]), abs(then[i]))
-            if abs(v) > share * limit[0] + rounding:
-                raise self._refusal("velocity", i, v, share * limit[0], 1)
-            if abs(v) <= abs(u) and v * u >= 0.0:  # it brakes
+            rounding = 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i]))
+            limit = share * velocity_limits[i]
+            if abs(speed) > limit + rounding:
+                raise self._refusal("velocity", i, speed, limit, 1)
+
+            last_speed = last_speeds[i]
+            is_braking = abs(speed) <= abs(last_speed) and speed * last_speed >= 0.0
+            if is_braking:
                 continue
-            if abs(v - u) > share * limit[1] + 2 * rounding:
-                raise self._refusal("acceleration", i, v - u, share * limit[1], 2)
-            if abs(v - u - c) > share * limit[2] + 4 * rounding:
-                raise self._refusal("jerk", i, v - u - c, share * limit[2], 3)
+
+            change = changes[i]
+            limit = share * acceleration_limits[i]
+            if abs(change) > limit + 2 * rounding:
+                raise self._refusal("acceleration", i, change, limit, 2)
+
+            jerk = change - last_changes[i]
+            limit = share * jerk_limits[i]
+            if abs(jerk) > limit + 4 * rounding:
+                raise self._refusal("jerk", i, jerk, limit, 3)
+
+        has_moved = any(speeds)
         # After a tick at rest, the deceleration before it is over.
-        self._change = [v - u for v, u in zip(moved, speeds, strict=True)] if any(moved) else zeros
-        self._then, self._speed = now, moved
-        self._moved += any(moved)
+        self._changes = changes if has_moved else zeros
+        self._accepted = numbers
+        self._speeds = speeds
+        self._ticks_with_motion += has_moved
 
     def _refusal(
         self, quantity: str, i: int, value: float, limit: float, order: int
     ) -> InvalidAction:
         """Return the error for a number whose difference of that order exceeds its limit."""
         per_s = (self.hz or 1.0) ** order
-        soft = "" if self._moved >= self._soft_ticks else ", which the soft start lowers"
+        is_soft = self._ticks_with_motion < self._soft_ticks
+        soft = ", which the soft start lowers" if is_soft else ""
         return InvalidAction(
             f"action[{i}]: got {quantity} {value * per_s:.4g}, want {limit * per_s:.3g} at most "
             f"(units/s^{order}{soft})",
@@ -452,8 +504,14 @@ class Guard:
 
 
 def measured_state(name: str | None) -> Callable[[Obs], np.ndarray] | None:
-    """Return a `measure` of a `Guard`: the part of the state with that name, such as "joints";
-    None measures nothing.
+    """Return a `measure` of a `Guard` that reads a part of the state.
+
+    Args:
+        name: The name of the part, such as "joints"; None measures nothing.
+
+    Returns:
+        The function, which raises `MissingState` if an observation lacks the part; None without a
+        name.
     """
     if name is None:
         return None

@@ -37,8 +37,8 @@ class OpenLeader(Protocol):
 
         Args:
             contract: The contract of the policy or the environment.
-            step: The change of a number of the action at a tick; None: by the contract.
-            measure: Returns the robot's measured pose; None: the state's part `joints`.
+            step: The change of a number of the action at a tick; None takes it from the contract.
+            measure: Returns the robot's measured pose; None reads the state's part `joints`.
 
         Returns:
             A context manager, which yields the leader and closes the device.
@@ -66,7 +66,7 @@ def leader_named(option: str, name: str) -> OpenLeader:
             contract: Contract | None, /, *, step: float | None, measure: Measure | None
         ) -> AbstractContextManager[Leader]:
             """Make a leader of the user's class."""
-            del contract, step, measure  # a class of the user's has its own settings
+            del contract, step, measure  # the user's class has its own settings
             return _opened(f"{option} {name}", make)
 
         return open_class
@@ -95,7 +95,8 @@ def _opened(where: str, make: Callable[[], Leader]) -> Iterator[Leader]:
 
 
 class TeleoperatedAgent(Agent):
-    """An agent whose actions are all a leader's, engaged or not; there is no policy.
+    """An agent that returns the action of a leader at each tick, whether it is engaged or not, in
+    place of a policy.
 
     Args:
         leader: The device with which the operator moves the robot.

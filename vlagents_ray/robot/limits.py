@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,12 @@ from vlagents_ray.registry import require
 from vlagents_ray.yaml_text import load_yaml
 
 Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one for each
-QUANTILE = 0.999  # of the demonstrations' speeds: a single broken frame must not set a limit
+# Limits from a dataset are based on this quantile of the demonstrations' speeds, since a single
+# broken frame must not set a limit.
+QUANTILE = 0.999
 MARGIN = 2.0
-"""Limits from a dataset are its quantiles times this. The soft start begins at half of them,
-i.e. at the quantiles.
+"""The factor from the quantiles of a dataset to its limits. The soft start begins at half of the
+limits, i.e. at the quantiles.
 """
 _PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
 _TOLERANCE = 0.1  # the share of the demonstrated range by which an action may leave it
@@ -43,11 +45,11 @@ class MotionLimits:
     low: Numbers | None = None
     high: Numbers | None = None
     velocity: Numbers | None = None  # units/s
-    acceleration: Numbers | None = None  # units/s^2, of speeding up; a robot may always brake
-    jerk: Numbers | None = None  # units/s^3, as `acceleration`
+    acceleration: Numbers | None = None  # units/s^2; a robot may always brake
+    jerk: Numbers | None = None  # units/s^3; a robot may always brake
     first: Numbers | None = None
-    """The largest distance of the first action from the pose at rest; default: that of 0.5 s at
-    `velocity`.
+    """The largest distance of the first action from the pose at rest; default: the distance of
+    0.5 s at `velocity`.
     """
     rest: tuple[float | None, ...] | None = None
     """The pose to which the arm goes slowly at the end of a run. A number that is None, as the
@@ -83,9 +85,9 @@ class MotionLimits:
         """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a
         LeRobotDataset v3.0.
 
-        The keys of a YAML or JSON file are the fields of this class, without `chain`, and further
-        `urdf`, a file beside it whose limits also apply, and `tip`, the link that the workspace is
-        for.
+        The keys of a YAML or JSON file are the fields of this class without `chain`. Two further
+        keys are `urdf`, the path of a URDF relative to the file, whose limits also apply, and
+        `tip`, the link whose position the workspace limits.
 
         Args:
             path: The file or folder.
@@ -93,7 +95,7 @@ class MotionLimits:
                 absolute targets.
 
         Returns:
-            The limits of the file; those of a dataset allow somewhat more than its demonstrations.
+            The limits. Limits of a dataset allow somewhat more than its demonstrations.
 
         Raises:
             ConfigError: The file is missing, or has an unknown key or a wrong value.
@@ -102,10 +104,10 @@ class MotionLimits:
         path = Path(path)
         try:
             if path.is_dir():
-                return cls._of_dataset(path, action)
+                return cls._from_dataset(path, action)
             if path.suffix == ".urdf":
-                return cls._of_urdf(path, (), None, 1.0)
-            return cls._of_document(path, _document(path))
+                return cls._from_urdf(path, joints=(), tip=None, scale=1.0)
+            return cls._from_document(path, _document(path))
         except (
             OSError,
             ValueError,
@@ -121,13 +123,17 @@ class MotionLimits:
             ) from error
 
     @classmethod
-    def _of_document(cls, path: Path, document: Any) -> MotionLimits:
-        urdf, tip = document.pop("urdf", None), document.pop("tip", None)
-        known = {field.name for field in fields(cls)} - {"chain"} | {"urdf", "tip"}
-        unknown = sorted(set(document) - known)
+    def _from_document(cls, path: Path, document: Any) -> MotionLimits:
+        """Return the limits in the content of a YAML or JSON file."""
+        urdf = document.pop("urdf", None)
+        tip = document.pop("tip", None)
+        known_keys = {field.name for field in fields(cls)} - {"chain"} | {"urdf", "tip"}
+        unknown = sorted(set(document) - known_keys)
         if unknown:
-            suggestions = "".join(did_you_mean(str(key), known) for key in unknown)
-            raise ConfigError(f"unknown keys {unknown}, want some of {sorted(known)}{suggestions}")
+            suggestions = "".join(did_you_mean(str(key), known_keys) for key in unknown)
+            raise ConfigError(
+                f"unknown keys {unknown}, want some of {sorted(known_keys)}{suggestions}"
+            )
         if not isinstance(document.get("joints", []), list):
             raise ConfigError(f"joints: expected a list of names, got {document['joints']!r}")
 
@@ -147,12 +153,16 @@ class MotionLimits:
                     "limits are in the units of the actions; remove `unit`"
                 )
             return limits
-        urdf_limits = cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit])
+
+        urdf_limits = cls._from_urdf(
+            path.parent / urdf, joints=limits.joints, tip=tip, scale=_PER_RAD[limits.unit]
+        )
         return limits.stricter(urdf_limits)
 
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return `low` and `high`, (dim,) each; infinite where none is set, and for another
-        number of joints.
+        """Return the lowest and the highest positions, (dim,) each.
+
+        A bound is infinite if it is not set, or if it is for another number of joints.
         """
 
         def bound(limit: Numbers | None, unlimited: float) -> np.ndarray:
@@ -163,7 +173,9 @@ class MotionLimits:
         return bound(self.low, -np.inf), bound(self.high, np.inf)
 
     def stricter(self, other: MotionLimits) -> MotionLimits:
-        """Return these limits, each replaced by the other's where that is stricter."""
+        """Return the stricter of both limits, number by number; this object's rest pose, workspace,
+        unit and distance of the first action stay.
+        """
 
         def stricter_of(name: str) -> Numbers | None:
             """Return the stricter of both values of a field."""
@@ -175,29 +187,22 @@ class MotionLimits:
 
         names = ("low", "high", "velocity", "acceleration", "jerk")
         bounds = {name: stricter_of(name) for name in names}
-        chain, joints = self.chain or other.chain, self.joints or other.joints
+        chain = self.chain or other.chain
+        joints = self.joints or other.joints
         return replace(self, chain=chain, joints=joints, **bounds)  # type: ignore[arg-type]
 
     @classmethod
-    def _of_dataset(cls, folder: Path, action: ActionSpec | None) -> MotionLimits:
+    def _from_dataset(cls, folder: Path, action: ActionSpec | None) -> MotionLimits:
+        """Return limits that allow the motions of a LeRobotDataset."""
         info = json.loads((folder / "meta/info.json").read_text())
         if INFO in info:
             action = DatasetContract.from_json(info[INFO]).contract.action
 
-        parquet = require("pyarrow.parquet", extra="record")
         fps = float(info["fps"])
-        episodes: dict[int, list[np.ndarray]] = {}
-        for file in sorted(folder.glob("data/*/*.parquet")):
-            table = parquet.read_table(file, columns=["action", "episode_index"])
-            rows = np.array(table["action"].to_pylist(), np.float64)
-            rows = rows.reshape(len(rows), -1)  # LeRobot stores an action of one number as a scalar
-            numbers = table["episode_index"].to_numpy()
-            for number in np.unique(numbers):
-                episodes.setdefault(int(number), []).append(rows[numbers == number])
-        if not episodes:
+        actions_of_episodes = _dataset_actions(folder)
+        if not actions_of_episodes:
             raise ConfigError("expected at least one frame in data/, got none")
 
-        actions_of_episodes = [np.concatenate(chunks) for chunks in episodes.values()]
         actions = np.concatenate(actions_of_episodes)
         tolerance = _TOLERANCE * np.ptp(actions, axis=0)
         deltas = (action or ActionSpec()).delta_columns(actions.shape[1])
@@ -208,16 +213,22 @@ class MotionLimits:
             changes = [np.abs(np.diff(path, order, axis=0)) for path in paths if len(path) > order]
             if not changes:
                 return tuple([math.inf] * actions.shape[1])
+
             limit: np.ndarray = np.quantile(np.concatenate(changes), QUANTILE, axis=0)
-            if deltas:  # a motion of deltas begins at rest, in too few frames to count among all
+            # A motion of deltas begins at rest, in too few frames to count among all of them.
+            if deltas:
                 starts = np.stack([episode[:order].max(0) for episode in changes])
-                limit = np.maximum(limit, np.quantile(starts, QUANTILE, axis=0, method="higher"))
+                start_limit = np.quantile(starts, QUANTILE, axis=0, method="higher")
+                limit = np.maximum(limit, start_limit)
             limit *= MARGIN * fps**order
-            # A gripper that hardly ever moves has the quantile 0, by which it could never be moved.
+            # A gripper that hardly ever moves has the quantile 0. With this limit, it could never
+            # be moved.
             return tuple(number if number > 0 else math.inf for number in limit.tolist())
 
-        low, high = actions.min(0) - tolerance, actions.max(0) + tolerance
-        low[deltas], high[deltas] = -np.inf, np.inf  # the range of deltas is that of the speeds
+        low = actions.min(0) - tolerance
+        high = actions.max(0) + tolerance
+        low[deltas] = -np.inf  # deltas are limited by `velocity`
+        high[deltas] = np.inf
         names = info["features"]["action"].get("names")
         return cls(
             low=tuple(low.tolist()),
@@ -229,18 +240,25 @@ class MotionLimits:
         )
 
     @classmethod
-    def _of_urdf(
-        cls, file: Path, joints: Sequence[str], tip: str | None, scale: float
+    def _from_urdf(
+        cls, file: Path, *, joints: Sequence[str], tip: str | None, scale: float
     ) -> MotionLimits:
+        """Return the limits of positions and speeds of a URDF.
+
+        Args:
+            file: The file.
+            joints: The joints of an action's numbers, in order; empty for all that move.
+            tip: The link whose position the workspace limits.
+            scale: The units of the actions per rad.
+        """
         robot = ET.parse(file).getroot()  # noqa: S314 - a file of this robot's owner
-        elements = {
-            joint.attrib["name"]: joint
-            for joint in robot.iter("joint")
-            if joint.find("child") is not None
-        }
-        names = [*joints] or [
-            name for name, joint in elements.items() if joint.attrib["type"] != "fixed"
-        ]
+        elements = {}
+        for joint in robot.iter("joint"):
+            if joint.find("child") is not None:
+                elements[joint.attrib["name"]] = joint
+
+        moving = [name for name, joint in elements.items() if joint.attrib["type"] != "fixed"]
+        names = list(joints) or moving
         unknown = sorted(set(names) - set(elements))
         if unknown:
             raise ConfigError(
@@ -250,13 +268,13 @@ class MotionLimits:
         def limit_of(name: str, key: str, default: float) -> float:
             """Return a limit of a joint in the units of the actions."""
             joint = elements[name]
-            kind = joint.attrib["type"]
-            unit = 1.0 if kind == "prismatic" else scale
+            joint_type = joint.attrib["type"]
+            unit = 1.0 if joint_type == "prismatic" else scale
 
             limit = joint.find("limit")
-            has_limit = limit is not None and (key == "velocity" or kind != "continuous")
+            is_limited = key == "velocity" or joint_type != "continuous"
             value = default
-            if limit is not None and has_limit:
+            if limit is not None and is_limited:
                 value = float(limit.attrib.get(key, default))
             if key == "velocity":
                 value = value or default  # URDFs write 0 for an unknown speed
@@ -271,59 +289,86 @@ class MotionLimits:
         )
 
 
+class _Joint(NamedTuple):
+    """A joint of a kinematic chain."""
+
+    rotation: list[float]  # from the child's frame to the parent's, (9,), row by row
+    offset: list[float]  # of the child's frame in the parent's, (3,), m
+    axis: list[float]  # unit vector, (3,)
+    index: int  # of its number in an action; -1 without one
+    slides: bool
+
+
 class Chain:
     """The forward kinematics from joints to the position of a link, in plain floats: numpy is
     slower for one point.
+
+    Args:
+        joints: The elements of the URDF's joints, by name.
+        tip: The link at the end of the chain.
+        names: The joints of an action's numbers, in order.
+        to_rad: The factor from the units of the actions to rad.
+
+    Raises:
+        ConfigError: There is no such link.
     """
 
     def __init__(
         self, joints: Mapping[str, Any], tip: str, names: Sequence[str], to_rad: float
     ) -> None:
-        """Read the joints from the base to the link `tip`; `names` are those of an action's
-        numbers, in order.
-        """
-        parents = {
-            joint.find("child").attrib["link"]: (name, joint) for name, joint in joints.items()
-        }
-        if tip not in parents:
-            raise ConfigError(f"tip: got {tip!r}, want one of the links {sorted(parents)}")
+        joint_of_child = {}
+        for name, joint in joints.items():
+            joint_of_child[joint.find("child").attrib["link"]] = (name, joint)
+        if tip not in joint_of_child:
+            raise ConfigError(f"tip: got {tip!r}, want one of the links {sorted(joint_of_child)}")
 
-        # The links from the tip to the base: rotation and offset of the joint, its axis, the index
-        # of its number in an action (-1 without one), and whether it slides.
-        self._links: list[tuple[list[float], list[float], list[float], int, bool]] = []
         self._to_rad = to_rad
-        while tip in parents:
-            name, joint = parents[tip]
-            origin, axis, kind = joint.find("origin"), joint.find("axis"), joint.attrib["type"]
+        self._joints: list[_Joint] = []  # from the tip to the base
+        link = tip
+        while link in joint_of_child:
+            name, joint = joint_of_child[link]
+            joint_type = joint.attrib["type"]
+            origin = joint.find("origin")
             attributes = {} if origin is None else origin.attrib
+            rotation = _rotation(*_three(attributes.get("rpy", "0 0 0")))
+
+            axis = joint.find("axis")
             direction = np.array([1.0, 0.0, 0.0] if axis is None else _three(axis.attrib["xyz"]))
             direction /= np.linalg.norm(direction) or 1.0
-            turn = _rotation(*_three(attributes.get("rpy", "0 0 0"))).ravel().tolist()
-            index = names.index(name) if name in names and kind != "fixed" else -1
-            offset = _three(attributes.get("xyz", "0 0 0"))
-            self._links.append((turn, offset, direction.tolist(), index, kind == "prismatic"))
-            tip = joint.find("parent").attrib["link"]
+
+            is_moved = name in names and joint_type != "fixed"
+            self._joints.append(
+                _Joint(
+                    rotation=rotation.ravel().tolist(),
+                    offset=_three(attributes.get("xyz", "0 0 0")),
+                    axis=direction.tolist(),
+                    index=names.index(name) if is_moved else -1,
+                    slides=joint_type == "prismatic",
+                )
+            )
+            link = joint.find("parent").attrib["link"]
 
     def tip(self, joints: Sequence[float]) -> tuple[float, float, float]:
         """Return the position of the tip in the base frame, m, at the numbers of an action."""
         x = y = z = 0.0
-        for turn, (ox, oy, oz), (ax, ay, az), index, slides in self._links:
+        for rotation, (ox, oy, oz), (ax, ay, az), index, slides in self._joints:
             if index >= 0 and slides:
                 x, y, z = x + joints[index] * ax, y + joints[index] * ay, z + joints[index] * az
             elif index >= 0:  # Rodrigues' formula
                 angle = joints[index] * self._to_rad
-                c, s = math.cos(angle), math.sin(angle)
-                along = (ax * x + ay * y + az * z) * (1.0 - c)
+                cos, sin = math.cos(angle), math.sin(angle)
+                along = (ax * x + ay * y + az * z) * (1.0 - cos)
                 x, y, z = (
-                    x * c + (ay * z - az * y) * s + ax * along,
-                    y * c + (az * x - ax * z) * s + ay * along,
-                    z * c + (ax * y - ay * x) * s + az * along,
+                    x * cos + (ay * z - az * y) * sin + ax * along,
+                    y * cos + (az * x - ax * z) * sin + ay * along,
+                    z * cos + (ax * y - ay * x) * sin + az * along,
                 )
-            a, b, c, d, e, f, g, h, i = turn
+
+            xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
             x, y, z = (
-                a * x + b * y + c * z + ox,
-                d * x + e * y + f * z + oy,
-                g * x + h * y + i * z + oz,
+                xx * x + xy * y + xz * z + ox,
+                yx * x + yy * y + yz * z + oy,
+                zx * x + zy * y + zz * z + oz,
             )
         return x, y, z
 
@@ -347,10 +392,14 @@ def _three(text: str) -> list[float]:
 
 
 def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
-    """Return the path of an episode's actions, (T, D); with deltas (T + 3, D), their sum, which
-    begins at rest.
+    """Return the path of an episode, whose differences are speeds for deltas as well.
 
-    The differences of a path are speeds for both kinds of actions.
+    Args:
+        actions: The actions of the episode, (T, D).
+        deltas: The indices of the relative numbers.
+
+    Returns:
+        The actions, (T, D); with deltas, (T + 3, D), their sum, which begins at rest.
     """
     if not deltas:
         return actions
@@ -362,8 +411,10 @@ def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
 
 
 def _numbers(name: str, value: object) -> np.ndarray:
-    """Return the number, or the numbers of a list, of a limit; none for None. Raises
-    `ConfigError` for others.
+    """Return the numbers of a limit, which is one number, a list of numbers, or None.
+
+    Raises:
+        ConfigError: The value is something else, or NaN.
     """
     if value is None:
         return np.array([], np.float64)
@@ -380,13 +431,27 @@ def _numbers(name: str, value: object) -> np.ndarray:
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return the value of a key of a file, where null in a list is no limit, or a number of
-    `rest` that stays.
+    """Return the value of a key of a file, with infinity in place of null, which is no limit; null
+    in `rest` stays.
     """
     if not isinstance(value, list):
         return value
     unlimited = -math.inf if key in ("low", "workspace_low") else math.inf
     return tuple(unlimited if number is None and key != "rest" else number for number in value)
+
+
+def _dataset_actions(folder: Path) -> list[np.ndarray]:
+    """Return the actions of each episode of a LeRobotDataset, (T, D) each."""
+    parquet = require("pyarrow.parquet", extra="record")
+    rows_of_episodes: dict[int, list[np.ndarray]] = {}
+    for file in sorted(folder.glob("data/*/*.parquet")):
+        table = parquet.read_table(file, columns=["action", "episode_index"])
+        rows = np.array(table["action"].to_pylist(), np.float64)
+        rows = rows.reshape(len(rows), -1)  # LeRobot stores an action of one number as a scalar
+        episodes = table["episode_index"].to_numpy()
+        for episode in np.unique(episodes):
+            rows_of_episodes.setdefault(int(episode), []).append(rows[episodes == episode])
+    return [np.concatenate(rows) for rows in rows_of_episodes.values()]
 
 
 def _document(path: Path) -> Any:

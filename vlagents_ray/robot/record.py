@@ -19,7 +19,7 @@ from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
 
-_NICE = 5  # the writing thread runs after the control loop's
+_NICE = 5  # the writing thread has a lower priority than the control loop
 
 
 class Recorder:
@@ -65,14 +65,16 @@ class Recorder:
             ) from error
         self._label: Label | None = None
         self._frames = frames
+
         # The next steps of the thread: functions of the running episode that return the episode
         # that runs afterwards. None ends the thread.
         self._queue: queue.SimpleQueue[
             Callable[[RunningEpisode | None], RunningEpisode | None] | None
         ]
         self._queue = queue.SimpleQueue()
-        self._added = 0  # the number of frames added, counted by the loop's thread
+        self._added = 0  # the number of frames added, counted by the thread of the control loop
         self._taken = 0  # the number of frames taken from the queue, counted by the writing thread
+
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-recorder", daemon=True)
         self._thread.start()
 
@@ -90,7 +92,10 @@ class Recorder:
     def episode(self, instruction: str) -> Iterator[None]:
         """Make the frames that are added within the context one episode.
 
-        It is kept however the context ends, unless it has the label "discard".
+        The episode is kept however the context ends, unless it has the label "discard".
+
+        Args:
+            instruction: The task in words.
         """
         self._label = None
         self._queue.put(lambda _: self._dataset.begin(instruction))
@@ -103,8 +108,8 @@ class Recorder:
         """Label the running episode; the last label counts. May be called from any thread.
 
         Args:
-            label: "success" or "failure", which the dataset keeps in the column `label` of its
-                episodes; "discard" drops the episode.
+            label: "success" or "failure", which is written to the column `label` of the dataset's
+                episodes; or "discard", which drops the episode.
 
         Raises:
             ConfigError: The label is unknown, or the dataset has no columns of interventions.
@@ -171,10 +176,12 @@ class Recorder:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        with contextlib.suppress(Exception) if exc[0] is not None else contextlib.nullcontext():
+        has_failed = exc[0] is not None  # then an error of `close` would hide the first one
+        with contextlib.suppress(Exception) if has_failed else contextlib.nullcontext():
             self.close()
 
     def _run(self) -> None:
+        """Execute the steps in the queue, until the recorder is closed; runs on its own thread."""
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         episode: RunningEpisode | None = None

@@ -14,19 +14,22 @@ from vlagents_ray.interface import Act, Obs
 if TYPE_CHECKING:
     from vlagents_ray.envs.base import EvalEnv
 
-_SIDE = 224  # px
-_DOT = 16
+_SIDE = 224  # of an image whose size the contract does not declare, px
+_DOT = 16  # side of the dot, px
 _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
 
 
 class SimulatedRobot:
     """An arm whose joints follow their commands, shown as a dot on a still image by its cameras.
 
-    Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute
-    targets (also if neither is stated), with the grippers of `ActionSpec.gripper_columns`.
-    Observations have the cameras, with their sizes, and the parts of the state, filled with the
-    joints, that the contract names; without a contract they have the cameras `front` and `wrist`
-    and the part `joints`.
+    Actions have the `dim` numbers of the policy's contract. They are deltas of the joints, or
+    absolute targets (also if the contract declares neither), with the grippers of
+    `ActionSpec.gripper_columns`. Observations have the cameras that the contract names, with their
+    sizes, and the parts of the state, filled with the joints; without a contract they have the
+    cameras `front` and `wrist` and the part `joints`.
+
+    Args:
+        contract: The contract of the policy that drives the arm.
     """
 
     simulated = True
@@ -34,9 +37,9 @@ class SimulatedRobot:
     def __init__(self, contract: Contract | None = None) -> None:
         contract = contract or Contract()
         self._action: ActionSpec = contract.action
-        self._parts = {
-            name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()
-        }
+        state = contract.state or {"joints": StateSpec()}
+        self._state_dims = {name: spec.dim for name, spec in state.items()}
+
         # Gradients with a little noise, which codecs compress like a camera's.
         self._pictures: dict[str, np.ndarray] = {}
         cameras = contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}
@@ -57,7 +60,7 @@ class SimulatedRobot:
         """Return the current state, in new arrays each time."""
         self._joints = self._joints + _SMOOTHING * (self._target - self._joints)
         state: dict[str, np.ndarray] = {}
-        for name, dim in self._parts.items():
+        for name, dim in self._state_dims.items():
             size = len(self._joints) if dim is None else dim
             state[name] = np.resize(self._joints, size).astype(np.float32)
 
@@ -98,18 +101,22 @@ class EnvRobot:
     """One episode of an environment as a `Robot`: each command is a step; without commands, time
     does not pass.
 
-    The caller closes `env`. With `endless` its step limit is ignored, as an operator takes longer
-    than a policy.
+    Args:
+        env: The environment, which the caller closes.
+        seed: The seed of the episode.
+        endless: Whether the environment's step limit is ignored, as an operator takes longer than a
+            policy.
     """
 
     simulated = True
 
     def __init__(self, env: EvalEnv, seed: int, *, endless: bool = False) -> None:
-        self._env, self._endless = env, endless
+        self._env = env
+        self._endless = endless
         self._obs, _ = env.reset(seed=seed)
         self.success = False  # the task was solved
-        self.ended = False  # by success, or by the environment
-        self.steps = 0
+        self.ended = False  # the task was solved, or the environment ended the episode
+        self.steps = 0  # the number of applied actions
 
     def observe(self) -> Obs:
         """Return the observation after the last step."""

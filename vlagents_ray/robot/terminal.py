@@ -11,16 +11,21 @@ from collections.abc import Callable, Iterator
 
 from vlagents_ray.errors import ConfigError
 
-# Gets a key in lower case; returns whether it has a meaning for that key.
+# A function that handles a key in lower case, and returns whether the key has a meaning for it.
 Consumer = Callable[[str], bool]
 
 
 class Terminal:
     """A terminal whose keys go to the newest consumer, such as a keyboard that moves the robot.
 
-    A key without meaning for it goes to the consumer before, and last to one that reads in the
-    background. Two objects of one terminal share its consumers. The default `descriptor` is that of
-    standard input; raises `ConfigError` if it is no terminal.
+    A key that has no meaning for it goes to the consumer before, and last to one that reads in the
+    background. Two objects of one terminal share its consumers.
+
+    Args:
+        descriptor: The file descriptor of the terminal; default: the one of standard input.
+
+    Raises:
+        ConfigError: The descriptor is not a terminal.
     """
 
     _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - of all terminals of this process
@@ -70,8 +75,16 @@ class Terminal:
                 self._own_consumers.remove(consumer)
 
     def read(self, consumer: Consumer) -> bool:
-        """Pass typed keys to their consumers, if this one is the newest; return whether the
-        terminal is open.
+        """Pass typed keys to their consumers, if this consumer is the newest.
+
+        Args:
+            consumer: The consumer that reads.
+
+        Returns:
+            Whether the terminal is open.
+
+        Raises:
+            ConfigError: The context of `consumed_by` has not begun for this consumer.
         """
         with self._lock:
             if consumer not in self._own_consumers:
@@ -80,6 +93,7 @@ class Terminal:
                 )
             if self._own_consumers[-1] != consumer:
                 return True
+
             while self._is_in_foreground() and select.select([self.descriptor], [], [], 0)[0]:
                 typed = b""
                 with contextlib.suppress(OSError):
@@ -127,10 +141,14 @@ class Terminal:
 
 @contextlib.contextmanager
 def typed_keys(consumer: Consumer) -> Iterator[bool]:
-    """Pass the keys typed at the terminal to a consumer within the context, unless a newer one has
-    a meaning for them.
+    """Pass the keys typed at the terminal to a consumer within the context, unless they have a
+    meaning for a newer consumer.
 
-    The consumer may be called from a thread. Yields whether there is a terminal.
+    Args:
+        consumer: The consumer, which may be called from a thread.
+
+    Yields:
+        Whether there is a terminal.
     """
     terminal = None
     with contextlib.suppress(ConfigError):  # standard input is no terminal

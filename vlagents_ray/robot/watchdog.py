@@ -40,8 +40,8 @@ class Watchdog:
         self.control = RobotControl()
         """The state of the robot, which `run_loop` lets it share with a chunk player."""
         self._stop = stop
-        self._limits = dict(silent_s)
-        self._heard = dict.fromkeys(silent_s, 0.0)
+        self._limits = dict(silent_s)  # s
+        self._heard_at = dict.fromkeys(silent_s, 0.0)  # on the clock `time.monotonic`
         self._changed = threading.Condition()  # reentrant
         self._thread: threading.Thread | None = None
 
@@ -57,18 +57,19 @@ class Watchdog:
         """
         if not 0 <= ago_s < math.inf:
             raise ConfigError(f"heard: got {ago_s} s ago for {name!r}, want a finite number from 0")
-        at = time.monotonic() - ago_s
-        heard = self._heard.get(name)
-        if heard is None or at <= heard:
+        heard_at = time.monotonic() - ago_s
+        last_heard_at = self._heard_at.get(name)
+        if last_heard_at is None or heard_at <= last_heard_at:
             return
+
         with self._changed:
-            self._heard[name] = at
+            self._heard_at[name] = heard_at
             if name in self.control.silent and ago_s < self._limits[name]:
                 self.control.heard(name)
                 self._changed.notify_all()
 
     def share(self, control: RobotControl) -> None:
-        """Use the state of a chunk player, to which earlier stops are moved."""
+        """Use the robot control of a chunk player from now on, and move earlier stops to it."""
         with self._changed:
             if control is not self.control:
                 control.adopt(self.control)
@@ -99,7 +100,7 @@ class Watchdog:
         with self._changed:
             if self._thread is not None:
                 return
-            self._heard = dict.fromkeys(self._limits, time.monotonic())
+            self._heard_at = dict.fromkeys(self._limits, time.monotonic())
             for name in set(self.control.silent) - self._limits.keys():
                 self.control.heard(name)  # no later sign of life would end its silence
             self._thread = threading.Thread(
@@ -123,11 +124,11 @@ class Watchdog:
         self.close()
 
     def overdue(self) -> tuple[str | None, float | None]:
-        """Record the silence of a source whose time limit is over, and return its reason, for
-        `bark`.
+        """Record the silence of a source whose time limit is over.
 
         Returns:
-            The reason, or None; and the time, s, until the next limit may be over, or None.
+            The reason for `bark`, or None if no source is overdue; and the time until the next
+            limit may be over, s, or None if no source is watched now.
         """
         with self._changed:
             now = time.monotonic()
@@ -135,19 +136,20 @@ class Watchdog:
             left_s: dict[str, float] = {}
             for name, limit_s in self._limits.items():
                 if name not in silent:
-                    left_s[name] = self._heard[name] + limit_s - now
+                    left_s[name] = self._heard_at[name] + limit_s - now
             if not left_s:
                 return None, None
 
             name = min(left_s, key=lambda source: left_s[source])
             if left_s[name] > 0:
                 return None, left_s[name]
-            reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
+
+            reason = f"{name}: silent for {now - self._heard_at[name]:.2f} s"
             self.control.stop(reason, silent=name)
             return reason, None
 
     def bark(self, reason: str) -> None:
-        """Call `stop`; its error is kept."""
+        """Stop the robot for a reason, and keep an error that `stop` raises in `error`."""
         self.barks.append(reason)
         try:
             with self.control.stopping():

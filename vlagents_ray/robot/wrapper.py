@@ -14,8 +14,8 @@ class RobotWrapper(Robot):
     """A robot around another one, with all attributes of the inner robot.
 
     Optional attributes of a `Robot`, such as `holds`, are read from the inner robot at each access
-    and set there. A subclass overrides the methods that it changes. Attributes of its own begin
-    with an underscore or are declared in its class.
+    and set there. A subclass overrides the methods that it changes. The attributes of a subclass
+    begin with an underscore or are declared in the class.
 
     Args:
         robot: The inner robot.
