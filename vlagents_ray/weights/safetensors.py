@@ -1,7 +1,7 @@
-"""The safetensors format: a header in JSON, with type, shape and place of each value, followed by
-their bytes.
+"""The safetensors format: a header in JSON with the type, shape and offsets of each value, followed
+by the bytes of the values.
 
-It contains only numbers, so that reading it executes nothing. A reader checks the whole header
+A file contains only numbers, so that reading it executes nothing. A reader checks the whole header
 before it allocates memory for any value. See https://huggingface.co/docs/safetensors for the
 format.
 """
@@ -21,15 +21,16 @@ import numpy as np
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
 from vlagents_ray.naming import without_duplicate_keys
 
-# Longest message with weights: a header (about 40,000 values), or a part of their bytes.
+# Longest message with weights: a header (about 40,000 values), or some of the values' bytes.
 MESSAGE_BYTES = 2**22
-# Bytes of a part; while a replica reads longer parts, its acts wait for Python's lock.
+# Number of bytes that are sent at once. While a replica reads more, inference calls wait for
+# Python's lock.
 PART_BYTES = 2**20
 _LENGTH = struct.Struct("<Q")
-_NAME_LENGTH = 512  # characters
-_DIMENSIONS = 32  # as in the oldest supported numpy
-_DIGITS = 15  # of a number in the header
-_METADATA = "__metadata__"  # the only name that is not a value's
+_NAME_LENGTH = 512  # longest name of a value, characters
+_DIMENSIONS = 32  # most dimensions of a value, as in the oldest supported numpy
+_DIGITS = 15  # most digits of a number in the header
+_METADATA = "__metadata__"  # the only name in a header that is not the name of a value
 _TYPES = {
     "BOOL": np.dtype(np.bool_),
     "BF16": np.dtype("V2"),  # see `vlagents_ray.weights.trainable.portable`
@@ -54,10 +55,19 @@ class ValueSpec:
 
 
 def header_of(values: Mapping[str, np.ndarray]) -> bytes:
-    """Return the header of a file with these values; raises `InvalidWeights` for a type that the
-    format lacks.
+    """Return the header of a file with these values.
+
+    Args:
+        values: The values by name.
+
+    Returns:
+        The length of the header in 8 bytes, and the header.
+
+    Raises:
+        InvalidWeights: The format lacks the type of a value.
     """
-    document, begin = {}, 0
+    document = {}
+    begin = 0
     for name, value in values.items():
         if value.dtype not in _CODES:
             raise InvalidWeights(
@@ -70,36 +80,46 @@ def header_of(values: Mapping[str, np.ndarray]) -> bytes:
             "data_offsets": [begin, end],
         }
         begin = end
+
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return _LENGTH.pack(len(text)) + text
 
 
 def parts_of(values: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
-    """Yield the bytes of the values, in the header's order, in parts of `length` bytes; the last
-    may be shorter.
+    """Yield the bytes of the values, in the order of the header.
+
+    Args:
+        values: The values by name.
+        length: The number of bytes that are yielded at once; the last time it may be fewer.
     """
-    part = bytearray()
+    buffer = bytearray()
     for value in values.values():
         data = memoryview(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
         while data:
-            taken = data[: length - len(part)]
-            part += taken
-            data = data[len(taken) :]
-            if len(part) == length:
-                yield bytes(part)
-                part.clear()
-    if part:
-        yield bytes(part)
+            fitting = data[: length - len(buffer)]
+            buffer += fitting
+            data = data[len(fitting) :]
+            if len(buffer) == length:
+                yield bytes(buffer)
+                buffer.clear()
+    if buffer:
+        yield bytes(buffer)
 
 
 def read_header(data: bytes) -> dict[str, ValueSpec]:
-    """Return the values that a header made by `header_of` announces, by name, in the order of their
-    bytes.
+    """Read a header that `header_of` made.
+
+    Args:
+        data: The length of the header in 8 bytes, and the header.
+
+    Returns:
+        The types and shapes of the values that the header announces, by name, in the order of their
+        bytes.
 
     Raises:
-        MalformedMessage: The data are not a header or too long, or the places overlap, leave gaps
-            or do not fit the shapes.
+        MalformedMessage: The data are not a header or too long, or the offsets of the values
+            overlap, leave gaps or do not fit the shapes.
     """
     announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
     if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
@@ -120,10 +140,10 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         )
     document.pop(_METADATA, None)
 
-    in_order = sorted((*_read_value(name, entry), name) for name, entry in document.items())
+    entries = sorted((*_read_value(name, entry), name) for name, entry in document.items())
     specs = {}
     offset = 0
-    for begin, end, code, shape, name in in_order:
+    for begin, end, code, shape, name in entries:
         spec = ValueSpec(_TYPES[code], shape)
         if begin != offset or end - begin != spec.size:
             raise MalformedMessage(
@@ -136,13 +156,16 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
 
 
 def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
-    """Return the begin and the end of a value's bytes, its type and its shape."""
+    """Check a value's entry in a header; return the begin and the end of its bytes, its type and
+    its shape.
+    """
     if len(name) > _NAME_LENGTH:
         raise MalformedMessage(
             f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}"
         )
     if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
         raise MalformedMessage(f"safetensors: {name!r}: want 'dtype', 'shape' and 'data_offsets'")
+
     code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
     if not isinstance(code, str) or code not in _TYPES:
         raise MalformedMessage(
@@ -171,36 +194,45 @@ def _whole(text: str) -> int:
 
 
 class ValuesReader:
-    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte
-    arrives.
+    """Reads values whose bytes arrive one after the other. The memory of a value is allocated when
+    its first byte arrives.
+
+    Args:
+        specs: The values that a header announces, from `read_header`.
     """
 
     def __init__(self, specs: Mapping[str, ValueSpec]) -> None:
-        """Read the values that a header announces, see `read_header`."""
-        self._left = deque(specs.items())
         self._values: dict[str, np.ndarray] = {}
+        self._pending = deque(specs.items())  # the values of which no byte has arrived
         # The bytes of the current value that have not arrived yet.
-        self._room = np.empty(0, np.uint8)
+        self._missing = np.empty(0, np.uint8)
         self.received = 0  # the number of bytes that have arrived
         self.size = sum(spec.size for spec in specs.values())  # the number of all bytes
 
-    def add(self, part: bytes) -> None:
-        """Append the next bytes; raises `MalformedMessage` if there are more than the header
-        announced.
+    def add(self, data: bytes) -> None:
+        """Append the next bytes.
+
+        Args:
+            data: The bytes, of one value or several.
+
+        Raises:
+            MalformedMessage: There are more bytes than the header announced.
         """
-        if self.received + len(part) > self.size:
+        if self.received + len(data) > self.size:
             raise MalformedMessage(
-                f"safetensors: got {self.received + len(part)} bytes of values, the header "
+                f"safetensors: got {self.received + len(data)} bytes of values, the header "
                 f"announced {self.size}"
             )
-        self.received += len(part)
-        data = np.frombuffer(part, np.uint8)
-        while data.size:
-            if not self._room.size:
+        self.received += len(data)
+
+        remaining = np.frombuffer(data, np.uint8)
+        while remaining.size:
+            if not self._missing.size:
                 self._begin_next()
-            length = min(data.size, self._room.size)
-            self._room[:length] = data[:length]
-            self._room, data = self._room[length:], data[length:]
+            length = min(remaining.size, self._missing.size)
+            self._missing[:length] = remaining[:length]
+            self._missing = self._missing[length:]
+            remaining = remaining[length:]
 
     def values(self) -> Mapping[str, np.ndarray]:
         """Return the values, read-only, once all bytes have arrived.
@@ -208,8 +240,9 @@ class ValuesReader:
         Raises:
             MalformedMessage: A truth value is neither 0 nor 1.
         """
-        while self._left:
-            self._begin_next()  # needed for values without elements
+        while self._pending:  # values without elements
+            self._begin_next()
+
         for name, value in self._values.items():
             if value.dtype == np.bool_ and value.size and value.view(np.uint8).max() > 1:
                 raise MalformedMessage(
@@ -219,14 +252,22 @@ class ValuesReader:
         return self._values
 
     def _begin_next(self) -> None:
-        name, spec = self._left.popleft()
-        value = self._values[name] = np.empty(spec.shape, spec.dtype)
-        self._room = value.reshape(-1).view(np.uint8)
+        """Allocate the memory of the next value."""
+        name, spec = self._pending.popleft()
+        value = np.empty(spec.shape, spec.dtype)
+        self._values[name] = value
+        self._missing = value.reshape(-1).view(np.uint8)
 
 
 def write_values(file: BinaryIO, values: Mapping[str, np.ndarray]) -> None:
-    """Write values into a file, from its place on; raises `InvalidWeights` for a type that the
-    format lacks.
+    """Write values into a file, at its current position.
+
+    Args:
+        file: The file, open for writing.
+        values: The values by name.
+
+    Raises:
+        InvalidWeights: The format lacks the type of a value.
     """
     file.write(header_of(values))
     file.writelines(parts_of(values))
@@ -234,14 +275,26 @@ def write_values(file: BinaryIO, values: Mapping[str, np.ndarray]) -> None:
 
 
 def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
-    """Return the values of a file, read-only, as `write_values` wrote them; raises
-    `MalformedMessage`.
+    """Read the values that `write_values` wrote.
+
+    Args:
+        file: The file, open for reading.
+
+    Returns:
+        The values by name, read-only.
+
+    Raises:
+        MalformedMessage: The file is damaged, or has another format.
     """
     length = file.read(_LENGTH.size)
     announced = _LENGTH.unpack(length)[0] if len(length) == _LENGTH.size else 0
-    reader = ValuesReader(read_header(length + file.read(min(announced, MESSAGE_BYTES))))
-    while part := file.read(PART_BYTES):
-        reader.add(part)
+    header = file.read(min(announced, MESSAGE_BYTES))
+    reader = ValuesReader(read_header(length + header))
+
+    data = file.read(PART_BYTES)
+    while data:
+        reader.add(data)
+        data = file.read(PART_BYTES)
     if reader.received != reader.size:
         raise MalformedMessage(
             f"safetensors: got {reader.received} bytes of values, the header announced "

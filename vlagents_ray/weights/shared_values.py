@@ -1,5 +1,5 @@
-"""Values on a GPU that another process copies in place, by CUDA's handles for memory of other
-processes.
+"""Values on a GPU that another process copies from their memory, through CUDA's handles for the
+memory of other processes.
 
 A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes of
 the same node that use the same GPU, while the process that made it keeps the memory: see the
@@ -33,11 +33,11 @@ class NotShared(PolicyUnavailable):
 class StorageHandle:
     """The memory of one or more values."""
 
-    allocation: bytes  # CUDA's handle of the allocation that contains it
+    allocation: bytes  # CUDA's handle of the allocation that contains the memory
     size: int  # bytes
-    begin: int  # its first byte in the allocation
-    counters: bytes  # torch's shared file with the counts of readers
-    counter: int  # index of its count in that file
+    begin: int  # the first byte in the allocation
+    counters: bytes  # name of torch's shared file with the counts of readers
+    counter: int  # index of the memory's count in that file
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,7 @@ class SharedValues:
     others: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
 
     def to_json(self) -> dict[str, Any]:
-        """Return JSON values of all but `others`, from which `from_json` makes the handles
-        again.
-        """
+        """Return everything except `others` as JSON values, which `from_json` reads."""
         storages = {}
         for address, handle in self.storages.items():
             storages[address] = [
@@ -78,39 +76,50 @@ class SharedValues:
 
     @classmethod
     def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
-        """Return the handles that `to_json` described, with the other values."""
+        """Read the handles that `to_json` returned.
+
+        Args:
+            node: The JSON values.
+            others: The values that are not on a GPU, by name.
+        """
         storages = {}
         for address, fields in node["storages"].items():
             allocation, size, begin, counters, counter = fields
             storages[int(address)] = StorageHandle(
                 bytes.fromhex(allocation), size, begin, bytes.fromhex(counters), counter
             )
-        views = {
-            name: ValueView(storage, dtype, begin, tuple(shape), tuple(stride))
-            for name, (storage, dtype, begin, shape, stride) in node["views"].items()
-        }
+        views = {}
+        for name, (storage, dtype, begin, shape, stride) in node["views"].items():
+            views[name] = ValueView(storage, dtype, begin, tuple(shape), tuple(stride))
         return cls(node["gpu"], storages, views, others)
 
 
-def gpu_of(named: Mapping[str, Any]) -> str:
-    """Return the UUID of the GPU that holds all values; empty if there is no single one."""
-    gpus = {_MEMORY.gpu(value) for value in named.values()} - {""}
+def gpu_of(values: Mapping[str, Any]) -> str:
+    """Return the UUID of the GPU that holds all values of GPUs; empty if there is not exactly one
+    such GPU.
+    """
+    gpus = {_MEMORY.gpu(value) for value in values.values()} - {""}
     return gpus.pop() if len(gpus) == 1 else ""
 
 
 def readable_gpus(gpu: str) -> tuple[str, ...]:
-    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, which is one;
-    none without it.
+    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, itself included;
+    none if `gpu` is empty.
     """
     return _MEMORY.readable(gpu) if gpu else ()
 
 
 @contextmanager
-def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Yield values by name for another process, those on the GPU as handles; they must not change
-    meanwhile.
+def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
+    """Share values with another process, which reads the memory of the GPU, within the context.
 
-    All values on a GPU must be on one, see `gpu_of`.
+    The values must not change meanwhile.
+
+    Args:
+        values_by_name: The values. Those on a GPU must all be on the same one, see `gpu_of`.
+
+    Yields:
+        The handles of values on the GPU, and the other values.
 
     Raises:
         NotShared: CUDA cannot share this kind of memory.
@@ -118,70 +127,88 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
     with ExitStack() as stack:
         stack.callback(_MEMORY.collect)  # after all handles have ended
         others: dict[str, Any] = {}
-        values, devices = SharedValues(gpu_of(named), {}, {}, others), set()
-        for name, value in named.items():
+        shared_values = SharedValues(gpu_of(values_by_name), {}, {}, others)
+        devices = set()
+        for name, value in values_by_name.items():
             if not _MEMORY.gpu(value):
                 others[name] = portable(value) if is_array(value) else value
                 continue
+
             devices.add(value.device)
             storage = value.untyped_storage()
-            address, begin = storage.data_ptr(), value.storage_offset()
-            if address not in values.storages:  # tied values have one storage
-                values.storages[address] = stack.enter_context(_MEMORY.handed_over(storage))
-            values.views[name] = ValueView(
-                address, dtype_name(value), begin, tuple(value.shape), value.stride()
+            address = storage.data_ptr()
+            if address not in shared_values.storages:  # tied values have one storage
+                handle = stack.enter_context(_MEMORY.handed_over(storage))
+                shared_values.storages[address] = handle
+            shared_values.views[name] = ValueView(
+                storage=address,
+                dtype=dtype_name(value),
+                begin=value.storage_offset(),
+                shape=tuple(value.shape),
+                stride=value.stride(),
             )
+
         for device in devices:
             _MEMORY.finish(device)
-        yield values
+        yield shared_values
 
 
 @contextmanager
 def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
-    """Yield another process's values by name, without copying those on a GPU: copy them within the
-    context.
+    """Open the values of another process; values on a GPU are not copied, so the caller copies them
+    within the context.
+
+    Args:
+        values: The handles and values that `shared` yields in the other process.
+
+    Yields:
+        The values by name.
 
     Raises:
         NotShared: The memory of the other process cannot be opened.
     """
     torch = sys.modules["torch"]
+    storages = {}
     try:
-        storages = {
-            address: _MEMORY.opened(values.gpu, handle)
-            for address, handle in values.storages.items()
-        }
+        for address, handle in values.storages.items():
+            storages[address] = _MEMORY.opened(values.gpu, handle)
     except RuntimeError as error:
         raise NotShared(
             f"the learner's memory on GPU {values.gpu} cannot be opened: {error}"
         ) from error
+
     devices = {storage.device for storage in storages.values()}
-    named = dict(values.others)
+    values_by_name = dict(values.others)
     for name, view in values.views.items():
-        empty = torch.empty(
-            0, dtype=getattr(torch, view.dtype), device=storages[view.storage].device
+        dtype = getattr(torch, view.dtype)
+        empty = torch.empty(0, dtype=dtype, device=storages[view.storage].device)
+        values_by_name[name] = empty.set_(
+            storages[view.storage], view.begin, view.shape, view.stride
         )
-        named[name] = empty.set_(storages[view.storage], view.begin, view.shape, view.stride)
         del empty
     del storages
+
     try:
-        yield named
+        yield values_by_name
         for device in devices:
             _MEMORY.finish(device)
     finally:
-        named.clear()  # frames of an error may refer to it
+        # The frames of an error may refer to it, which would keep the memory of the other process.
+        values_by_name.clear()
 
 
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where torch's file of counts is
-_FIRST_COUNT, _COUNT = 64, 8  # bytes before the counts in that file, and of each of them
+_FIRST_COUNT = 64  # the number of bytes before the counts in that file
+_COUNT = 8  # the number of bytes of a count
 
 
 @contextmanager
 def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
-    """Let torch free memory that it has sent after this context, whether and how often it was read.
+    """Let torch free memory that it has shared after this context, however often it was read.
 
     Torch keeps such memory as long as its count of readers is not 0. The count is 1 at first, and
-    each reader that ends takes 1 away, so that it is wrong without a reader, and with several;
-    being unsigned, it is then never 0 again.
+    each reader that ends subtracts 1. So the count is wrong if there was no reader or more than
+    one; as it is unsigned, it is then never 0 again.
 
     Args:
         counters: The name of torch's file of counts, which exists now.
@@ -241,18 +268,15 @@ class _GpuMemory:
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
         # An empty tensor has no memory, and a sparse one has several.
-        return (
-            self._uuid(value.device)
-            if value.is_cuda and value.layout == torch.strided and value.numel()
-            else ""
-        )
+        has_one_memory = value.layout == torch.strided and value.numel()
+        return self._uuid(value.device) if value.is_cuda and has_one_memory else ""
 
     def finish(self, device: Any) -> None:
         """Wait for the work that this thread has queued on a GPU, since another process does not
         wait for it.
 
-        It waits for the current stream; waiting for the device would abort graph captures of other
-        threads.
+        Only the current stream is waited for; waiting for the device would abort graph captures of
+        other threads.
         """
         sys.modules["torch"].cuda.current_stream(device).synchronize()
 
@@ -283,15 +307,13 @@ class _GpuMemory:
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
         """Return the storage of another process; raises `RuntimeError` if it cannot be reached."""
         torch = sys.modules["torch"]
-        devices = [
-            device for device in range(torch.cuda.device_count()) if self._uuid(device) == gpu
-        ]
-        if not devices:
+        uuids = self._visible_uuids()
+        if gpu not in uuids:
             raise RuntimeError("this process does not use that GPU")
         # The last two are an event to wait for, which torch would never free here, and whether
         # there is one. The sender has already waited, see `finish`.
         return torch.UntypedStorage._new_shared_cuda(
-            devices[0],
+            uuids.index(gpu),
             handle.allocation,
             handle.size,
             handle.begin,
@@ -302,17 +324,22 @@ class _GpuMemory:
         )
 
     def readable(self, gpu: str) -> tuple[str, ...]:
-        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without the
-        host.
+        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without a copy
+        on the host.
         """
         cuda = sys.modules["torch"].cuda
-        uuids = [self._uuid(device) for device in range(cuda.device_count())]
+        uuids = self._visible_uuids()
         index = uuids.index(gpu)
-        return tuple(
-            uuid
-            for i, uuid in enumerate(uuids)
-            if i == index or cuda.can_device_access_peer(index, i)
-        )
+        readable = []
+        for i, uuid in enumerate(uuids):
+            if i == index or cuda.can_device_access_peer(index, i):
+                readable.append(uuid)
+        return tuple(readable)
+
+    def _visible_uuids(self) -> list[str]:
+        """Return the UUIDs of the GPUs that this process sees, by torch's index."""
+        count = sys.modules["torch"].cuda.device_count()
+        return [self._uuid(device) for device in range(count)]
 
     @staticmethod
     def _uuid(device: Any) -> str:

@@ -1,9 +1,9 @@
 """The named values of a trainable object: a torch module, or nested dicts and lists of arrays and
 torch modules.
 
-The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys,
-joined with "/", and then that in a module. Torch and JAX are never imported here: their objects
-exist only if they have been imported.
+The name of a value in a torch module is its name in the `state_dict`. In nested dicts, the name
+consists of the keys, joined with "/", followed by the name in a module. Torch and JAX are never
+imported here: their objects exist only if they have been imported.
 """
 
 from __future__ import annotations
@@ -24,21 +24,28 @@ import numpy as np
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 
 _BFLOAT16 = np.dtype("V2")
-_SHOWN = 5  # faults in a message
+_SHOWN = 5  # most faults in a message
 _THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
 # 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB.
 _WORDS = 2**20
 # The odd factor by which the sum of a fingerprint is multiplied before the next words are added.
 _FACTOR = -7046029254386353131
-# The number of elements of a tensor on which an operation works at once, as it needs further memory
-# for them.
+# Operations that need further memory work on this number of elements of a tensor at once.
 _AT_ONCE = 2**24
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
 def named_values(trainable: Any) -> dict[str, Any]:
-    """Return references to the values of a torch module or nested dicts and lists, by name;
-    raises `NotTrainable`.
+    """Return references to the values of a trainable object.
+
+    Args:
+        trainable: A torch module, or nested dicts and lists of arrays and torch modules.
+
+    Returns:
+        The values by name.
+
+    Raises:
+        NotTrainable: The object is something else.
     """
     if _is_module(trainable):
         # A module may add state other than tensors (`get_extra_state`), which a learner does not
@@ -56,12 +63,15 @@ def named_values(trainable: Any) -> dict[str, Any]:
 
 
 def set_values(trainable: Any, values: Mapping[str, Any]) -> None:
-    """Replace values of a trainable object by those of the same shapes, types and devices; other
-    names keep theirs.
+    """Replace values of a trainable object with others of the same shapes, types and devices.
 
     Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have
     recorded. All others are replaced by reference, which takes no time and no memory; `values` must
     not be changed afterwards.
+
+    Args:
+        trainable: The object, as for `named_values`.
+        values: The new values by name; a value whose name is missing stays.
     """
     if _is_module(trainable):
         _set_values_of_module(trainable, values)
@@ -71,8 +81,11 @@ def set_values(trainable: Any, values: Mapping[str, Any]) -> None:
         current = container[key]
         if _is_module(current):
             prefix = f"{name}/"
-            inner_names = [full for full in values if full.startswith(prefix)]
-            set_values(current, {full.removeprefix(prefix): values[full] for full in inner_names})
+            inner_values = {}
+            for full_name in values:
+                if full_name.startswith(prefix):
+                    inner_values[full_name.removeprefix(prefix)] = values[full_name]
+            set_values(current, inner_values)
         elif name in values and _is_tensor(current) and _on_gpu(current):
             _overwrite(current, values[name])
         elif name in values:
@@ -104,12 +117,13 @@ def _overwrite(target: Any, value: Any) -> None:
 
 @contextmanager
 def evaluation_mode(trainable: Any) -> Iterator[None]:
-    """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the
-    mode of each part.
+    """Put torch modules into evaluation mode (no dropout, no batch statistics) within the context,
+    and restore the mode of each inner module.
     """
     values = [trainable]
     if isinstance(trainable, dict | list):
         values = [container[key] for _, container, key in _leaves(trainable)]
+
     modules: list[Any] = []
     for value in values:
         if _is_module(value):
@@ -129,10 +143,8 @@ def is_copied(trainable: Any) -> bool:
     """Return whether `set_values` copies into the memory of the old values, so that references
     to these change.
     """
-    return any(
-        _is_tensor(value) and value.device.type != "cpu"
-        for value in named_values(trainable).values()
-    )
+    values = named_values(trainable).values()
+    return any(_is_tensor(value) and _on_gpu(value) for value in values)
 
 
 def portable(value: Any) -> np.ndarray:
@@ -162,11 +174,12 @@ def on_host(value: Any) -> Any:
 
 
 def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
-    """Exchange contiguous tensors of equal names and devices in their memory, within little more
-    than that.
+    """Exchange the numbers of contiguous tensors in their memory, with little further memory.
 
-    Names of `first` that share memory (see `are_apart`) must share it in `second`, as in a result
-    of `completed`.
+    Args:
+        first: The tensors by name.
+        second: Tensors of the same names, shapes and devices. Names of `first` that share memory
+            (see `are_apart`) must share it in `second`, as in a result of `completed`.
     """
     with sys.modules["torch"].no_grad():
         untied = {memory_of(name, value): (name, value) for name, value in first.items()}
@@ -180,8 +193,12 @@ def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
 
 
 def memory_of(name: str, value: Any) -> Any:
-    """Return a key that is equal for two values of a module that are tied, i.e. are in the same
-    memory.
+    """Return a key that is equal for two values of a module that are tied, i.e. that are in the
+    same memory.
+
+    Args:
+        name: The name of the value, which is the key of a value without memory.
+        value: The value.
     """
     if not _is_tensor(value) or value.layout != sys.modules["torch"].strided or not value.numel():
         return name
@@ -189,8 +206,14 @@ def memory_of(name: str, value: Any) -> Any:
 
 
 def mapped(function: Callable[[Any], Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the results of a function of values, by name; tied values are passed once, and so
-    are their results.
+    """Apply a function to values.
+
+    Args:
+        function: The function, which is called once for tied values.
+        values: The values by name.
+
+    Returns:
+        The results by name; tied values have the same result.
     """
     untied = {memory_of(name, value): value for name, value in values.items()}
     results = {memory: function(value) for memory, value in untied.items()}
@@ -205,11 +228,15 @@ def own_copy(value: Any) -> Any:
 
 
 def converted(value: Any, current: Any) -> Any:
-    """Convert `value` to the type, precision and device of the current value, in memory that is not
+    """Convert a value to the type, precision and device of another one, in memory that is not
     shared.
 
     Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if
     `current` is on the CPU.
+
+    Args:
+        value: The value.
+        current: The value whose type, precision and device it gets.
     """
     if _is_tensor(current):
         torch = sys.modules["torch"]
@@ -225,7 +252,8 @@ def converted(value: Any, current: Any) -> Any:
             tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
 
         if current.is_cuda and not tensor.is_cuda:
-            return copy(tensor, torch.empty_like(current, memory_format=torch.contiguous_format))
+            target = torch.empty_like(current, memory_format=torch.contiguous_format)
+            return copy(tensor, target)
         new = tensor.to(current.device, current.dtype)
         is_shared = _is_tensor(value) and new.data_ptr() == value.data_ptr()
         return new.clone() if is_shared else new
@@ -295,28 +323,27 @@ def _is_module(value: Any) -> bool:
 
 
 def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -> None:
-    """Move torch tensors from GPUs to the host, and append to `moved` their memory, without bytes
-    now, and the host's.
+    """Move torch tensors from GPUs to the host.
 
     The tensors stay the same objects, with the same views and ties; until `from_host` they must not
-    be read. After an error, the list has those that were moved.
+    be read.
+
+    Args:
+        groups: Groups of values by name; values that are not on a GPU stay.
+        moved: A list to which each moved memory is appended: the GPU's, which has no bytes then,
+            and the host's. After an error, it has what was moved before.
     """
-    tensors = [
-        value
-        for named in groups
-        for value in named.values()
-        if _is_tensor(value) and _on_gpu(value)
-    ]
-    storages = {
-        value.untyped_storage().data_ptr(): value.untyped_storage()
-        for value in tensors
-        if value.numel()
-    }
+    storages = {}
+    for values in groups:
+        for value in values.values():
+            if _is_tensor(value) and _on_gpu(value) and value.numel():
+                storage = value.untyped_storage()
+                storages[storage.data_ptr()] = storage
+
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
-            moved.append(
-                (storage, sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage))
-            )
+            host_storage = sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage)
+            moved.append((storage, host_storage))
             storage.resize_(0)
 
 
@@ -325,43 +352,48 @@ def _on_gpu(value: Any) -> bool:
 
 
 def from_host(moved: list[tuple[Any, Any]]) -> None:
-    """Move tensors back, to other addresses; after an error, the list has those that were not
-    moved yet.
+    """Move tensors back to their GPUs, to other addresses.
+
+    Args:
+        moved: The list that `to_host` filled, which is emptied. After an error, it has the memory
+            that was not moved yet.
     """
     while moved:
-        storage, host = moved[-1]
-        storage.resize_(host.nbytes())
-        storage.copy_(host)
+        storage, host_storage = moved[-1]
+        storage.resize_(host_storage.nbytes())
+        storage.copy_(host_storage)
         moved.pop()
 
 
-# Work on a GPU beside the acts of a policy: on other streams, and with pinned memory that is used
-# again.
+# The following functions work on a GPU at the same time as the inference calls of a policy: on
+# other streams, and with pinned memory that is used again.
 #
-# All threads share torch's default stream, which has the acts. A wait for one's own work there
-# lasts until the end of all acts that were queued before, and CUDA copies pageable memory in turn
-# with them.
+# All threads share torch's default stream, on which the inference calls are queued. A thread that
+# waits for its work there also waits for all calls that were queued before, and CUDA copies
+# pageable memory in turn with them.
 
-_PART = 2**25  # bytes of each of two parts, one of which is filled while the other one is copied
+# Bytes of each of two buffers, one of which is filled while the other one is copied.
+_BUFFER_BYTES = 2**25
 _LOCK = threading.Lock()
-# By device: the stream, and two parts of pinned memory, each with the event at the end of its last
-# copy.
-_USED: dict[Any, tuple[Any, list[tuple[Any, Any]]]] = {}
-# The stream of `beside_acts` by device: one, as memory is only used again on its stream.
+# By device: the stream of copies, and two buffers of pinned memory, each with the event at the end
+# of its last copy.
+_COPY_BUFFERS: dict[Any, tuple[Any, list[tuple[Any, Any]]]] = {}
+# By device: the stream of `beside_acts`. A device has only one, as torch reuses freed memory only
+# on the stream on which it was allocated.
 _BESIDE: dict[Any, Any] = {}
 
 
 @contextmanager
 def beside_acts(device: Any) -> Iterator[None]:
-    """Run this thread's work on a GPU within this context on another stream than the acts; it is
-    over at the end.
+    """Run this thread's work on a GPU within the context on another stream than the inference
+    calls, and wait for it at the end.
 
-    It begins after the work that was queued before. Memory that this context allocates may be used
-    again in the next one as soon as it is freed, so that work of other streams on it must be over
-    then.
+    The work begins after the work that was queued before. Memory that is allocated within the
+    context may be used again within the next one as soon as it is freed, so that work of other
+    streams on it must be over then.
 
     Args:
-        device: The GPU; None: the current one. The context does nothing for "cpu", or while the
+        device: The GPU; None for the current one. The context does nothing for "cpu", or while the
             process uses no GPU.
     """
     torch = sys.modules.get("torch")
@@ -380,48 +412,63 @@ def beside_acts(device: Any) -> Iterator[None]:
 
 
 def copy(source: Any, target: Any) -> Any:
-    """Copy a tensor into a contiguous one of the same shape, and return that one.
+    """Copy a tensor into another one.
 
     If only one of them is on a GPU, the copy begins after the work that this thread has queued
-    there, and is over when this returns.
+    there, and is over when this function returns.
+
+    Args:
+        source: The tensor to copy.
+        target: A contiguous tensor of the same shape.
+
+    Returns:
+        `target`.
     """
     torch = sys.modules["torch"]
     with torch.no_grad():
         if source.is_cuda == target.is_cuda or not target.numel():
             return target.copy_(source)
-        device, dtype = next((one.device, one.dtype) for one in (source, target) if one.is_cuda)
-        length = _PART // dtype.itemsize
+
+        on_gpu = source if source.is_cuda else target
+        device, dtype = on_gpu.device, on_gpu.dtype
+        length = _BUFFER_BYTES // dtype.itemsize  # elements that are copied at once
         with _LOCK, torch.cuda.device(device):
-            if device not in _USED:
-                # Otherwise they could not be written outside of that mode.
-                with torch.inference_mode(mode=False):
-                    empty = [torch.empty(_PART, dtype=torch.uint8).pin_memory() for _ in range(2)]
-                _USED[device] = (
-                    torch.cuda.Stream(device),
-                    [(memory, torch.cuda.Event()) for memory in empty],
-                )
-            stream, parts = _USED[device]
+            stream, buffers = _copy_buffers(device)
             stream.wait_stream(torch.cuda.current_stream(device))
-            places = target.view(-1).split(length)
+            source_pieces = source.reshape(-1).split(length)
+            target_pieces = target.view(-1).split(length)
             try:
                 with torch.cuda.stream(stream):
-                    for number, (part, place) in enumerate(
-                        zip(source.reshape(-1).split(length), places, strict=True)
+                    for number, (source_piece, target_piece) in enumerate(
+                        zip(source_pieces, target_pieces, strict=True)
                     ):
-                        memory, event = parts[number % 2]
+                        memory, event = buffers[number % 2]
                         event.synchronize()
-                        pinned = memory[: len(part) * dtype.itemsize].view(dtype)
-                        pinned.copy_(part, non_blocking=True)
-                        if place.is_cuda:
-                            place.copy_(pinned, non_blocking=True)
+                        pinned = memory[: len(source_piece) * dtype.itemsize].view(dtype)
+                        pinned.copy_(source_piece, non_blocking=True)
+                        if target_piece.is_cuda:
+                            target_piece.copy_(pinned, non_blocking=True)
                         event.record(stream)
-                        if not place.is_cuda:
+
+                        if not target_piece.is_cuda:
                             event.synchronize()
-                            place.copy_(pinned)
+                            target_piece.copy_(pinned)
             finally:
-                # The memory may be freed, or used on other streams, from now on.
+                # The memory may be freed, or used on other streams, when this function returns.
                 stream.synchronize()
     return target
+
+
+def _copy_buffers(device: Any) -> tuple[Any, list[tuple[Any, Any]]]:
+    """Return the stream of copies of a device, and its two buffers with their events."""
+    torch = sys.modules["torch"]
+    if device not in _COPY_BUFFERS:
+        # Tensors that are made in inference mode could not be written outside of it.
+        with torch.inference_mode(mode=False):
+            buffers = [torch.empty(_BUFFER_BYTES, dtype=torch.uint8).pin_memory() for _ in range(2)]
+        events = [torch.cuda.Event() for _ in buffers]
+        _COPY_BUFFERS[device] = torch.cuda.Stream(device), list(zip(buffers, events, strict=True))
+    return _COPY_BUFFERS[device]
 
 
 # The following functions check that pushed values fit those of a policy, and compute a digest.
@@ -430,16 +477,19 @@ def copy(source: Any, target: Any) -> Any:
 def accepted(
     current: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
 ) -> dict[str, Any]:
-    """Return pushed values with the types and devices of the current ones.
+    """Check pushed values, and convert them to the types and devices of the current ones.
 
-    Of the current values, only types, devices and shapes are read, except where pushed values are
-    not finite. Names whose current values are tied get the same value, the last one that was
+    Only the types, devices and shapes of the current values are read, except where pushed values
+    are not finite. Names whose current values are tied get the same value, the last one that was
     pushed.
 
     Args:
         current: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
         partial: Whether names may be missing, as in a push of adapters alone.
+
+    Returns:
+        The converted values by name; a name that is tied to a pushed one is included.
 
     Raises:
         InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type,
@@ -457,9 +507,11 @@ def accepted(
 
     # Constants of a module, such as masks of attention, may be infinite: a learner pushes them
     # unchanged.
-    not_finite = [name for name, is_finite in finite.items() if not is_finite]
-    wrong = [name for name in not_finite if not _is_equal(new[memories[name]], current[name])]
-    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in wrong])
+    faults: list[str] = []
+    for name, is_finite in finite.items():
+        if not is_finite and not _is_equal(new[memories[name]], current[name]):
+            faults.append(f"{name!r}: got NaN or infinite values, want finite ones")
+    _refuse(faults)
     return {name: new[memory] for name, memory in memories.items() if memory in new}
 
 
@@ -470,15 +522,18 @@ def completed(
     allow_same: bool = False,
     in_place: bool = False,
 ) -> dict[str, Any]:
-    """Return the values of a new version: the result of `accepted`, and the current values of the
-    missing names.
+    """Return the values of a new version: the new values, and the current values of the names that
+    these lack.
 
     Args:
         current: The current values of the policy, by name.
-        new: The new ones.
+        new: The new values, from `accepted`.
         allow_same: Whether all may equal the current ones.
-        in_place: Whether the current values will change in their memory, so that those of missing
-            names are copied.
+        in_place: Whether the current values will change in their memory, so that the current values
+            in the result are copies.
+
+    Returns:
+        The values by name, in the order of `current`.
 
     Raises:
         UnchangedWeights: All values equal the current ones, and `allow_same` is not set.
@@ -497,17 +552,18 @@ def completed(
 
 
 def are_apart(values: Mapping[str, Any]) -> bool:
-    """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange
-    each of them.
+    """Return whether `swap` can exchange each of the tensors: they are contiguous, and share no
+    memory, except that tied ones are equal.
     """
     untied = {memory_of(name, value): value for name, value in values.items() if value.numel()}
     if not all(value.is_contiguous() for value in untied.values()):
         return False
 
-    spans = sorted(
-        (str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes)
-        for value in untied.values()
-    )
+    spans: list[tuple[str, int, int]] = []
+    for value in untied.values():
+        begin = value.data_ptr()
+        spans.append((str(value.device), begin, begin + value.nbytes))
+    spans.sort()
     for (device, _, end), (next_device, next_begin, _) in itertools.pairwise(spans):
         if device == next_device and end > next_begin:
             return False
@@ -517,24 +573,28 @@ def are_apart(values: Mapping[str, Any]) -> bool:
 def require_fit(
     current: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
 ) -> None:
-    """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind
-    of type.
+    """Check the names, shapes and types of pushed values.
 
-    `pushed` are values, or their `vlagents_ray.weights.safetensors.ValueSpec`; with `partial`,
-    names may be missing.
+    Args:
+        current: The current values of the policy, by name.
+        pushed: The pushed values, or their `vlagents_ray.weights.safetensors.ValueSpec`, by name.
+        partial: Whether names may be missing.
+
+    Raises:
+        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type.
     """
-    unknown = [name for name in pushed if name not in current]
-    faults = [
-        f"{name!r}: unknown, want one of the policy's {len(current)} names" for name in unknown
-    ]
+    faults: list[str] = []
+    for name in pushed:
+        if name not in current:
+            faults.append(f"{name!r}: unknown, want one of the policy's {len(current)} names")
     if not partial:
         missing = [name for name in current if name not in pushed]
         faults += [f"{name!r}: missing; push it, or set partial=True" for name in missing]
     elif not pushed:
         faults.append("no value: push at least one")
 
-    # A variable with a value here would keep the learner's memory open as long as the error has
-    # this frame.
+    # No variable may have a pushed value here: it would keep the learner's memory open as long as
+    # the error refers to this frame.
     for name in pushed:
         if name in current:
             fault = _misfit(name, pushed[name], current[name])
@@ -544,18 +604,19 @@ def require_fit(
 
 
 def fingerprint(values: Mapping[str, Any]) -> str:
-    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of
-    values on any device.
+    """Return a digest of values on any device: 32 hexadecimal characters over names, shapes, types
+    and all bytes.
 
-    It detects any accidental difference: each word is multiplied by two odd numbers, which depend
-    on its place, and summed modulo 2**64, on a GPU if the value is there. A cryptographic digest
-    would need all values on the host, and take a few seconds for a large model.
+    The digest detects any accidental difference: each word is multiplied by two odd numbers, which
+    depend on its index, and summed modulo 2**64, on a GPU if the value is there. A cryptographic
+    digest would need all values on the host, and take a few seconds for a large model.
     """
     on_gpus = {name: value for name, value in values.items() if _is_tensor(value) and value.is_cuda}
-    on_host_names = [name for name in values if name not in on_gpus]
+    host_names = [name for name in values if name not in on_gpus]
     with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
-        sums_on_host = threads.map(_sums, (values[name] for name in on_host_names))
-        sums = dict(zip(on_host_names, sums_on_host, strict=True))
+        host_sums = threads.map(_sums, (values[name] for name in host_names))
+        sums = dict(zip(host_names, host_sums, strict=True))
+
     keys = dict[Any, Any]()
     sums |= _fetched({name: _sums_on_gpu(value, keys) for name, value in on_gpus.items()})
 
@@ -588,10 +649,13 @@ def _misfit(name: str, pushed: Any, current: Any) -> str | None:
 
 
 def _kind(dtype: str) -> Any:
-    """Return the kind of a type, such as floating point: precisions are converted, kinds are
-    not.
+    """Return the kind of a type, such as floating point: a value may be converted to another
+    precision, but not to another kind.
     """
-    return next((kind for kind in _KINDS if dtype.startswith(kind)), dtype)
+    for prefixes in _KINDS:
+        if dtype.startswith(prefixes):
+            return prefixes
+    return dtype
 
 
 def _is_finite(value: Any) -> Any:
@@ -615,12 +679,14 @@ def _all_finite_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the names of torch tensors of real numbers that are surely finite, each with True.
 
     The largest absolute values of all tensors of a device and type are computed together: several
-    operations for each of hundreds of tensors would share the GPU, and Python's lock, with acts.
+    operations for each of hundreds of tensors would delay inference calls, with which they share
+    the GPU and Python's lock.
     """
     groups: dict[Any, list[str]] = {}
     for name, value in values.items():
         if _is_tensor(value) and value.is_floating_point() and value.numel():
             groups.setdefault((value.device, value.dtype), []).append(name)
+
     finite: dict[str, Any] = {}
     for names in groups.values():
         torch = sys.modules["torch"]
@@ -651,7 +717,7 @@ def _is_equal(new: Any, current: Any) -> bool:
 
 @functools.cache
 def _keys(count: int) -> np.ndarray:
-    """Return (2, count) odd int64 without a pattern, by the finalizer of splitmix64."""
+    """Return odd numbers without a pattern, (2, count) int64, from the finalizer of splitmix64."""
     key = np.arange(1, 2 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         key = (key ^ (key >> np.uint64(shift))) * np.uint64(factor)
@@ -659,9 +725,12 @@ def _keys(count: int) -> np.ndarray:
 
 
 def _sums(value: Any) -> np.ndarray:
-    """Return the two sums (2,) int64 of a value of the host."""
+    """Return the two sums of a value on the host, (2,) int64."""
     data = np.ascontiguousarray(portable(value)).reshape(-1).view(np.uint8)
-    words = (np.pad(data, (0, -len(data) % 4)) if len(data) % 4 else data).view(np.int32)
+    if len(data) % 4:
+        data = np.pad(data, (0, -len(data) % 4))
+    words = data.view(np.int32)
+
     sums: np.ndarray = np.zeros(2, np.int64)
     for begin in range(0, len(words), _WORDS):
         piece = words[begin : begin + _WORDS].astype(np.int64)
@@ -670,20 +739,24 @@ def _sums(value: Any) -> np.ndarray:
 
 
 def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
-    """Return the two sums of a tensor on a GPU, as a tensor there; `keys` has the result of
-    `_keys` by device.
+    """Return the two sums of a tensor on a GPU, as a tensor there, (2,) int64.
+
+    Args:
+        value: The tensor.
+        keys: The result of `_keys` by device, to which the device of `value` is added.
     """
     torch = sys.modules["torch"]
     value = value.detach()
     if value.device not in keys:
-        keys[value.device] = copy(
-            torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64)
-        )
+        empty = value.new_empty((2, _WORDS), dtype=torch.int64)
+        keys[value.device] = copy(torch.from_numpy(_keys(_WORDS)), empty)
+    device_keys = keys[value.device]
+
     data = value.reshape(-1).contiguous().view(torch.uint8)
     if len(data) % 4 or data.storage_offset() % 4:
         data = torch.nn.functional.pad(data, (0, -len(data) % 4))
-    sums = keys[value.device].new_zeros(2)
-    device_keys = keys[value.device]
+
+    sums = device_keys.new_zeros(2)
     for piece in data.view(torch.int32).split(_WORDS) if len(data) else ():
         products = device_keys[:, : len(piece)] * piece.to(torch.int64)
         sums = sums * _FACTOR + products.sum(1)
@@ -691,8 +764,8 @@ def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
 
 
 def _fetched(tensors: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return small tensors of equal shapes as arrays: one copy from each device waits for all of
-    them.
+    """Return small tensors of equal shapes as arrays, with a single copy from each device, which
+    waits for all of them.
     """
     arrays: dict[str, np.ndarray] = {}
     for device in {tensor.device for tensor in tensors.values()}:

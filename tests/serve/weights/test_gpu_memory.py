@@ -32,8 +32,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
     fake.install(monkeypatch)
     monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
     monkeypatch.setattr(trainable, "_WORDS", PART // 40)
-    monkeypatch.setattr(trainable, "_PART", PART)
-    monkeypatch.setattr(trainable, "_USED", {})
+    monkeypatch.setattr(trainable, "_BUFFER_BYTES", PART)
+    monkeypatch.setattr(trainable, "_COPY_BUFFERS", {})
     return fake
 
 
