@@ -13,11 +13,14 @@ from vlagents_ray.naming import did_you_mean
 
 
 def main() -> None:
-    """Run the console script; name the packages to install if only the light install is there."""
+    """Run the console script; print which packages to install if only the light install is
+    there.
+    """
     # This handler applies until a command has its own, see `cli.console.errors`.
     default = signal.signal(signal.SIGINT, _end_at_once)
 
-    if sys.argv[1:2] == ["robot"]:  # the light install has it, and Ctrl-C in it stops the robot
+    # This command is in the light install, and Ctrl-C in it stops the robot.
+    if sys.argv[1:2] == ["robot"]:
         from vlagents_ray.cli.robot import main as robot
 
         find_modules_here()
@@ -43,11 +46,13 @@ def main() -> None:
         sys.exit(1)
 
     find_modules_here()
-    atexit.register(gc.freeze)  # else Python collects all of Ray at its end, for half a second
+    # Otherwise Python would collect all of Ray at its end, which takes half a second.
+    atexit.register(gc.freeze)
     app()
 
 
 def _end_at_once(_number: int, _frame: FrameType | None) -> None:
+    """End the process at Ctrl-C, while it imports the commands."""
     os.write(2, b"error interrupted before the command began; nothing was started or written\n")
     os._exit(130)
 

@@ -1,5 +1,5 @@
-"""Arguments of the commands that the light install has: readers for argparse, whose errors name
-the cure.
+"""Arguments of the commands in the light install: readers for argparse, whose errors name the
+cure.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from vlagents_ray.naming import did_you_mean
 
 
 def number(
-    kind: type[float] | type[int] = float,
+    number_type: type[float] | type[int] = float,
     *,
     minimum: float = 0,
     above: bool = False,
@@ -23,22 +23,25 @@ def number(
     """Return a function with which argparse reads a number.
 
     Args:
-        kind: The type of the number.
+        number_type: The type of the number.
         minimum: The smallest number.
         above: Whether `minimum` itself is excluded.
         maximum: The largest number.
+
+    Returns:
+        The function, which raises `ArgumentTypeError` for another text.
     """
 
     def read(text: str) -> float:
         """Read the number; raise `ArgumentTypeError` if it is out of range."""
         with contextlib.suppress(ValueError):
-            value = kind(text)
+            value = number_type(text)
             if value > minimum or (value == minimum and not above):
                 if value > maximum:
                     raise argparse.ArgumentTypeError(f"got {text!r}, want at most {maximum:g}")
                 return value
 
-        noun = "a whole number" if kind is int else "a number"
+        noun = "a whole number" if number_type is int else "a number"
         bound = "above" if above else "from"
         raise argparse.ArgumentTypeError(f"got {text!r}, want {noun} {bound} {minimum:g}")
 
@@ -46,8 +49,8 @@ def number(
 
 
 def one_of(*names: str) -> dict[str, Any]:
-    """Return the settings of an argument that is one of `names`; unlike with `choices`, an error
-    has a suggestion.
+    """Return the settings for `add_argument` of an argument that is one of `names`; unlike with
+    `choices`, an error has a suggestion.
     """
 
     def read(text: str) -> str:
@@ -66,13 +69,15 @@ def parse_all(
     arguments: Sequence[str],
     cures: Mapping[str, str] = MappingProxyType({}),
 ) -> argparse.Namespace:
-    """Parse the arguments; the process ends with status 2 and a suggestion if one of them is
-    unknown.
+    """Parse arguments; the process ends with status 2 and a suggestion if one of them is unknown.
 
     Args:
         parser: The parser.
         arguments: The arguments.
         cures: The messages for options that users expect and that do not exist, by option.
+
+    Returns:
+        The values of the arguments.
     """
     options, unknown = parser.parse_known_args(arguments)
     for argument in unknown:
@@ -88,10 +93,10 @@ def parse_all(
 def _guesses(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> str:
     """Return the options that the user may have meant by unknown ones."""
     words = parser.format_help().replace(",", " ").split()
-    known = [word.removeprefix("--") for word in words if word.startswith("--")]
+    options = [word.removeprefix("--") for word in words if word.startswith("--")]
     guesses = ""
     for argument in unknown:
         if argument.startswith("-"):
             name = argument.lstrip("-").partition("=")[0]
-            guesses += did_you_mean(name, known).replace("mean '", "mean '--")
+            guesses += did_you_mean(name, options).replace("mean '", "mean '--")
     return guesses

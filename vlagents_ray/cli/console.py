@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import json
 import os
 import sys
@@ -25,11 +24,11 @@ from vlagents_ray.settings import wrong_settings
 
 
 class PlainConsole(Console):
-    """A console that shows text as it is, for copying: `[serve]` is no markup, `:boat:` no picture,
-    lines are not cut.
+    """A console that shows text as it is, so that it can be copied: `[serve]` is not markup,
+    `:boat:` is not an emoji, and lines are not cut.
 
-    Styled output is a `Text`, or has a `style`. On a terminal a table has its width, and breaks
-    words that are too long for its cells; elsewhere a table is as wide as its content.
+    Styled output is a `Text`, or has a `style`. On a terminal a table is as wide as the terminal,
+    and breaks words that are too long for its cells; elsewhere it is as wide as its content.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -38,14 +37,15 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Render without control characters of the text, which may be a server's or from others'
-        results.
+        """Render without the control characters of the text, which may come from a server or from
+        somebody else's results.
         """
         for segment in super().render(renderable, options):
-            is_plain = (
-                segment.control is not None or segment.text.isprintable() or segment.text == "\n"
-            )
-            yield segment if is_plain else Segment(_without_controls(segment.text), segment.style)
+            is_plain = segment.text.isprintable() or segment.text == "\n"
+            if segment.control is not None or is_plain:
+                yield segment
+            else:
+                yield Segment(_without_controls(segment.text), segment.style)
 
     @property  # type: ignore[misc]
     def size(self) -> ConsoleDimensions:
@@ -55,13 +55,21 @@ class PlainConsole(Console):
 
 
 def _without_controls(text: str) -> str:
-    return "".join(
-        character if character.isprintable() or character in "\n\t" else "�" for character in text
-    )
+    """Replace the control characters of a text, except newlines and tabs."""
+    characters = []
+    for character in text:
+        is_shown = character.isprintable() or character in "\n\t"
+        characters.append(character if is_shown else "�")
+    return "".join(characters)
 
 
 def table(*columns: str, **options: Any) -> Table:
-    """Make an empty table that cuts nothing off."""
+    """Make an empty table that does not cut text off.
+
+    Args:
+        columns: The titles of the columns.
+        options: Further arguments of `rich.table.Table`.
+    """
     empty = Table(**options)
     for column in columns:
         empty.add_column(column, overflow="fold")
@@ -74,14 +82,14 @@ err = PlainConsole(stderr=True)
 
 @contextlib.contextmanager
 def errors(*settings: type[BaseModel]) -> Iterator[None]:
-    """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130
-    for Ctrl-C.
+    """Print an error of this package as one message on stderr, and end the command with an exit
+    code: 2 for wrong settings, 130 for Ctrl-C, else 1.
 
     SIGTERM is treated as Ctrl-C, so that started processes end in order.
 
     Args:
-        settings: Further models of settings that a user writes, whose fields the message lists for
-            an unknown one.
+        settings: Further models of settings that a user writes. If a field is unknown, the message
+            lists the fields of its model.
     """
     try:
         with interrupts():
@@ -96,7 +104,8 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
         fail(str(error), 2)
     except ClusterLost as error:
         with open(os.dup(2), "w") as stderr, open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), 2)  # Ray's native threads log there until the process ends
+            # Ray's native threads write to stderr until the process ends.
+            os.dup2(nowhere.fileno(), 2)
             say_error(f"{type(error).__name__}: {error}", PlainConsole(file=stderr))
         raise typer.Exit(1) from error
     except VLAgentsError as error:
@@ -128,21 +137,30 @@ def say_error(message: str, console: Console | None = None) -> None:
 
 
 def fresh(folder: Path) -> Path:
-    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results
-    never mix.
+    """Return the path of a new folder, so that results never mix.
 
-    Raises `ConfigError` if it is a file.
+    Args:
+        folder: The preferred path.
+
+    Returns:
+        `folder`, or the first of folder-2, folder-3, … that does not exist.
+
+    Raises:
+        ConfigError: `folder` is a file.
     """
     if folder.is_file():
         raise ConfigError(f"{folder}: expected a folder, got a file; choose another name")
-    if not folder.exists():
-        return folder
-    numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
-    return next(candidate for candidate in numbered if not candidate.exists())
+
+    path = folder
+    number = 1
+    while path.exists():
+        number += 1
+        path = folder.with_name(f"{folder.name}-{number}")
+    return path
 
 
 def print_json(document: Any) -> None:
-    """Print the JSON document of a command with `--json`, and nothing else, on stdout."""
+    """Print the JSON document of a command with `--json` on stdout, which has nothing else."""
     out.print(json.dumps(document, indent=2, default=str))
 
 

@@ -34,39 +34,43 @@ if TYPE_CHECKING:
 
 GB = 1e9
 SHM = Path("/dev/shm")  # noqa: S108 - where Linux has its shared memory, not a temporary file
-# Ray's own rules (ray/_private/ray_constants.py, utils.py, worker.py).
+# Ray's rules for the size of its object store (ray/_private/ray_constants.py, utils.py, worker.py).
 _STORE_SHARE, _STORE_MAX, _STORE_UNCAPPED = 0.3, 200 * GB, 10 * GB
-_FILES_WANTED, _FILES_RAISED_TO, _FILES_ENOUGH = 8192, 65536, 4096
+# Limits of open files: the recommended one, the one to which Ray raises its own, and the lowest one
+# without a warning.
+_FILES_RECOMMENDED, _FILES_RAISED_TO, _FILES_ENOUGH = 8192, 65536, 4096
 _SOCKET_PATH_MAX = 107  # bytes of a Unix socket's path, without its final NUL
 _SESSION_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store"
-_DISK_FULL = 0.95
+_DISK_FULL = 0.95  # the share of a disk above which Ray stops spilling to it
 DEFAULT_PORT = 8000
-_FIRST_FREE = 1024  # ports below are root's
+_FIRST_FREE = 1024  # lower ports are reserved for root
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-# Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or
-# the reason why they use none.
+# A program that prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU
+# that they use or the reason why they use none.
 _LIBRARIES = """
 import json, os, sysconfig
 from importlib.metadata import distributions
 os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-installed = {one.name: one.version for one in distributions()}
-found = {"headers": sysconfig.get_path("include"), "libraries": {}}
-for name in [name for name in ("torch", "jax") if name in installed]:
-    facts = {"version": installed[name], "cuda": None, "device": None, "why": ""}
-    found["libraries"][name] = facts
+versions = {distribution.name: distribution.version for distribution in distributions()}
+report = {"headers": sysconfig.get_path("include"), "libraries": {}}
+for name in ("torch", "jax"):
+    if name not in versions:
+        continue
+    facts = {"version": versions[name], "cuda": None, "device": None, "why": ""}
+    report["libraries"][name] = facts
     try:
         library = __import__(name)
         if name == "torch":
             facts["cuda"] = library.version.cuda
             facts["device"] = library.cuda.get_device_name()
         else:
-            plugins = [cuda for cuda in ("12", "13") if f"jax-cuda{cuda}-plugin" in installed]
+            plugins = [cuda for cuda in ("12", "13") if f"jax-cuda{cuda}-plugin" in versions]
             facts["cuda"] = plugins[0] if plugins else None
             facts["device"] = library.devices("gpu")[0].device_kind
     except Exception as error:
         facts["why"] = (str(error).splitlines() or [type(error).__name__])[0]
-print("\\n" + json.dumps(found))
+print("\\n" + json.dumps(report))
 """
 
 SUPPORTED = (3, 11)  # the version of Python that the tests of servers run
@@ -76,13 +80,13 @@ SUPPORTED = (3, 11)  # the version of Python that the tests of servers run
 class Check:
     """One row of `vlagents-ray doctor`.
 
-    "fail": serving a policy or evaluating it on `tabletop` will not work here. "warn": something
-    optional is missing, or will be slow.
+    The status "fail" means that serving a policy or evaluating it on `tabletop` will not work here;
+    "warn" means that something optional is missing, or will be slow.
     """
 
     status: Literal["ok", "warn", "fail"]
-    detail: str  # what was found
-    cure: str = ""  # empty without a problem
+    detail: str  # the finding
+    cure: str = ""  # empty if there is no problem
 
 
 def shared_memory() -> Check:
@@ -97,8 +101,12 @@ def shared_memory() -> Check:
 
 
 def judge_shared_memory(total: float, free: float, memory: float) -> Check:
-    """Judge sizes in bytes: of /dev/shm, of its free space, and of the memory of the machine or
-    container.
+    """Judge the size of the shared memory.
+
+    Args:
+        total: The size of /dev/shm, bytes.
+        free: The free space in it, bytes.
+        memory: The memory of the machine or container, bytes.
     """
     store = min(_STORE_SHARE * memory, _STORE_MAX, max(_STORE_UNCAPPED, 0.95 * free))
     detail = (
@@ -137,7 +145,13 @@ def temp_dir() -> Check:
 
 
 def judge_temp_dir(path: str, total: float, free: float) -> Check:
-    """Judge the `total` and `free` bytes of the file system that holds `path`."""
+    """Judge the folder of Ray's session files.
+
+    Args:
+        path: The folder.
+        total: The size of its file system, bytes.
+        free: The free space in it, bytes.
+    """
     detail = f"{path}: {free / GB:.1f} of {total / GB:.1f} GB free"
     cure = "free some space, or set RAY_TMPDIR to a folder on a larger disk"
     length = len(os.fsencode(path)) + len(_SESSION_SOCKET)
@@ -162,21 +176,26 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
 
 def open_files() -> Check:
     """Check that one process may hold as many sockets and files as a server needs."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    return judge_open_files(
-        sys.maxsize if soft == unlimited else soft, sys.maxsize if hard == unlimited else hard
-    )
+    limits = []
+    for limit in resource.getrlimit(resource.RLIMIT_NOFILE):
+        limits.append(sys.maxsize if limit == resource.RLIM_INFINITY else limit)
+    soft, hard = limits
+    return judge_open_files(soft, hard)
 
 
 def judge_open_files(soft: int, hard: int) -> Check:
-    """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
+    """Judge the limits of open files of a process.
+
+    Args:
+        soft: The limit that applies now. Ray raises it up to the hard limit or 65536.
+        hard: The limit that only root can raise.
+    """
     effective = max(soft, min(hard, _FILES_RAISED_TO))
     if effective >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
     cure = (
-        f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's "
-        "systemd unit"
+        f"ulimit -Hn {_FILES_RECOMMENDED} as root, or LimitNOFILE={_FILES_RECOMMENDED} in the "
+        "service's systemd unit"
     )
     return Check("warn", f"{effective} a process; many robots or workers at once may run out", cure)
 
@@ -184,18 +203,19 @@ def judge_open_files(soft: int, hard: int) -> Check:
 def port_free(port: int) -> Check:
     """Check that the TCP port is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ports in TIME_WAIT are free
+        # A port in the state TIME_WAIT counts as free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", port))
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
             why = "taken" if error.errno == errno.EADDRINUSE else "only root may listen on it"
-            other = port + 1 if port >= _FIRST_FREE else DEFAULT_PORT
+            next_port = port + 1 if port >= _FIRST_FREE else DEFAULT_PORT
             return Check(
                 "warn",
                 why,
-                f"`ss -ltnp` names its process; or vlagents-ray serve POLICY --port {other}",
+                f"`ss -ltnp` names its process; or vlagents-ray serve POLICY --port {next_port}",
             )
     return Check("ok", "free")
 
@@ -207,10 +227,19 @@ def run(
     *,
     as_json: bool = False,
 ) -> int:
-    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else
-    0.
+    """Run all checks, and print a row for each.
 
-    Raises `ConfigError` if one of `pythons` is no program.
+    Args:
+        console: The console on which the table is printed.
+        port: The port that a server would listen on.
+        pythons: The interpreters whose libraries are checked, see `checks`.
+        as_json: Whether a JSON document is printed instead of a table.
+
+    Returns:
+        The exit code: 1 if any check failed, else 0.
+
+    Raises:
+        ConfigError: One of `pythons` is not a program.
     """
     for interpreter in pythons:
         _require_program(interpreter)
@@ -230,23 +259,30 @@ def run(
 
 
 def _require_program(interpreter: Path) -> None:
-    """Raise `ConfigError` if `interpreter` is no program."""
+    """Raise `ConfigError` if `interpreter` is not a program."""
     if interpreter.is_file() and os.access(interpreter, os.X_OK):
         return
-    kind = "a folder" if interpreter.is_dir() else "no program"
-    inside = interpreter / "bin/python"
-    cure = f"; did you mean {inside}?" if inside.exists() else ""
+    description = "a folder" if interpreter.is_dir() else "no program"
+    python_inside = interpreter / "bin/python"
+    cure = f"; did you mean {python_inside}?" if python_inside.exists() else ""
     raise ConfigError(
         "--python: expected the interpreter of an environment, such as .venv-lerobot/bin/python, "
-        f"got {interpreter}, which is {kind}{cure}"
+        f"got {interpreter}, which is {description}{cure}"
     )
 
 
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
-    """Yield names and results of all checks; `pythons` take the place of those that `env make`
-    made in this folder.
+    """Run all checks.
+
+    Args:
+        port: The port that a server would listen on.
+        pythons: The interpreters whose libraries are checked; default: the interpreters of the
+            environments that `env make` made in this folder.
+
+    Yields:
+        The name and the result of each check.
     """
-    todo: list[tuple[str, Callable[[], Check]]] = [
+    named_checks: list[tuple[str, Callable[[], Check]]] = [
         ("Python", python_version),
         ("Ray", ray),
         ("plug-ins", plugins),
@@ -259,17 +295,18 @@ def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[t
         ("temporary files", temp_dir),
         ("open files", open_files),
     ]
-    for name, check in todo:
+    for name, check in named_checks:
         yield name, guarded(check)
 
     yield from libraries(Path(sys.executable))
-    made = [*sorted(Path().glob(".venv-*/bin/python")), *Path("/opt/family/bin").glob("python")]
-    for interpreter in pythons or made:
+    made_here = sorted(Path().glob(".venv-*/bin/python"))
+    made_in_image = Path("/opt/family/bin").glob("python")
+    for interpreter in pythons or [*made_here, *made_in_image]:
         yield from libraries(interpreter, status="fail" if pythons else "warn")
 
 
 def guarded(check: Callable[[], Check]) -> Check:
-    """Run a check; the error that it raises is a "warn" row."""
+    """Run a check; an error that it raises becomes a row with the status "warn"."""
     try:
         return check()
     except MissingDependency as error:
@@ -308,8 +345,8 @@ def ray() -> Check:
 def plugins() -> Check:
     """List the installed plug-ins, and those of the project that are not installed."""
     missing: set[str] = set()
-    for kind in published():
-        missing.update(not_installed(kind).values())
+    for group in published():
+        missing.update(not_installed(group).values())
 
     detail = ", ".join(plugin_distributions()) or "none"
     if missing:
@@ -369,10 +406,14 @@ def python_version() -> Check:
 def libraries(
     python: Path, status: Literal["warn", "fail"] = "warn"
 ) -> Iterator[tuple[str, Check]]:
-    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler,
-    if it has them.
+    """Check the libraries of an interpreter: torch, JAX and Triton's compiler, if it has them.
 
-    `status` is that of an interpreter that does not run.
+    Args:
+        python: The interpreter.
+        status: The status of the result if the interpreter does not run.
+
+    Yields:
+        The name and the result of each check.
     """
     where = "" if str(python) == sys.executable else f" in {python.parent.parent}"
     answer = _output([str(python), "-c", _LIBRARIES])
@@ -402,7 +443,7 @@ def judge_library(
         version: The version of the library.
         cuda: The version of CUDA that it was built for; None for CPUs only.
         device: The name of the GPU that it uses; None if it uses none.
-        why: The reason why it uses no GPU.
+        why: The reason why it does not use a GPU.
     """
     build = f"for CUDA {cuda}" if cuda else "for CPUs only"
     detail = f"{version}, {build}"
@@ -431,8 +472,11 @@ def judge_library(
 
 
 def triton_compiler(headers: Path) -> Check:
-    """Check that Triton finds a C compiler and Python's headers, with which it builds a program
-    that starts kernels.
+    """Check that Triton finds a C compiler and Python's headers, with which it builds the program
+    that starts its kernels.
+
+    Args:
+        headers: The folder of Python's headers.
     """
     compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
@@ -479,6 +523,7 @@ def _rendered(simulator: str, probe: RenderProbe) -> Check:
 
 
 def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+    """Run a program, and return its output; a program that cannot run has failed."""
     try:
         return subprocess.run(  # noqa: S603
             command, capture_output=True, text=True, timeout=timeout_s, check=False
@@ -490,4 +535,5 @@ def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedPr
 
 
 def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["no message"])[-1]
+    lines = text.strip().splitlines()
+    return lines[-1] if lines else "no message"

@@ -53,24 +53,29 @@ class EvalOptions:
         list[str],
         typer.Argument(
             metavar="FILE | ENV...",
-            help="A file of runs (.yaml); or environments: tabletop, 'libero/*', …",
+            help="A file of runs (.yaml), or environments such as tabletop or 'libero/*'.",
         ),
     ]
     source: Annotated[
-        str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")
+        str | None,
+        typer.Option(
+            "--policy", help="The policy: a registered name, a deployment file, or a URL."
+        ),
     ] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
     episodes: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_EPISODES, help="Episodes of each environment; default: 10."),
+        typer.Option(
+            min=1, max=MOST_EPISODES, help="Number of episodes in each environment; default: 10."
+        ),
     ] = None
     workers: Annotated[
         int | None,
         typer.Option(
             min=0,
             max=MOST_WORKERS,
-            help="Environments played in parallel; 0: in this process, without Ray. Default: 0 if "
-            "short, else 1.",
+            help="Number of environments that run in parallel; 0 runs them in this process, "
+            "without Ray. Default: 0 for a short evaluation, else 1.",
         ),
     ] = None
     cpus: Annotated[
@@ -80,7 +85,7 @@ class EvalOptions:
             min=0,
             max=MOST_CPUS,
             callback=finite,
-            help="CPUs of each worker, unless the file says how many; default: 0.5.",
+            help="Number of CPUs of each worker, unless the file sets it; default: 0.5.",
         ),
     ] = None
     gpus: Annotated[
@@ -90,44 +95,62 @@ class EvalOptions:
             min=0,
             max=MOST_CPUS,
             callback=finite,
-            help="GPUs per worker to render on, such as 0.25; default: 0 (software).",
+            help="Number of GPUs on which each worker renders, such as 0.25; default: 0, which "
+            "renders in software.",
         ),
     ] = None
     seeds: Annotated[
         int | None,
-        typer.Option("--seed", min=0, max=MOST_SEED, help="Episode i uses seed + i; default: 0."),
+        typer.Option(
+            "--seed",
+            min=0,
+            max=MOST_SEED,
+            help="Seed of the first episode; episode i uses seed + i; default: 0.",
+        ),
     ] = None
-    video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
+    video: Annotated[
+        str | None,
+        typer.Option(help="Episodes whose video is written: none, failures (default) or all."),
+    ] = None
     record: Annotated[
-        str | None, typer.Option(help="Trajectories: none (default), failures or all.")
+        str | None,
+        typer.Option(help="Episodes whose trajectory is written: none (default), failures or all."),
     ] = None
     track: Annotated[
         str, typer.Option(help="Trackers such as wandb, with commas between them.")
     ] = ""
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the results in --out.")] = (
-        False
-    )
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the evaluation in the folder --out.")
+    ] = False
     accept_changes: Annotated[
         bool,
         typer.Option(
             "--accept-changes",
-            help="With --resume: continue although files or weights have changed; the report "
-            "says so.",
+            help="With --resume: continue even if files or weights have changed, which the report "
+            "records.",
         ),
     ] = False
     execute: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_ROWS, help="Rows executed of each chunk; default: all."),
+        typer.Option(
+            min=1, max=MOST_ROWS, help="Number of rows executed of each chunk; default: all."
+        ),
     ] = None
     retries: Annotated[
         int | None,
-        typer.Option(min=0, max=MOST_RETRIES, help="Attempts after a lost one; default: 3."),
+        typer.Option(
+            min=0,
+            max=MOST_RETRIES,
+            help="Number of further attempts at an episode that infrastructure lost; default: 3.",
+        ),
     ] = None
     config: Set = field(default_factory=list)
     env_options: Annotated[
         list[str],
         typer.Option(
-            "--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256."
+            "--env-set",
+            metavar="KEY=VALUE",
+            help="An option of the environments, such as width=256; may be repeated.",
         ),
     ] = field(default_factory=list)
     options: Annotated[
@@ -135,19 +158,25 @@ class EvalOptions:
         typer.Option(
             "--reset-set",
             metavar="KEY=VALUE",
-            help="An option of the policy's reset: checkpoint_step=9.",
+            help="An option of the policy's reset, such as checkpoint_step=9; may be repeated.",
         ),
     ] = field(default_factory=list)
     watch: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Evaluate each checkpoint that a training run writes there, until Ctrl-C.",
+            help="Evaluate each checkpoint that a training run writes into this folder, until "
+            "Ctrl-C.",
         ),
     ] = None
     until: Annotated[
         int | None,
-        typer.Option(min=0, max=MOST_STEP, metavar="STEP", help="End --watch with this step."),
+        typer.Option(
+            min=0,
+            max=MOST_STEP,
+            metavar="STEP",
+            help="With --watch: end after the checkpoint of this step.",
+        ),
     ] = None
     settle_s: Annotated[
         float | None,
@@ -155,27 +184,36 @@ class EvalOptions:
             min=0,
             max=MOST_S,
             callback=finite,
-            help="With --watch: a checkpoint is complete after this time without a change; "
-            "default: 10.",
+            help="With --watch: treat a checkpoint as complete after this number of seconds "
+            "without changes; default: 10.",
         ),
     ] = None
     marker: Annotated[
-        str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="With --watch: the file that the trainer writes last into a checkpoint.",
+        ),
     ] = None
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")
+        bool,
+        typer.Option(
+            "--dry-run", help="Print the plan and the remaining time, without running episodes."
+        ),
     ] = False
     end_at: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970.",
+            help="Start no episode that would end after this time: 2027-01-31T18:30, or seconds "
+            "since 1970.",
         ),
     ] = None
     replica_per_gpu: Annotated[
         bool,
         typer.Option(
-            "--replica-per-gpu", help="With --address: a policy has a replica on each of its GPUs."
+            "--replica-per-gpu",
+            help="With --address: run a replica of the policy on each GPU of the cluster.",
         ),
     ] = False
     arm: Annotated[
@@ -183,27 +221,34 @@ class EvalOptions:
         typer.Option(
             "--robot",
             metavar="MODULE:CLASS",
-            help="Play the file's trials on a real robot, of this class: a person resets the scene "
-            "and judges, and "
-            "does not see which policy plays.",
+            help="Run the trials of the file on a real robot of this class. The operator resets "
+            "the scene and judges each trial, without knowing which policy runs.",
         ),
     ] = None
     operator: Annotated[
         str | None,
         typer.Option(
-            metavar="page|terminal", help="With --robot: where that person is asked; default: page"
+            metavar="page|terminal",
+            help="With --robot: where the operator answers questions; default: page.",
         ),
     ] = None
     unblind: Annotated[
-        bool, typer.Option("--unblind", help="With --robot: write the results so far.")
+        bool,
+        typer.Option(
+            "--unblind",
+            help="With --robot: write the results so far, with the names of the policies.",
+        ),
     ] = False
     address: Address = None
     live: Live = False
     live_at: LiveAt = None
 
-    def given(self, *names: str) -> list[str]:
-        """Return the options among `names` that are set, as the command line writes them; 0 counts
-        as set, False does not.
+    def options_set(self, *names: str) -> list[str]:
+        """Return the options that are set, as they are written on the command line.
+
+        Args:
+            names: The names of the fields of the options. The value 0 counts as set, False does
+                not.
         """
         options = []
         for name in names:
@@ -213,10 +258,17 @@ class EvalOptions:
         return options
 
     def require_together(self, *, on_robot: bool) -> None:
-        """Raise `ConfigError` for options that need another one, or that exclude one another."""
-        of_watch = self.given("until", "settle_s", "marker")
-        if self.watch is None and of_watch:
-            raise ConfigError(f"got {of_watch} without --watch")
+        """Check the combination of the options.
+
+        Args:
+            on_robot: Whether the evaluation runs on a real robot.
+
+        Raises:
+            ConfigError: An option needs another one that is not set, or two exclude each other.
+        """
+        watch_options = self.options_set("until", "settle_s", "marker")
+        if self.watch is None and watch_options:
+            raise ConfigError(f"got {watch_options} without --watch")
         if self.dry_run and self.watch is not None:
             raise ConfigError(
                 "--dry-run and --watch exclude each other: the steps of the training are not known "
@@ -230,15 +282,15 @@ class EvalOptions:
             raise ConfigError(
                 "--replica-per-gpu: want --address, a cluster whose GPUs can be counted"
             )
-        if self.dry_run and self.given("live", "live_at"):
+        if self.dry_run and self.options_set("live", "live_at"):
             raise ConfigError(
                 "--dry-run and --live exclude each other: nothing is played that could be watched"
             )
 
-        of_robot = self.given("operator", "unblind")
-        if not on_robot and of_robot:
-            raise ConfigError(f"got {of_robot} without --robot")
-        excluded = self.given("watch", "dry_run", "end_at", "track", "live", "live_at")
+        robot_options = self.options_set("operator", "unblind")
+        if not on_robot and robot_options:
+            raise ConfigError(f"got {robot_options} without --robot")
+        excluded = self.options_set("watch", "dry_run", "end_at", "track", "live", "live_at")
         if on_robot and excluded:
             raise ConfigError(f"--robot and {excluded} exclude each other")
         if self.operator not in (None, "page", "terminal"):
@@ -247,15 +299,16 @@ class EvalOptions:
 
 @command_of(EvalOptions)
 def evaluate_command(options: EvalOptions) -> None:
-    """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
+    """Evaluate policies: run episodes in parallel, and report success rates with confidence
+    intervals and videos.
 
-    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers,
-    --video, --record, --track, --retries and --resume win over it.
+    A file contains policies, their checkpoints, suites of environments and seeds. The options
+    --out, --workers, --video, --record, --track, --retries and --resume override it.
 
-    Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if
-    interrupted (resume both with --resume); 2 for invalid settings; 3 when an error of the policy
-    ended every episode of a case; 1 for any other failure, and when infrastructure lost an episode
-    for good (--resume tries it again).
+    Exit status: 0 if every episode has a result; 75 if episodes are left because of --end-at, 130
+    if the evaluation was interrupted (continue both with --resume); 2 for invalid settings; 3 if an
+    error of the policy ended every episode of a case; 1 for any other failure, and if
+    infrastructure lost an episode (--resume runs it again).
     """
     with errors():
         config = config_from_options(options)
@@ -297,7 +350,12 @@ def evaluate_command(options: EvalOptions) -> None:
 
 
 def config_from_options(options: EvalOptions) -> EvalConfig:
-    """Build the configuration of an evaluation from the options of `vlagents-ray eval`."""
+    """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
+
+    Raises:
+        ConfigError: An option is missing, or contradicts the file of runs.
+        pydantic.ValidationError: A value is wrong.
+    """
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 
     targets = options.targets
@@ -309,10 +367,10 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         "env_options": parse_settings(options.env_options, "--env-set"),
         "seeds": None if options.seeds is None else [options.seeds],
     }
-    run = _given(parsed, EvalConfig)
-    policy = _given(parsed, PolicyConfig)
-    suite = _given(parsed, SuiteConfig)
-    worker = _given(parsed, WorkerConfig)
+    run = _settings_of(parsed, EvalConfig)
+    policy = _settings_of(parsed, PolicyConfig)
+    suite = _settings_of(parsed, SuiteConfig)
+    worker = _settings_of(parsed, WorkerConfig)
 
     if targets[0].endswith(YAML_SUFFIXES):
         excess = [*targets[1:], *policy, *suite]
@@ -333,6 +391,7 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
                 "runs (.yaml)"
             )
         fields = {"policies": [policy], "suites": [{"envs": list(targets)} | suite], **run}
+
     if options.arm is not None:
         fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
     config = EvalConfig.model_validate(fields)
@@ -351,9 +410,10 @@ def _with_worker(config: EvalConfig, options: dict[str, Any]) -> EvalConfig:
 
     def fill(worker: WorkerConfig) -> WorkerConfig:
         """Return the settings of a worker, with the options that they lack."""
-        missing = {
-            name: value for name, value in options.items() if name not in worker.model_fields_set
-        }
+        missing = {}
+        for name, value in options.items():
+            if name not in worker.model_fields_set:
+                missing[name] = value
         return worker.model_copy(update=missing)
 
     suites = []
@@ -365,7 +425,7 @@ def _with_worker(config: EvalConfig, options: dict[str, Any]) -> EvalConfig:
     return config.model_copy(update={"worker": fill(config.worker), "suites": suites})
 
 
-def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+def _settings_of(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
     """Select the options that are fields of `model` and are set."""
     selected = {}
     for name in model.model_fields:
@@ -377,5 +437,9 @@ def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
 
 
 def read_run(file: Path) -> dict[str, Any]:
-    """Read a file of runs."""
+    """Read a file of runs, and return its settings.
+
+    Raises:
+        ConfigError: There is no such file, or it is not a mapping.
+    """
     return read_run_file(file, "file of runs", "`policies` and `suites`")

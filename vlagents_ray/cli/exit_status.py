@@ -1,4 +1,5 @@
-"""Exit statuses of commands that programs read; the others are those of `console`."""
+"""An exit status that programs read; see `console.errors` for the others."""
 
-# `vlagents-ray eval` when its time is over and episodes are left (EX_TEMPFAIL of sysexits.h)
+# The status of `vlagents-ray eval` if its time is over and episodes are left (EX_TEMPFAIL of
+# sysexits.h).
 OUT_OF_TIME = 75

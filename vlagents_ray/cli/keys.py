@@ -1,4 +1,4 @@
-"""`vlagents-ray keys`: make, list and revoke the API keys of a server."""
+"""`vlagents-ray keys`: makes, lists and revokes the API keys of a server."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
 from vlagents_ray.serve.access.key_store import Key, new_key, read_keys, revoke
 
-keys = typer.Typer(
-    no_args_is_help=True, help="The API keys of a server: make, list and revoke them."
-)
+keys = typer.Typer(no_args_is_help=True, help="Make, list and revoke the API keys of a server.")
 File = Annotated[
     Path | None,
     typer.Option(
         "--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder."
     ),
 ]
-Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
+Name = Annotated[
+    str, typer.Argument(help="Name of the robot or program that uses the key, such as arm-1.")
+]
 
 
 @keys.command("new")
@@ -33,36 +33,48 @@ def new(
     name: Name,
     file: File = None,
     app: Annotated[
-        list[str], typer.Option(help="An application that it is for, repeatable; default: all.")
+        list[str],
+        typer.Option(
+            help="An application for which the key is valid; may be repeated; default: all."
+        ),
     ] = [],  # noqa: B006
     rate: Annotated[
         float | None,
         typer.Option(
-            min=0.001, max=1e6, callback=finite, help="Requests a second, at each replica."
+            min=0.001,
+            max=1e6,
+            callback=finite,
+            help="Most requests per second, at each replica.",
         ),
     ] = None,
     sessions: Annotated[
         int | None,
-        typer.Option(min=1, max=1_000_000, help="Sessions held at once, at each replica."),
+        typer.Option(min=1, max=1_000_000, help="Most sessions at the same time, at each replica."),
     ] = None,
     priority: Annotated[
-        str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")
+        str | None,
+        typer.Option(
+            help="Highest priority of its requests; with 'simulation', robots are served first."
+        ),
     ] = None,
     scope: Annotated[
         list[str],
         typer.Option(
-            help="What else it may: 'weights' push, 'watch' all sessions, 'operate' them; "
-            "repeatable."
+            help="A further permission: 'weights' to push weights, 'watch' to see all sessions, "
+            "'operate' to send commands to them; may be repeated."
         ),
     ] = [],  # noqa: B006
     days: Annotated[
         float | None,
         typer.Option(
-            min=0.001, max=36_500, callback=finite, help="It expires after this number of days."
+            min=0.001,
+            max=36_500,
+            callback=finite,
+            help="Number of days after which the key expires.",
         ),
     ] = None,
 ) -> None:
-    """Make a key. It is shown this once; the file keeps its hash."""
+    """Make a key, and print it. It is not shown again, as the file contains only its hash."""
     with errors():
         expires = None if days is None else time.time() + days * 86_400
         path = _path(file)
@@ -81,7 +93,7 @@ def new(
 
 @keys.command("list")
 def list_(file: File = None) -> None:
-    """List the keys, and what each allows."""
+    """List the keys with their permissions and limits."""
     with errors():
         listed = table("name", "for", "requests/s", "sessions", "priority", "may also", "state")
         for key in read_keys(_existing(file)):
@@ -99,7 +111,7 @@ def list_(file: File = None) -> None:
 
 @keys.command("revoke")
 def revoke_(name: Name, file: File = None) -> None:
-    """Revoke a key. Running servers notice within seconds, and close the connections that use
+    """Revoke a key. Running servers reject it within seconds, and close the connections that use
     it.
     """
     with errors():
@@ -108,7 +120,7 @@ def revoke_(name: Name, file: File = None) -> None:
 
 
 def _state(key: Key) -> Text:
-    """Return whether a key is valid, and until when."""
+    """Return a text that says whether a key is valid, and until when."""
     if key.revoked:
         return Text("revoked", "red")
     if key.expires is None:
@@ -131,7 +143,7 @@ def _path(file: Path | None) -> Path:
 
 
 def _existing(file: Path | None) -> Path:
-    """Return the path of the key file; raise `ConfigError` if there is none."""
+    """Return the path of the key file; raise `ConfigError` if it does not exist."""
     path = _path(file)
     if not path.is_file():
         raise ConfigError(
