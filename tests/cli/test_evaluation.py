@@ -313,16 +313,16 @@ def test_what_was_played_is_not_planned_again_and_tells_the_time(
 ) -> None:
     results = play(config(episodes=3))
     [played, other] = forecasts(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=9)), results)
-    assert (played.finished, played.left) == (3, 6)
+    assert (played.finished, played.remaining) == (3, 6)
     assert played.seconds == pytest.approx(sum(one.seconds for one in results.cases[0].counted) / 3)
-    assert (other.finished, other.left, other.seconds) == (0, 9, None)
+    assert (other.finished, other.remaining, other.seconds) == (0, 9, None)
 
 
 def test_nothing_is_left_of_a_case_that_stopped(config: Callable[..., EvalConfig]) -> None:
     settings = config(episodes=30, stop={"target": 0.3})
     play(settings, left_out=range(20, 30))
     [found] = forecasts(plan_cases(settings), Results.load(settings.out))
-    assert (found.finished, found.left) == (20, 0)
+    assert (found.finished, found.remaining) == (20, 0)
 
 
 def test_the_plan_is_printed_without_asking_any_policy(

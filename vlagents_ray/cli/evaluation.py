@@ -1,5 +1,5 @@
-"""Evaluations by their configuration: played, planned, watched or on a robot, and the live page
-of `--live`.
+"""Evaluations from their configuration: in simulation, as a plan, of a running training, or on a
+robot; and the live page of `--live`.
 """
 
 from __future__ import annotations
@@ -57,13 +57,19 @@ from vlagents_ray.serve.models.checkpoints import CHOICE
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a case
-LOOK_S = 1.0  # period at which the folder is read
-_PORT = 8050  # of the page, if it is free
-_PAGE = "live"  # name of the page in the registry
+LOOK_S = 1.0  # the period at which the folder of checkpoints is read
+_PORT = 8050  # the port of the live page, if it is free
+_PAGE = "live"  # the name of the live page in the registry
 
 
 def live_address(at: str | None) -> tuple[str, int]:
-    """Return the (host, port) that `--live-at` states; None is `--live` alone.
+    """Return the address of the live page.
+
+    Args:
+        at: The value of `--live-at`, "HOST:PORT"; None for `--live` alone.
+
+    Returns:
+        The host and the port; port 0 is any free one.
 
     Raises:
         ConfigError: The plug-in with the page is not installed, or other machines would reach it
@@ -73,11 +79,11 @@ def live_address(at: str | None) -> tuple[str, int]:
     if at is None:
         return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:
-        parts = urlsplit(f"//{at}")
-        host, port = parts.hostname, parts.port
+        url = urlsplit(f"//{at}")
+        host, port = url.hostname, url.port
     except ValueError:
         host = port = None
-    if host is None or port is None or parts.netloc != at:
+    if host is None or port is None or url.netloc != at:
         raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
     require_watch_keys(host, load_keys())  # before anything is served
     return host, port
@@ -87,19 +93,30 @@ def live_address(at: str | None) -> tuple[str, int]:
 def shown_progress(
     plan: ResolvedPlan, live: tuple[str, int] | None, *, goes_on: bool = False
 ) -> Iterator[Progress]:
-    """Show an evaluation on the terminal and, if that has an address, on the live page, within the
-    context of its Ray.
+    """Show the progress of an evaluation on the terminal and on the live page.
 
-    Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
+    Without workers the terminal shows lines, as a table that is drawn again would disturb a
+    debugger.
+
+    Args:
+        config: The evaluation. Its Ray must be running already.
+        live: The address of the live page; None for no page.
+        goes_on: Whether further evaluations in the same folder follow.
+
+    Yields:
+        The progress, for `evaluate`.
     """
     progress = progress_for(out) if plan.workers else LineProgress(out)
     if live is None:
         yield progress
         return
+
     document = ProgressDocument(plan.out, progress, goes_on=goes_on)
-    urls = [str(policy.url) for policy in plan.policies]
-    apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
-    with _page(document, apps if node_of_this_process() is not None else [], live):
+    apps: list[str] = []
+    if node_of_this_process() is not None:
+        urls = [str(policy.url) for policy in plan.policies]
+        apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
+    with _page(document, apps, live):
         try:
             yield document
         except Exception as error:
@@ -111,8 +128,11 @@ def shown_progress(
 
 
 def follow(results: Path, address: tuple[str, int]) -> None:
-    """Serve the page of an evaluation or a training that another process writes to a folder,
-    until Ctrl-C.
+    """Serve the live page of an evaluation or a training of another process, until Ctrl-C.
+
+    Args:
+        results: The folder into which the other process writes its results.
+        address: The host and port of the page.
     """
     with _page(ResultsDocument(results), [], address), contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()
@@ -122,7 +142,7 @@ def follow(results: Path, address: tuple[str, int]) -> None:
 def _page(
     document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]
 ) -> Iterator[None]:
-    """Serve the live page for the length of the context, and print its URL."""
+    """Serve the live page within the context, and print its URL."""
     page: EvaluationPage = registered_class("pages", _PAGE)()
     with page.serve(document, apps, address, load_keys()) as url:
         out.print(f"live: {url}")
@@ -137,11 +157,17 @@ def run_evaluation(
     replica_per_gpu: bool = False,
     live: tuple[str, int] | None = None,
 ) -> None:
-    """Serve the policies that are not at a URL, evaluate them all, print the table.
+    """Serve the policies that are not at a URL, evaluate all policies, and print the table.
 
-    `end_at` is as in `evaluate`, and `live` the address of the live page, as for `shown_progress`.
+    Args:
+        config: The evaluation.
+        address: The Ray cluster, see `served`.
+        end_at: The time after which no episode ends, as in `evaluate`.
+        replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
+        live: The host and port of the live page; None for no page.
     """
-    if live is not None and config.workers is None:  # the page also shows the sessions of replicas
+    # The page also shows the sessions of replicas, which only Ray has.
+    if live is not None and config.workers is None:
         config = config.model_copy(update={"workers": 1})
 
     with contextlib.ExitStack() as stack:
@@ -161,8 +187,12 @@ def run_evaluation(
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
-    """Serve the policy unless it is at a URL, and play one episode of it; `only` as in
-    `evaluate`.
+    """Serve the policy unless it is at a URL, and run one episode of it.
+
+    Args:
+        config: The evaluation of one policy in one environment.
+        address: The Ray cluster, see `served`.
+        only: The number and the seed of the episode, as in `evaluate`.
     """
     with served(config, address) as (plan, agents), shown_progress(plan, None) as progress:
         return evaluate_plan(plan, agent_factory=agents, progress=progress, only=only)
@@ -174,8 +204,16 @@ def evaluate_and_print(
     end_at: float | None = None,
     agents: Agents | None = None,
 ) -> Summary:
-    """Evaluate policies, as `served` yields them; an interrupted evaluation prints its results
-    so far.
+    """Evaluate policies, and print the table of the results, also if the evaluation is interrupted.
+
+    Args:
+        config: The evaluation, as `served` yields it.
+        progress: Shows the progress.
+        end_at: The time after which no episode ends, as in `evaluate`.
+        agents: The policies that run in this process, as `served` yields them.
+
+    Returns:
+        The summary of the results.
     """
     try:
         summary = evaluate_plan(plan, agent_factory=agents, progress=progress, end_at=end_at)
@@ -196,9 +234,11 @@ def evaluate_and_print(
 
 def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
     """End the command with status 3 if an error of the policy ended every episode of one of these
-    cases.
+    cases, and with status 1 if infrastructure lost an episode.
 
-    The status is 1 if infrastructure lost an episode.
+    Args:
+        config: The evaluation; only its cases are considered.
+        summary: The summary of the results.
     """
     planned = {case.fingerprint for case in cases}
     results = [case for case in summary.results.cases if case.case_id in planned]
@@ -216,12 +256,13 @@ def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
     missing = sum(case.missing for case in results)
     if not missing:
         return
-    lost = []
+
+    lost_attempts = []
     for case in results:
-        lost += [attempt for attempt in case.attempts if not attempt.retried]
+        lost_attempts += [attempt for attempt in case.attempts if not attempt.retried]
     reason = ""
-    if lost:
-        last = max(lost, key=lambda attempt: attempt.at)
+    if lost_attempts:
+        last = max(lost_attempts, key=lambda attempt: attempt.at)
         first_line = last.error.strip().partition("\n")[0]
         reason = f", the last one to {last.code}: {first_line}"
     fail(
@@ -242,13 +283,24 @@ def watch_training(
     marker: str | None = None,
     live: tuple[str, int] | None = None,
 ) -> None:
-    """Evaluate each step of the one policy whose checkpoint contains `{step}`, once the step's
-    checkpoint is complete.
+    """Evaluate each checkpoint of a running training as soon as it is complete.
 
     All results go into one folder, and one server stays up. Policies without `{step}` are evaluated
-    in the first round. `live` is the address of the live page, as for `shown_progress`. Ends as
-    `rounds` does, or by Ctrl-C; resume to continue. An episode without a result ends the command
-    with status 1, after the last round.
+    in the first round. The evaluation ends after the step `until`, or by Ctrl-C; it can be resumed.
+    An episode without a result ends the command with status 1, after the last round.
+
+    Args:
+        config: The evaluation, in which the checkpoint of one policy contains `{step}`.
+        folder: The folder into which the training writes checkpoints.
+        address: The Ray cluster, see `served`.
+        until: The last step; None for no limit.
+        settle_s: The time without changes after which a checkpoint is complete, s.
+        marker: The file that the trainer writes last into a checkpoint.
+        live: The host and port of the live page; None for no page.
+
+    Raises:
+        ConfigError: The folder has results and `resume` is off, or no policy has `{step}` in its
+            checkpoint, or watching ended without a checkpoint.
     """
     trained, pattern = _trained_policy(config)
     # These errors are raised now, not at the first checkpoint.
@@ -305,13 +357,14 @@ def watch_training(
 
 
 def _trained_policy(config: EvalConfig) -> tuple[int, str]:
-    """Find the index of the policy that is trained, and the pattern of its checkpoints."""
+    """Return the index of the policy that is trained, and the pattern of its checkpoints."""
     patterns = {}
     for index, policy in enumerate(config.policies):
         settings: dict[str, Any] = {CHOICE: policy.checkpoint}
         if policy.source is not None and "://" not in policy.source:
             deployment = policy_deployment(policy, policy.source, step_follows=True)
             settings |= own_settings(deployment.applications[0])
+
         checkpoint = settings[CHOICE]
         if isinstance(checkpoint, str) and STEP in checkpoint:
             patterns[index] = checkpoint
@@ -330,7 +383,7 @@ def _trained_policy(config: EvalConfig) -> tuple[int, str]:
 
 
 def _with_steps(config: EvalConfig, index: int, steps: list[int]) -> EvalConfig:
-    """Return the evaluation, with these checkpoint steps of the policy at `index`."""
+    """Return the evaluation with these checkpoint steps of the policy at `index`."""
     policies = list(config.policies)
     policies[index] = policies[index].model_copy(update={"steps": steps})
     return config.model_copy(update={"policies": policies})
@@ -339,7 +392,14 @@ def _with_steps(config: EvalConfig, index: int, steps: list[int]) -> EvalConfig:
 def run_on_robot(
     config: EvalConfig, address: str | None, *, operator: str, unblinded: bool
 ) -> None:
-    """Serve the policies that are not at a URL, run the trials, print the table."""
+    """Serve the policies that are not at a URL, run the trials on a robot, and print the table.
+
+    Args:
+        config: The evaluation, with the settings of the robot.
+        address: The Ray cluster, see `served`.
+        operator: Where the operator answers questions, "page" or "terminal".
+        unblinded: Whether only the results so far are printed, with the names of the policies.
+    """
     from vlagents_ray.evaluate.robot import (
         PageOperator,
         TerminalOperator,
@@ -365,16 +425,25 @@ def run_on_robot(
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The episodes that one case has left, and the time that one of them takes."""
+    """The remaining episodes of a case, and the time that one of them takes."""
 
     case: EvalCase
-    finished: int  # number of planned episodes that are finished
-    left: int  # number of episodes to play; 0 if the case has stopped early
-    seconds: float | None  # mean time of the policy's episodes in the env; None if unknown
+    finished: int  # the number of planned episodes that are finished
+    remaining: int  # the number of episodes to run; 0 if the case has stopped early
+    seconds: float | None  # mean time of the policy's episodes in the env, s; None if unknown
 
 
 def print_plan(config: EvalConfig, address: str | None = None) -> None:
-    """Print a row for each case, and the sum. Nothing is served, played or written."""
+    """Print a row for each case of an evaluation, and the sum, without serving a policy, running an
+    episode or writing a file.
+
+    Args:
+        config: The evaluation.
+        address: The Ray cluster, see `served`.
+
+    Raises:
+        ConfigError: The evaluation could not run.
+    """
     for tracker in config.track:
         registered_class("trackers", tracker)  # raises an error for an unknown name
 
@@ -383,7 +452,11 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
     results = Results.load(resolved.out) if (resolved.out / FILE).is_file() else None
     forecast = forecasts(plan_cases(resolved), results)
     out.print(_forecast_table(forecast))
+    _print_sums(forecast, resolved.out, workers)
 
+
+def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> None:
+    """Print the number of cases and episodes, and the time that they take."""
     cases = [row.case for row in forecast]
     policies = len({case.contender for case in cases})
     envs = len({(case.suite.name, case.env) for case in cases})
@@ -395,22 +468,25 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
 
     planned = sum(case.planned for case in cases)
     finished = sum(row.finished for row in forecast)
-    left = sum(row.left for row in forecast)
+    remaining = sum(row.remaining for row in forecast)
     out.print(
-        f"{counted(planned, 'episode')}, {finished} of them finished in {resolved.out}, {left} to "
+        f"{counted(planned, 'episode')}, {finished} of them finished in {folder}, {remaining} to "
         "play"
     )
 
     # Workers share one queue, so that at most one episode's time is lost at the end.
-    total_s = sum(row.left * (row.seconds or 0.0) for row in forecast)
-    seconds = total_s / max(1, min(workers, left))
-    unknown = sum(row.seconds is None for row in forecast)
+    total_s = sum(row.remaining * (row.seconds or 0.0) for row in forecast)
+    seconds = total_s / max(1, min(workers, remaining))
     time = f"{_time(seconds)} as by earlier episodes"
+
+    unknown = sum(row.seconds is None for row in forecast)
     if unknown == len(forecast):
         time = "unknown time"
+    unplayed = ""
+    if unknown:
+        unplayed = f"; not played yet: {unknown} of {counted(len(forecast), 'case')}"
+
     where = f"with {counted(workers, 'worker')}" if workers else "in one process, without Ray"
-    cases_text = counted(len(forecast), "case")
-    unplayed = f"; not played yet: {unknown} of {cases_text}" if unknown else ""
     out.print(f"{time} {where}{unplayed}")
 
 
@@ -423,61 +499,80 @@ def _forecast_table(forecast: Sequence[Forecast]) -> Table:
         rows.add_column(title, justify="right", no_wrap=True)
 
     for row in forecast:
-        each, time = "?", "?"
+        episode_seconds = "?"
+        time = "?"
         if row.seconds is not None:
-            each, time = f"{row.seconds:.3g}", _time(row.left * row.seconds)
+            episode_seconds = f"{row.seconds:.3g}"
+            time = _time(row.remaining * row.seconds)
         rows.add_row(
             row.case.contender,
             " ".join(filter(None, row.case.name[1:])),
             str(len(row.case.suite.seeds)),
             str(row.case.planned),
             str(row.finished),
-            str(row.left),
-            each,
+            str(row.remaining),
+            episode_seconds,
             time,
         )
     return rows
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
-    """Return the forecast of each case, in their order, from the episodes in `results`."""
-    earlier = [] if results is None else results.cases
-    names = [(recorded.contender, recorded.suite, recorded.env) for recorded in earlier]
+    """Return the forecast of each case.
+
+    Args:
+        planned: The cases.
+        results: The earlier results in the same folder; None if there are none.
+
+    Returns:
+        The forecasts, in the order of the cases.
+    """
+    recorded_cases = [] if results is None else results.cases
+    names = [(recorded.contender, recorded.suite, recorded.env) for recorded in recorded_cases]
     forecast = []
     for case in planned:
         finished = 0
         has_stopped = False
         if case.name in names:
-            same = earlier[names.index(case.name)]
-            finished = _finished(case, [episode.result for episode in same.episodes])
-            has_stopped = same.stopped_at is not None
+            recorded_case = recorded_cases[names.index(case.name)]
+            finished = _finished(case, [episode.result for episode in recorded_case.episodes])
+            has_stopped = recorded_case.stopped_at is not None
 
         seconds: list[float] = []
-        for recorded in earlier:
+        for recorded in recorded_cases:
             if (recorded.policy, recorded.env) == (case.policy.name, case.env):
                 seconds += [episode.seconds for episode in recorded.counted]
 
-        left = 0 if has_stopped else case.planned - finished
+        remaining = 0 if has_stopped else case.planned - finished
         mean_s = sum(seconds) / len(seconds) if seconds else None
-        forecast.append(Forecast(case, finished, left, mean_s))
+        forecast.append(Forecast(case, finished, remaining, mean_s))
     return forecast
 
 
 def _finished(case: EvalCase, results: Sequence[EpisodeResult]) -> int:
     """Return the number of a case's planned episodes that have a result."""
-    keys = {
-        (result.key.episode, result.key.seed)
-        for result in results
-        if result.status != "infra_failed"
-    }
-    seeds = set(case.suite.seeds)
-    return sum(episode < case.suite.episodes and seed - episode in seeds for episode, seed in keys)
+    first_seeds = set(case.suite.seeds)
+    finished: set[tuple[int, int]] = set()
+    for result in results:
+        if result.status == "infra_failed":
+            continue
+        episode, seed = result.key.episode, result.key.seed
+        if episode < case.suite.episodes and seed - episode in first_seeds:
+            finished.add((episode, seed))
+    return len(finished)
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return "1 case", or "2 cases"."""
+    """Return a number with its noun, such as "1 case" or "2 cases".
+
+    Args:
+        number: The number.
+        noun: The noun in the singular.
+        plural: The noun in the plural; default: with an "s".
+    """
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def _time(seconds: float) -> str:
+    """Return a duration as H:MM:SS."""
     return str(datetime.timedelta(seconds=round(seconds)))

@@ -1,4 +1,4 @@
-"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, state, and
+"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, whether they can run, and
 installation commands.
 """
 
@@ -32,16 +32,17 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.launch.deployment_file import Deployment
 
 
-_SHORT = 5  # maximum number of ranges of tasks that a line of the listing names
+_SHORT = 5  # most ranges of tasks in a line of the listing
 
 
 @dataclass(frozen=True)
 class Listed:
     """One entry of a listing."""
 
+    # The names of the fields are keys of the JSON document.
     kind: str  # "policy", "wrapper" or "environment"
-    name: str  # as registered
-    what: str  # a description, or an environment's tasks, in one line; a key of the JSON document
+    name: str  # the registered name
+    what: str  # a description, or the tasks of an environment, in one line
     # The reason why it cannot run in this Python, with the cure; None if it is ready.
     missing: str | None
     # The settings of a policy or wrapper as `name=default`, the tasks of an environment.
@@ -49,40 +50,39 @@ class Listed:
 
     def lines(self) -> Iterator[str]:
         """Yield the full description, in whole lines, which can be copied and searched."""
+        title = "tasks" if self.kind == "environment" else "settings"
         yield f"{self.name}: {self.what}"
         yield f"  {'ready' if self.missing is None else self.missing}"
-        yield (
-            f"  {'tasks' if self.kind == 'environment' else 'settings'}: "
-            f"{', '.join(self.details) or 'none'}"
-        )
+        yield f"  {title}: {', '.join(self.details) or 'none'}"
 
 
 def policies_and_wrappers() -> Iterator[Listed]:
     """Yield the policies, then the wrappers."""
-    for kind, registered, find in (
+    for noun, group, find_class in (
         ("policy", "policies", policy_class),
         ("wrapper", "wrappers", wrapper_class),
     ):
-        for name in sorted(names(registered)):
+        for name in sorted(names(group)):
             try:
-                cls = find(name)
+                cls = find_class(name)
             except VLAgentsError as error:
-                yield Listed(kind, name, "cannot be loaded", str(error), [])
+                yield Listed(noun, name, "cannot be loaded", str(error), [])
                 continue
-            missing = missing_packages(name) if kind == "policy" else None
+            missing = missing_packages(name) if noun == "policy" else None
             settings = list(settings_of(cls))
-            yield Listed(kind, name, _what(registered, name), missing, settings)
-        yield from _in_other_plugins(kind, registered)
+            yield Listed(noun, name, _description(group, name), missing, settings)
+        yield from _in_other_plugins(noun, group)
 
 
-def _what(registered: str, name: str) -> str:
+def _description(group: str, name: str) -> str:
     """Return the description of a registered policy or wrapper, or its module's first sentence if
     its entry has none.
     """
-    entry = find_entry(registered, name)
+    entry = find_entry(group, name)
     if entry is not None and entry.about:
         return entry.about
-    return summary_of(sys.modules[target_of(registered, name).partition(":")[0]])
+    module_name = target_of(group, name).partition(":")[0]
+    return summary_of(sys.modules[module_name])
 
 
 def environments() -> Iterator[Listed]:
@@ -97,29 +97,35 @@ def environments() -> Iterator[Listed]:
             tasks = []
 
         task_ranges = list(ranges(tasks))
-        short = task_ranges
+        shown_ranges = task_ranges
         if len(task_ranges) > _SHORT:
-            short = [task_ranges[0], "…", task_ranges[-1]]
+            shown_ranges = [task_ranges[0], "…", task_ranges[-1]]
         description = "any task of the simulator"
         if tasks:
             plural = "" if len(tasks) == 1 else "s"
-            description = f"{len(tasks)} task{plural}: {', '.join(short)}"
+            description = f"{len(tasks)} task{plural}: {', '.join(shown_ranges)}"
         yield Listed("environment", name, description, missing, task_ranges)
     yield from _in_other_plugins("environment", "envs")
 
 
-def _in_other_plugins(kind: str, registered: str) -> Iterator[Listed]:
+def _in_other_plugins(noun: str, group: str) -> Iterator[Listed]:
     """Yield the names in plug-ins of the project that are not installed."""
-    for name, distribution in sorted(not_installed(registered).items()):
+    for name, distribution in sorted(not_installed(group).items()):
         cure = pip_install(distribution=distribution)
-        yield Listed(kind, name, f"in {distribution}", f"not installed: {cure}", [])
+        yield Listed(noun, name, f"in {distribution}", f"not installed: {cure}", [])
 
 
 def installing(listed: Sequence[Listed]) -> Iterator[str]:
-    """Yield a line for each way to install missing packages: a command and the policies that need
-    it, or an environment's cure.
+    """Return the commands that install missing packages.
+
+    Args:
+        listed: The entries of a listing.
+
+    Yields:
+        A line for each command, with the policies that need it, or for each environment with its
+        cure.
     """
-    names_by_line: dict[str, list[str]] = {}  # a line has {} for the names
+    names_by_line: dict[str, list[str]] = {}  # a line has {} in place of the names
     for entry in listed:
         modules: list[str] = []
         sources: list[str] = []
@@ -128,14 +134,15 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
             modules, sources, requirements = _lacking(entry.name)
 
         lines = []
-        is_by_environment = bool(requirements) and bool(modules or sources)
-        if is_by_environment:
+        needs_environment = bool(requirements) and bool(modules or sources)
+        if needs_environment:
             lines.append(f"vlagents-ray env make {requirements}  # {{}}")
         if sources:
             lines.append(f"export {sources[0]}=FOLDER  # a checkout, for {{}}")
-        if entry.missing is not None and not is_by_environment:
+        if entry.missing is not None and not needs_environment:
             escaped = entry.missing.replace("{", "{{").replace("}", "}}")
             lines.append(f"{{}}: {escaped}")
+
         for line in lines:
             names_by_line.setdefault(line, []).append(entry.name)
 
@@ -144,9 +151,13 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
 
 
 def require_packages(config: Deployment) -> None:
-    """Raise `MissingDependency` if a policy that is to run in this environment lacks packages here.
+    """Check that the packages of a deployment's policies are installed in this environment.
 
-    A checkout of its source is not required, as a setting may name one.
+    A policy that runs in another environment is not checked. A checkout of a policy's source is not
+    required, as a setting may name it.
+
+    Raises:
+        MissingDependency: A package is missing.
     """
     for app in config.applications:
         if app.args.get("environment") or app.runtime_env:
@@ -158,13 +169,20 @@ def require_packages(config: Deployment) -> None:
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Return the packages that a model family lacks in this environment, with the cure; None if
-    it lacks none.
+    """Return the packages that a model family lacks in this environment, with the cure.
+
+    Args:
+        name: The registered name of the policy.
+        checkout: Whether a missing checkout of the source counts.
+
+    Returns:
+        The packages and the cure in words; None if nothing is missing.
     """
     entry = find_entry("policies", name)
     if entry is not None and entry.extra and not all(map(importlib.util.find_spec, entry.needs)):
         cure = pip_install(entry.extra, entry.distribution)
         return f"not in this environment ({', '.join(entry.needs)}): {cure}"
+
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
@@ -183,8 +201,14 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
-    """Return the modules and checkout variables that a family lacks, and the name of its
-    requirements, "" if it has none. A family that an extra installs is not looked at.
+    """Return the packages that a model family lacks; none for a family that an extra installs.
+
+    Args:
+        name: The registered name of the policy.
+
+    Returns:
+        The missing modules, the variables of which one must name a checkout, and the name of the
+        family's requirements, which is empty if it has none.
     """
     entry = find_entry("policies", name)
     if entry is None or entry.extra:
@@ -202,7 +226,9 @@ def _lacking(name: str) -> tuple[list[str], list[str], str]:
 
 
 def settings_of(cls: type) -> Iterator[str]:
-    """Return each setting as `name=default`, or its name alone if it is required."""
+    """Yield each setting of a policy or wrapper as `name=default`, or only its name if it is
+    required.
+    """
     fields: Mapping[str, Any] | None = getattr(getattr(cls, "Config", None), "model_fields", None)
     if fields is not None:
         for name, field in fields.items():
@@ -214,12 +240,14 @@ def settings_of(cls: type) -> Iterator[str]:
 
     for parameter in inspect.signature(cls).parameters.values():
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
-            required = parameter.default is parameter.empty
-            yield parameter.name if required else f"{parameter.name}={parameter.default!r}"
+            if parameter.default is parameter.empty:
+                yield parameter.name
+            else:
+                yield f"{parameter.name}={parameter.default!r}"
 
 
 def ranges(tasks: list[str]) -> Iterator[str]:
-    """Join numbered names of one kind: "libero_spatial/0" to "libero_spatial/9" as
+    """Join consecutive numbered tasks: "libero_spatial/0" to "libero_spatial/9" become
     "libero_spatial/0..9".
     """
     for stem, group in groupby(tasks, _stem):

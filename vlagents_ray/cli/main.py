@@ -1,5 +1,5 @@
-"""The commands of `vlagents-ray`; each is thin around a folder of the package. Nothing here
-loads Ray.
+"""The commands of `vlagents-ray`, which call other folders of the package. This module does not
+import Ray.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
 
 OneName = Annotated[
-    str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")
+    str | None, typer.Argument(metavar="[NAME]", help="Show the details of this name alone.")
 ]
 
 app = typer.Typer(
@@ -41,6 +41,7 @@ app = typer.Typer(
 
 
 def _print_version(requested: bool) -> None:
+    """Print the version, and end the command."""
     if requested:
         out.print(f"vlagents-ray {importlib.metadata.version('vlagents-ray')}")
         raise typer.Exit
@@ -60,7 +61,7 @@ def commands(
 
 env = typer.Typer(
     no_args_is_help=True,
-    help="Python environments for policies that the server's own does not suit.",
+    help="Make Python environments for policies that cannot run in the server's environment.",
 )
 _MORE = "More commands"
 app.command("serve")(serve_command)
@@ -75,7 +76,7 @@ app.command("eval", short_help="Evaluate policies in parallel: success with inte
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
 )
 def robot_command(context: typer.Context) -> None:
-    """Drive a robot or a simulation by a policy, an operator, or both."""
+    """Drive a robot or a simulation with a policy, an operator, or both."""
     from vlagents_ray.cli.robot import main
 
     raise typer.Exit(main(context.args))
@@ -89,8 +90,8 @@ def demo(
 ) -> None:
     """Try it in a minute: serve a policy, evaluate it on the tabletop, record videos.
 
-    In a checkout this is the reference policy, which was trained; elsewhere the scripted one, which
-    needs no weights.
+    In a checkout this is the reference policy, which was trained; elsewhere it is the scripted
+    policy, which needs no weights.
     """
     from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
@@ -116,20 +117,22 @@ def demo(
         episodes=5,
     )
     with errors():
-        run_evaluation(
-            EvalConfig(
-                policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)
-            )
+        config = EvalConfig(
+            policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)
         )
+        run_evaluation(config)
 
 
 @app.command(short_help="Check this machine: Python, Ray, GPU, ports; each with the cure.")
 def doctor(
     port: Annotated[
-        int, typer.Option(min=1, max=65535, help="The port that a server would take.")
+        int, typer.Option(min=1, max=65535, help="The port on which a server would listen.")
     ] = 8000,
     python: Annotated[
-        list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")
+        list[Path],
+        typer.Option(
+            help="The Python of a policy's environment; may be repeated; default: those in .venv-*."
+        ),
     ] = [],  # noqa: B006
     as_json: AsJson = False,
 ) -> None:
@@ -143,19 +146,19 @@ def doctor(
     raise typer.Exit(status)
 
 
-# The short lines fit into 80 columns, so that all commands are on one screen.
-for _command, _name, _line in (
+# The short descriptions fit into 80 columns, so that all commands are on one screen.
+for _command, _name, _short_help in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
     (results.replay_command, "replay", "Play an episode again, and compare actions."),
 ):
-    app.command(_name, short_help=_line, rich_help_panel=_MORE)(_command)
-for _commands, _name, _line in (
+    app.command(_name, short_help=_short_help, rich_help_panel=_MORE)(_command)
+for _commands, _name, _short_help in (
     (env, "env", "Make Python environments for policies."),
     (keys, "keys", "Make, list and revoke the API keys of a server."),
     (new, "new", "Write a working skeleton, with its test."),
 ):
-    app.add_typer(_commands, name=_name, short_help=_line, rich_help_panel=_MORE)
+    app.add_typer(_commands, name=_name, short_help=_short_help, rich_help_panel=_MORE)
 
 
 def _add_commands_of_plugins() -> None:
@@ -185,15 +188,15 @@ def _add_commands_of_plugins() -> None:
         _add_failing(name, f"Not installed: {cure}.", message)
 
 
-def _add_failing(name: str, line: str, message: str) -> None:
-    """Add a command that takes any arguments and fails with a message."""
+def _add_failing(name: str, short_help: str, message: str) -> None:
+    """Add a command that accepts any arguments and fails with a message."""
 
     def failing() -> None:
         fail(message, 2)
 
     context = {"allow_extra_args": True, "ignore_unknown_options": True}
     app.command(
-        name, short_help=line, help=message, rich_help_panel=_MORE, context_settings=context
+        name, short_help=short_help, help=message, rich_help_panel=_MORE, context_settings=context
     )(failing)
 
 
@@ -204,8 +207,8 @@ _add_commands_of_plugins()
     short_help="List policies and wrappers, and how to install them.", rich_help_panel=_MORE
 )
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
-    """List policies and wrappers: their models, whether their packages are installed, and
-    installation commands.
+    """List policies and wrappers: their models, whether their packages are installed, and how to
+    install them.
     """
     from vlagents_ray.cli.listing import policies_and_wrappers
 
@@ -214,22 +217,27 @@ def policies(name: OneName = None, as_json: AsJson = False) -> None:
 
 @app.command(short_help="List environments, and how to install them.", rich_help_panel=_MORE)
 def envs(name: OneName = None, as_json: AsJson = False) -> None:
-    """List the environments: their tasks, whether they run here, and installation commands."""
+    """List environments: their tasks, whether they run here, and how to install them."""
     from vlagents_ray.cli.listing import environments
 
     _list(list(environments()), name, as_json=as_json)
 
 
 def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
-    """Print a listing: a line for each with installation commands, or the full description of
-    one name.
+    """Print a listing.
+
+    Args:
+        listed: The entries.
+        name: The name whose details are printed; None prints a line for each entry, and the
+            commands that install missing packages.
+        as_json: Whether a JSON document is printed.
     """
     from vlagents_ray.cli.listing import installing
 
     chosen = [entry for entry in listed if name in (None, entry.name)]
     if not chosen:
-        known = [entry.name for entry in listed]
-        cure = did_you_mean(str(name), known) or f"; there are {', '.join(known)}"
+        registered = [entry.name for entry in listed]
+        cure = did_you_mean(str(name), registered) or f"; there are {', '.join(registered)}"
         fail(f"{name!r} is not registered{cure}", 2)
 
     if as_json:
@@ -244,8 +252,10 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     columns = ["name", "kind", "here", "what"] if has_kinds else ["name", "here", "what"]
     rows = table(*columns, box=None)
     for entry in chosen:
-        kind = [entry.kind] if has_kinds else []
-        rows.add_row(entry.name, *kind, "no" if entry.missing else "yes", entry.what)
+        cells = [entry.name, "no" if entry.missing else "yes", entry.what]
+        if has_kinds:
+            cells.insert(1, entry.kind)
+        rows.add_row(*cells)
     out.print(rows)
 
     cures = list(installing(chosen))
@@ -260,22 +270,32 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 @env.command("make")
 def make(
     requirements: Annotated[
-        Path, typer.Argument(help="A family's name, such as lerobot, or a requirements file.")
+        Path,
+        typer.Argument(help="The name of a model family, such as lerobot, or a requirements file."),
     ],
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder; default: .venv- and that name.")
+        Path | None,
+        typer.Option("--out", help="Folder of the environment; default: .venv-NAME."),
     ] = None,
     more: Annotated[
-        list[Path], typer.Option("--with", help="A further requirements file, repeatable.")
+        list[Path],
+        typer.Option("--with", help="A further requirements file; may be repeated."),
     ] = [],  # noqa: B006
     python: Annotated[
-        str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")
+        str | None,
+        typer.Option(
+            help="Version or interpreter of Python; default: the version in the file, or the "
+            "version that runs this command."
+        ),
     ] = None,
     light: Annotated[
-        bool, typer.Option("--light", help="Without Ray, for a child process.")
+        bool, typer.Option("--light", help="Install no Ray, for a policy in a child process.")
     ] = False,
     cuda: Annotated[
-        bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")
+        bool,
+        typer.Option(
+            "--cuda", help="Install CUDA packages (several GB) even on a machine without a GPU."
+        ),
     ] = False,
 ) -> None:
     """Make a virtual environment with this vlagents-ray and a policy's requirements, and print

@@ -1,8 +1,8 @@
 """Skeletons of a policy, an environment, a dialect and a plug-in, which work at once and pass their
 own tests.
 
-`skeletons/KIND/` has their templates, in which `$name` is the module's name and `$title` that of
-its class.
+`skeletons/KIND/` has their templates, in which `$name` is the name of the module and `$title` the
+name of its class.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vlagents_ray.registry import names
 new = typer.Typer(
     no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder."
 )
-# The files that are written for each kind, with $name for the name, and their templates in
-# skeletons/KIND.
+# By kind of skeleton: the files that are written, in whose paths $name is the name of the module,
+# and their templates in skeletons/KIND.
 _MODULE = {"$name.py": "module.py", "test_$name.py": "test.py", "$name.yaml": "run.yaml"}
 _FILES = {
     "policy": _MODULE,
@@ -105,10 +105,10 @@ def plugin(name: Name, context: typer.Context) -> None:
             "part of a server": names("replica"),
             "command": commands.list_commands(context),
         }
-        for kind, taken in registered.items():
-            if name in taken:
+        for noun, registered_names in registered.items():
+            if name in registered_names:
                 raise ConfigError(
-                    f"NAME: {name!r} is the name of a {kind} already; choose another one"
+                    f"NAME: {name!r} is the name of a {noun} already; choose another one"
                 )
         _write(name, "plugin")
         command = as_typed("vlagents-ray")
@@ -122,8 +122,14 @@ def plugin(name: Name, context: typer.Context) -> None:
 
 
 def render(name: str, kind: Kind) -> dict[Path, str]:
-    """Return the text of each file of a skeleton; the paths are relative to the folder of the
-    user.
+    """Fill the templates of a skeleton.
+
+    Args:
+        name: The name of the module.
+        kind: The kind of the skeleton.
+
+    Returns:
+        The text of each file by its path, relative to the current folder.
     """
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
@@ -135,8 +141,10 @@ def render(name: str, kind: Kind) -> dict[Path, str]:
 
 
 def _write(name: str, kind: Kind) -> None:
-    """Write the files into the current folder, or none of them. Raises `ConfigError` for an
-    invalid name.
+    """Write the files of a skeleton into the current folder, or none of them.
+
+    Raises:
+        ConfigError: The name is invalid, or a file or module of this name exists.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise ConfigError(
@@ -179,8 +187,13 @@ def _write(name: str, kind: Kind) -> None:
 
 
 def as_typed(program: str) -> str:
-    """Return a program of this environment as a user types it: its name if the shell finds it,
-    else its path.
+    """Return a program of this environment as the user types it.
+
+    Args:
+        program: The name of the program.
+
+    Returns:
+        The name if the shell finds this program by it; else its path.
     """
     path = Path(sys.executable).with_name(program)
     on_path = shutil.which(program)

@@ -24,21 +24,21 @@ YAML_SUFFIXES = (".yaml", ".yml")
 
 Set = Annotated[
     list[str],
-    typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy; may be repeated."),
 ]
 Address = Annotated[
     str | None,
     typer.Option(
-        help="A running Ray cluster ('auto' finds that of `ray start`), or the URL of a server on "
-        "this machine, for the one it has; default: one for the run, on this machine."
+        help="A running Ray cluster, where 'auto' finds the one of `ray start`, or the URL of a "
+        "local server, to use its Ray cluster; default: a new cluster on this machine, for the run."
     ),
 ]
 
-AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 Live = Annotated[
     bool,
     typer.Option(
-        "--live", help="Serve a page in the browser that fills up as it runs, on 127.0.0.1:8050."
+        "--live", help="Show the progress on a live page for the browser, at 127.0.0.1:8050."
     ),
 ]
 LiveAt = Annotated[
@@ -46,26 +46,31 @@ LiveAt = Annotated[
     typer.Option(
         "--live-at",
         metavar="HOST:PORT",
-        help="The same there; beyond this machine it needs API keys.",
+        help="Like --live, at this address; an address that other machines reach needs API keys.",
     ),
 ]
 
 StateDims = Annotated[
     list[str],
     typer.Option(
-        "--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say."
+        "--state-dim",
+        metavar="PART=N",
+        help="The number of numbers in a part of the state, if the policy does not declare it.",
     ),
 ]
-_MOST_DIMS = 1_000_000  # numbers in a part of the state
+_MOST_DIMS = 1_000_000  # most numbers in a part of the state
 _Options = TypeVar("_Options")
 
 
 def command_of(
     options: type[_Options],
 ) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
-    """Make a command for Typer from a function that takes its options as one object.
+    """Return a decorator that makes a command for Typer from a function that takes its options as
+    one object.
 
-    Each field of the dataclass `options` is annotated with its `typer.Option` or `typer.Argument`.
+    Args:
+        options: The dataclass of the options. Each field is annotated with its `typer.Option` or
+            `typer.Argument`.
     """
     hints = get_type_hints(options, include_extras=True)
     parameters = []
@@ -112,8 +117,16 @@ class Commands(TyperGroup):
 
 
 def finite(value: float | None) -> float | None:
-    """Return the value of an option, for Typer, whose bounds accept a number that is not one;
-    that is an error here.
+    """Reject NaN and infinity, for Typer, whose bounds accept them.
+
+    Args:
+        value: The value of an option.
+
+    Returns:
+        The value.
+
+    Raises:
+        typer.BadParameter: The value is not a finite number.
     """
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"expected a finite number, got {value}")
@@ -121,11 +134,19 @@ def finite(value: float | None) -> float | None:
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
-    """Parse texts such as `a.b=1` to nested settings; the value is YAML, so `[1, 2]` and `true`
-    work.
+    """Parse texts such as `a.b=1` to nested settings.
 
-    A value that is not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or
-    a quotation.
+    Args:
+        texts: The texts, KEY=VALUE. The value is YAML, such as `[1, 2]` or `true`. A value that is
+            not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or a
+            quotation.
+        option: The name of the option, for errors.
+
+    Returns:
+        The settings, in which `a.b` is the key "b" of the mapping "a".
+
+    Raises:
+        ConfigError: A text is not KEY=VALUE, a key is below another value, or a value is not YAML.
     """
     settings: dict[str, Any] = {}
     for text in texts:
@@ -153,27 +174,51 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
 
 
 def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
-    """Parse `PART=N`, the numbers in parts of the state."""
+    """Parse the sizes of parts of the state.
+
+    Args:
+        texts: The texts, PART=N.
+        option: The name of the option, for errors.
+
+    Returns:
+        The number of numbers in each part.
+
+    Raises:
+        ConfigError: A size is not a whole number above 0.
+    """
     dims = parse_settings(texts, option)
-    if not all(type(number) is int and 1 <= number <= _MOST_DIMS for number in dims.values()):
-        raise ConfigError(
-            f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got {dims}"
-        )
+    for number in dims.values():
+        if type(number) is not int or not 1 <= number <= _MOST_DIMS:
+            raise ConfigError(
+                f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got "
+                f"{dims}"
+            )
     return dims
 
 
 def parse_list(text: str) -> list[str]:
-    """Split at commas; empty items are left out."""
+    """Split a text at commas, without empty items."""
     return [item.strip() for item in text.split(",") if item.strip()]
 
 
 def parse_time(text: str, option: str) -> float:
-    """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to
-    seconds since 1970.
+    """Parse a time.
+
+    Args:
+        text: Seconds since 1970, or a date and time of day in ISO 8601, which is local unless it
+            has a zone.
+        option: The name of the option, for errors.
+
+    Returns:
+        The time, s since 1970.
+
+    Raises:
+        ConfigError: The text is not a time.
     """
     try:
         with contextlib.suppress(ValueError):
-            return datetime.datetime.fromtimestamp(float(text)).timestamp()  # within the calendar
+            # This also rejects a time beyond the calendar.
+            return datetime.datetime.fromtimestamp(float(text)).timestamp()
         return datetime.datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise ConfigError(
@@ -182,16 +227,26 @@ def parse_time(text: str, option: str) -> float:
         ) from error
 
 
-def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
-    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a
-    folder.
+def read_run_file(file: Path, noun: str, keys: str) -> dict[str, Any]:
+    """Read a YAML file with the settings of a run.
+
+    Args:
+        file: The file.
+        noun: A name of this type of file, for errors, such as "file of runs".
+        keys: The keys that such a file has, for errors.
+
+    Returns:
+        The settings. `out` is runs/NAME, unless the file names a folder.
+
+    Raises:
+        ConfigError: The file does not exist, or is not a mapping.
     """
     if file.is_dir():
         raise ConfigError(
-            f"{kind} {str(file)!r}: expected a file, got a folder; name a .yaml file in it"
+            f"{noun} {str(file)!r}: expected a file, got a folder; name a .yaml file in it"
         )
     if not file.is_file():
-        raise ConfigError(f"{kind} {str(file)!r} does not exist")
+        raise ConfigError(f"{noun} {str(file)!r} does not exist")
     document = read_yaml(file)
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")

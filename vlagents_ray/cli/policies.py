@@ -1,4 +1,4 @@
-"""The policies of an evaluation: at their URLs, or served for its duration."""
+"""The policies of an evaluation: at their URLs, or served while the evaluation runs."""
 
 from __future__ import annotations
 
@@ -49,8 +49,13 @@ _STARTING_S = 30.0  # time limit for a server at a URL
 def served(
     config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
 ) -> Iterator[tuple[ResolvedPlan, Agents]]:
-    """Resolve an evaluation, and serve the policies that are not at a URL for the length of the
-    context, or run them in this process.
+    """Resolve an evaluation, and serve the policies that are not at a URL within the context, or
+    run them in this process.
+
+    Args:
+        config: The evaluation.
+        address: A running Ray cluster; None starts one on this machine if Ray is needed.
+        replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
 
     Yields:
         The plan; and, without workers, the agents of the policies that are not at a URL.
@@ -104,7 +109,10 @@ def planned_workers(
     Args:
         config: The evaluation.
         deployments: The deployments of its policies, from `resolve_policies`.
-        address: As in `served`.
+        address: A running Ray cluster, as in `served`.
+
+    Returns:
+        The number of workers; 0 runs the evaluation in this process.
 
     Raises:
         ConfigError: `workers` is 0, and something needs Ray, as in `served`.
@@ -117,6 +125,7 @@ def planned_workers(
 
 
 def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
+    """Raise `ConfigError` if an evaluation in a cluster has no workers."""
     if config.workers == 0 and address is not None:
         raise ConfigError(
             "workers: got 0 with --address, want 1 or more in a cluster, or no --address"
@@ -213,7 +222,7 @@ def _serve_on_ray(
 
 
 def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
-    """Keep Ray's logs off the terminal, and join the cluster at `address`, for the length of
+    """Keep Ray's logs off the terminal, and join the cluster at `address`, within the context of
     `stack`.
     """
     stack.enter_context(quiet_ray(None))
@@ -225,9 +234,17 @@ def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
 def _local_policies(
     deployments: Mapping[str, Deployment], workers: int | None
 ) -> dict[str, partial[LocalPolicy]] | None:
-    """Return the policies for this process by application; None if they need Ray.
+    """Return the policies that run in this process, by application.
 
-    Raises `ConfigError` if `workers` is 0 and a policy needs Ray.
+    Args:
+        deployments: The deployments of the policies, by application.
+        workers: The number of workers that the user has chosen, or None.
+
+    Returns:
+        The policies; None if one of them needs Ray.
+
+    Raises:
+        ConfigError: `workers` is 0, and a policy needs Ray.
     """
     local = {}
     for name, deployment in deployments.items():
@@ -252,8 +269,17 @@ def _local_policies(
 def resolve_policies(
     config: EvalConfig, *, ask: bool = True
 ) -> tuple[EvalConfig, dict[str, Deployment]]:
-    """Return the evaluation with names and URLs of its policies, and the deployments to start,
-    by application.
+    """Find the names and URLs of an evaluation's policies.
+
+    Args:
+        config: The evaluation.
+        ask: Whether servers are asked for the names, settings and checkpoints of their policies.
+
+    Returns:
+        The evaluation with names and URLs, and the deployments to start, by application.
+
+    Raises:
+        ConfigError: A policy has neither a source nor a URL, or settings although a server has it.
     """
     deployments: dict[str, Deployment] = {}
     policies = [_resolve_policy(policy, deployments, ask=ask) for policy in config.policies]
@@ -267,7 +293,9 @@ def _resolve_policy(
     """Return the policy with its name and URL; add its deployment to `deployments` unless a
     server has it.
     """
-    url = policy.source if policy.source is not None and "://" in policy.source else policy.url
+    url = policy.url
+    if policy.source is not None and "://" in policy.source:
+        url = policy.source
     if url is not None:
         return _policy_at(url, policy, ask=ask)
     if policy.source is None:
@@ -299,8 +327,11 @@ def _resolve_policy(
 def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
     """Return the policy of a server.
 
-    With `ask`, it gets the name, the settings and the checkpoint that the server has, since a
-    result belongs to the served policy, not to an address.
+    Args:
+        url: The URL of the server.
+        policy: The policy in the configuration.
+        ask: Whether the policy gets the name, the settings and the checkpoint that the server
+            reports, since a result belongs to the served policy, not to an address.
     """
     fields: dict[str, Any] = {"url": url, "source": None}
     if not ask:
@@ -326,8 +357,12 @@ def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
 def policy_deployment(
     policy: PolicyConfig, source: str, *, step_follows: bool = False
 ) -> Deployment:
-    """Read the deployment of `source` with the settings of `policy`; `step_follows` as in
-    `read_deployment`.
+    """Read the deployment of a policy that an evaluation serves.
+
+    Args:
+        policy: The policy in the configuration, whose settings are added.
+        source: A registered policy, "module:Class", or a deployment file.
+        step_follows: Whether the checkpoint's step is set later, as in `read_deployment`.
     """
     args = None
     if policy.config and not source.endswith(YAML_SUFFIXES):
