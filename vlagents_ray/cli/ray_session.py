@@ -24,30 +24,30 @@ from vlagents_ray.ray_tools.signals import is_interrupted, raise_dropped_interru
 log = logging.getLogger(__name__)
 
 _LEAVE_S = 10.0  # time limit for a command to end in order
-# Time limit for the process to end then: Ray's shutdown may wait for lost processes.
+# Time limit for the process to end after the command: Ray's shutdown may wait for lost processes.
 _EXIT_S = 3.0
 _LOOK_S = 1.0  # period of the check for an interrupt that Python dropped
 _END_S = 90.0  # from Ctrl-C to the end: a third for Serve, the rest for Ray's shutdown
 RESTART = "start it again"
 RESUME = "what was played is kept: go on with --resume when there is a cluster again"
 
-_FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
+_FILE_BYTES = 10_000_000  # Serve logs each request; two files of this size are kept
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
 _LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
 _DAEMON = "raylet"
-_OF_SERVE = ("HAProxyManager", "ProxyActor", "ServeController")  # Serve's own actors
-_ACTOR = ":actor_name:"  # begins the line that names the actor of the file
-_TITLES = (_ACTOR, ":task_name:", ":job_id:")
+_SERVE_ACTORS = ("HAProxyManager", "ProxyActor", "ServeController")
+_ACTOR = ":actor_name:"  # the beginning of the line that names the actor of the file
+_TITLES = (_ACTOR, ":task_name:", ":job_id:")  # the beginnings of lines that name the process
 _LOAD_FAILURES = (
     "Exception in Replica(",
     "Failed to update the deployments",
     "the policy did not load",
 )
-# The beginning of each line of Serve's processes.
+# The beginnings of lines in the logs of Serve's processes: of all, and of those without a problem.
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
 _SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")
-# Warnings about intended settings of `own_ray`: it is on loopback, has a token and does not handle
-# signals.
+# Warnings about intended settings of `own_ray`: it listens on loopback, has a token and does not
+# handle signals.
 _INTENDED = (
     "won't accept connections from HAProxy on other nodes",
     "Token authentication is enabled",
@@ -63,12 +63,13 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
 
     Args:
         name: The prefix of the log file's name; None keeps no log.
-        started: Set once the server serves. Until then, the traceback of a policy that does not
-            load is kept off the terminal as well, since the command ends with its last line.
+        started: An event that is set when the server is ready. Until then, the traceback of a
+            policy that does not load is kept off the terminal as well, since the command ends with
+            its last line.
 
     Yields:
-        The log file, which stays unless it is empty and which this user alone can read; None
-        without one.
+        The log file, which only this user can read, and which is removed at the end if it is empty;
+        None without a name.
     """
     file = None
     handler = None
@@ -103,13 +104,13 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
         if file is not None and handler is not None:
             follower.join()
             handler.close()
-            if file.stat().st_size == 0:  # as when the port is taken
+            if file.stat().st_size == 0:  # for instance if the port is taken
                 file.unlink()
 
 
 class _Terminal:
-    """The lines of the logs of Ray and Serve that go to the terminal; the log file gets the
-    others.
+    """Passes problems in the logs of Ray and Serve to the terminal, and all other lines to the log
+    file.
     """
 
     def __init__(self, log_file: logging.Handler | None, started: threading.Event | None) -> None:
@@ -118,8 +119,8 @@ class _Terminal:
         self._started = started
 
     def keep_problem(self, record: logging.LogRecord) -> bool:
-        """Filter a record of this process, for `logging`: one that is no problem goes to the log
-        file.
+        """Filter a record of this process, for `logging`: write a record that is not a problem to
+        the log file.
         """
         text = record.getMessage()
         if _is_problem(text, record.levelno):
@@ -128,8 +129,12 @@ class _Terminal:
         return False
 
     def print_line(self, actor: str, process: str, line: str) -> None:
-        """Print a line of another process if it is a problem; otherwise write it to the log
-        file.
+        """Print a line of another process if it is a problem; otherwise write it to the log file.
+
+        Args:
+            actor: The name of the actor in the process.
+            process: The number of the process, or "raylet".
+            line: The line.
         """
         level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
         text = f"({actor} pid={process}) {line}"
@@ -140,9 +145,9 @@ class _Terminal:
 
         is_starting = self._started is not None and not self._started.is_set()
         is_traceback = is_starting and process in self.failing
-        # A signal to the whole process group also ends Ray's daemon, which then guesses at
-        # causes, and HAProxy, of which Serve's actors then print that it crashed.
-        is_consequence = is_interrupted() and (process == _DAEMON or actor in _OF_SERVE)
+        # A signal to the whole process group also ends Ray's daemon, which then prints possible
+        # causes, and HAProxy, so that Serve's actors print that HAProxy crashed.
+        is_consequence = is_interrupted() and (process == _DAEMON or actor in _SERVE_ACTORS)
         if is_consequence or is_traceback or not _is_problem(line, level):
             self._write_log(text)
         else:
@@ -155,9 +160,9 @@ class _Terminal:
 
 
 def _follow(terminal: _Terminal, ended: threading.Event) -> None:
-    """Forward the output of Ray's processes, until `ended`. Runs on its own thread.
+    """Forward the output of Ray's processes until the event `ended` is set; runs on its own thread.
 
-    Ray's own `log_to_driver` has no filter.
+    This replaces Ray's `log_to_driver`, which has no filter.
     """
     files: dict[Path, _LogFile] = {}
     over = False
@@ -170,6 +175,7 @@ def _follow(terminal: _Terminal, ended: threading.Event) -> None:
                 for path in folder.glob(pattern):
                     if path not in files:
                         files[path] = _LogFile(path)
+
         for file in files.values():
             for line in file.new_lines():
                 terminal.print_line(file.actor, file.process, line)
@@ -180,15 +186,13 @@ class _LogFile:
 
     def __init__(self, path: Path) -> None:
         self.actor = "ray"
-        # The end of "worker-WORKER-JOB-PID", or "raylet".
+        # The last part of the name "worker-WORKER-JOB-PID", or "raylet".
         self.process = path.stem.rpartition("-")[2]
         self._path = path
         self._offset = 0
 
     def new_lines(self) -> Iterator[str]:
-        """Yield the complete lines since the last call, without those by which Ray names the
-        process.
-        """
+        """Yield the complete lines since the last call, without the lines that name the process."""
         try:
             if self._path.stat().st_size < self._offset:  # rotated
                 self._offset = 0
@@ -197,6 +201,7 @@ class _LogFile:
                 text, end, _ = file.read().rpartition(b"\n")
         except OSError:  # it has been removed
             return
+
         self._offset += len(text) + len(end)
         for line in text.decode(errors="replace").split("\n"):
             if line.startswith(_ACTOR):
@@ -206,15 +211,24 @@ class _LogFile:
 
 
 def _is_problem(text: str, level: int) -> bool:
-    return level >= logging.WARNING and not any(intended in text for intended in _INTENDED)
+    """Return whether a line of a log is a warning or an error that is not intended."""
+    is_intended = any(warning in text for warning in _INTENDED)
+    return level >= logging.WARNING and not is_intended
 
 
 @contextlib.contextmanager
 def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
-    """End the process with status 1 if its Ray is lost within the context; in order, if that
-    takes at most 10 s.
+    """End the process with status 1 if its Ray is lost within the context.
+
+    The command can end in order if that takes at most 10 s.
+
+    Args:
+        cure: The advice in the error.
+
+    Yields:
+        The observer of Ray.
     """
-    # Ray is imported before the thread starts: a module that two threads import at once is
+    # Ray is imported before the thread starts: a module that two threads import at the same time is
     # incomplete in one of them.
     import ray  # noqa: F401
 
@@ -229,33 +243,39 @@ def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
         loss.interrupted = True
         raise
     except Exception as error:
-        if loss.error is not None:  # Ray's own error is a consequence
+        if loss.error is not None:  # the error of Ray is a consequence
             raise loss.error from error
         raise
     finally:
-        loss.left.set()
+        loss.ending.set()
 
 
 class RayLoss:
-    """Watches the Ray that this process has joined for its loss."""
+    """Watches whether the Ray that this process has joined is lost.
+
+    Args:
+        cure: The advice in the error.
+    """
 
     def __init__(self, cure: str) -> None:
-        """`cure` is the advice in the error."""
         self.error: ClusterLost | None = None
         self.interrupted = False
-        self.left = threading.Event()  # the command has ended, or is about to print its error
+        self.ending = threading.Event()  # the command has ended, or is about to print its error
         self._cure = cure
-        self._known = threading.Event()
+        self._lost = threading.Event()
 
     def wait(self) -> None:
-        """Block until Ray is lost and raise `ClusterLost`; after an interrupt the command ends
-        within `_END_S`.
+        """Wait until Ray is lost; after an interrupt, the process ends within `_END_S`.
+
+        Raises:
+            ClusterLost: Ray is lost.
+            KeyboardInterrupt: The command was interrupted.
         """
         try:
-            while not self._known.wait(_LOOK_S):
+            while not self._lost.wait(_LOOK_S):
                 raise_dropped_interrupt()
         except KeyboardInterrupt:
-            self.left.set()
+            self.ending.set()
             # This also prints the stacks of all threads.
             faulthandler.dump_traceback_later(_END_S, exit=True)
             raise
@@ -263,17 +283,17 @@ class RayLoss:
             raise self.error
 
     def watch(self) -> None:
-        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on its own
+        """Watch Ray until the command ends, and end the process if Ray is lost; runs on its own
         thread.
         """
-        while self.error is None and not self.left.is_set():
+        while self.error is None and not self.ending.is_set():
             self._watch_ray()
         if self.error is None:
             return
 
-        self._known.set()
+        self._lost.set()
         message = f"{type(self.error).__name__}: {self.error}"
-        if self.left.wait(_LEAVE_S):
+        if self.ending.wait(_LEAVE_S):
             if self.interrupted:
                 return
             time.sleep(_EXIT_S)
@@ -284,11 +304,11 @@ class RayLoss:
         os._exit(1)  # the reaper ends all other processes
 
     def _watch_ray(self) -> None:
-        """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
+        """Watch the Ray that this process has joined, until it leaves Ray or Ray is lost."""
         from vlagents_ray.ray_tools.head_monitor import PERIOD_S, HeadMonitor
 
         head: HeadMonitor | None = None
-        while not self.left.wait(PERIOD_S):
+        while not self.ending.wait(PERIOD_S):
             node = node_of_this_process()
             if node is None or (head is not None and head.node is not node):
                 return

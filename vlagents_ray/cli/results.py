@@ -21,16 +21,22 @@ Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of result
 def report_command(
     folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results.")],
     path: Annotated[
-        Path | None, typer.Option("--out", help="Default: report.html in FOLDER; of several, here.")
+        Path | None,
+        typer.Option(
+            "--out",
+            help="File of the report; default: report.html in FOLDER; with several folders: "
+            "./report.html.",
+        ),
     ] = None,
     inline: Annotated[
-        bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")
+        bool,
+        typer.Option("--inline", help="Include the videos in the page, up to a limit of its size."),
     ] = False,
     accept_changes: Annotated[
         bool,
         typer.Option(
             "--accept-changes",
-            help="Compare although files, weights or envs differ; the report says so.",
+            help="Compare even if files, weights or environments differ, which the report records.",
         ),
     ] = False,
     as_json: AsJson = False,
@@ -39,8 +45,8 @@ def report_command(
 ) -> None:
     """Write the report: success with intervals, comparisons, latency, failures, and settings.
 
-    With --live it shows the results in FOLDER as another process adds to them, until Ctrl-C, and
-    writes no report.
+    With --live, show the results in FOLDER while another process adds to them, until Ctrl-C. In
+    this case no report is written.
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import require_folder_of
@@ -60,20 +66,23 @@ def report_command(
                 )
             follow(folders[0], live_address(live_at))
             return
+
         results = combined([Results.load(folder) for folder in folders])
         if as_json:
             summary = summarize(results)
             compared = families_json(summary, accept_changes=accept_changes)
             print_json(summary.to_json() | {"comparisons": compared})
             return
-        path = path or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
+
+        if path is None:
+            path = folders[0] / FILE if len(folders) == 1 else Path(FILE)
         require_folder_of(path)
         written = write_report(results, path, inline=inline, accept_changes=accept_changes)
         out.print(f"report: {written}")
 
 
 def _described_formats() -> Iterator[str]:
-    """Yield each format with its description."""
+    """Yield each export format with its description."""
     for name, entry in entries("exports").items():
         yield f"{name}: {entry.about}"
 
@@ -81,17 +90,24 @@ def _described_formats() -> Iterator[str]:
 def export_command(
     folder: Folder,
     path: Annotated[
-        Path, typer.Option("--out", help="File to write, or a new folder, as the format has it.")
+        Path, typer.Option("--out", help="New file or folder, depending on the format.")
     ],
     to: Annotated[str, typer.Option(help="; ".join(_described_formats()) + ".")],
     policy: Annotated[
-        str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")
+        str | None,
+        typer.Option(
+            help="Export only the episodes of this policy: NAME, or NAME@STEP of one checkpoint."
+        ),
     ] = None,
-    env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
+    env: Annotated[
+        str | None, typer.Option(help="Export only the episodes in this environment.")
+    ] = None,
     settings: Annotated[
         list[str],
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="A setting of the format, such as successes=true."
+            "--set",
+            metavar="KEY=VALUE",
+            help="A setting of the format, such as successes=true; may be repeated.",
         ),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
@@ -114,6 +130,14 @@ def settings_of_export(
     name: str, export: Callable[..., int], texts: Sequence[str]
 ) -> dict[str, Any]:
     """Parse the settings of a format, which are the keyword-only parameters of its function.
+
+    Args:
+        name: The name of the format.
+        export: The function of the format.
+        texts: The settings as KEY=VALUE.
+
+    Returns:
+        The settings that are set, by name.
 
     Raises:
         ConfigError: A setting is unknown, or its value has another type than the parameter.
@@ -147,17 +171,27 @@ def _require_no_dataset(folder: Path) -> None:
 def replay_command(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")],
     episode: Annotated[
-        str | None, typer.Argument(help="Its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
+        str | None,
+        typer.Argument(
+            help="The episode: its key, or ENV#NUMBER such as 'tabletop#3'.", show_default=False
+        ),
     ] = None,
     policy: Annotated[
-        str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")
+        str | None,
+        typer.Option(
+            help="Another policy: a name, a deployment file, or a URL; default: the policy of the "
+            "evaluation."
+        ),
     ] = None,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")
+        Path | None,
+        typer.Option("--out", help="Folder of the replay; default: a new one in FOLDER."),
     ] = None,
     address: Address = None,
 ) -> None:
-    """Play an episode of an evaluation again, and compare: exit code 0 if all is the same."""
+    """Run an episode of an evaluation again, and compare both. The exit code is 0 if all is the
+    same.
+    """
     with errors():
         from vlagents_ray.cli.evaluation import play_one
         from vlagents_ray.evaluate import Results
@@ -165,11 +199,11 @@ def replay_command(
 
         _require_no_dataset(folder)
         recorded = find(Results.load(folder), episode)
-        other: dict[str, Any] | None = None
+        other_policy: dict[str, Any] | None = None
         if policy is not None:
-            other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+            other_policy = {"source": policy, "url": None, "config": {}, "checkpoint": None}
         replay_folder = out_dir or fresh(folder / "replays" / "replay")
-        config = recorded.config(replay_folder, policy=other)
+        config = recorded.config(replay_folder, policy=other_policy)
         summary = play_one(config, address, recorded.number_and_seed)
 
         differences = compare(recorded, summary.results)

@@ -1,4 +1,4 @@
-"""`vlagents-ray serve`: serve a policy, and print the addresses for clients and a browser."""
+"""`vlagents-ray serve`: serves a policy, and prints the addresses for clients and a browser."""
 
 from __future__ import annotations
 
@@ -35,44 +35,59 @@ class ServeOptions:
     host: Annotated[
         str | None,
         typer.Option(
-            help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1."
+            help="Address on which the server listens, such as 0.0.0.0; default: the file's, or "
+            "127.0.0.1."
         ),
     ] = None
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")
+        int | None,
+        typer.Option(
+            min=1, max=65535, help="Port on which the server listens; default: the file's, or 8000."
+        ),
     ] = None
     settings: Set = field(default_factory=list)
     serve_set: Annotated[
         list[str],
         typer.Option(
-            "--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8."
+            "--serve-set",
+            metavar="KEY=VALUE",
+            help="A setting of the server, such as batch.max_size=8; may be repeated.",
         ),
     ] = field(default_factory=list)
     vlagents_port: Annotated[
         int | None,
         typer.Option(
-            min=1, max=65535, help="Also accept clients of the package vlagents, at this port."
+            min=1,
+            max=65535,
+            help="A further port, which accepts clients of the package vlagents.",
         ),
     ] = None
     address: Address = None
     keys: Annotated[
         Path | None,
         typer.Option(
-            help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS."
+            help="File of the API keys; default: the variable VLAGENTS_RAY_KEYS_FILE or "
+            "VLAGENTS_RAY_KEYS."
         ),
     ] = None
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Accept every client, without keys.")
     ] = False
     plain_http: Annotated[
-        bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")
+        bool, typer.Option("--plain-http", help="Do not warn that keys are sent unencrypted.")
     ] = False
     tls_cert: Annotated[
-        Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")
+        Path | None,
+        typer.Option(help="Certificate in PEM, with which https:// and wss:// are served."),
     ] = None
-    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None
+    tls_key: Annotated[
+        Path | None, typer.Option(help="Private key of the certificate, in PEM.")
+    ] = None
     tls_client_ca: Annotated[
-        Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")
+        Path | None,
+        typer.Option(
+            help="CA in PEM; only clients with a certificate that it has signed are accepted."
+        ),
     ] = None
 
     def server_args(self) -> dict[str, Any]:
@@ -88,8 +103,10 @@ class ServeOptions:
         return {**args, **({"config": config} if config else {})}
 
     def tls(self) -> Tls | None:
-        """Return the certificates that the options name; raises `ConfigError` if one of the two
-        is missing.
+        """Return the certificates that the options name; None if there are none.
+
+        Raises:
+            ConfigError: The certificate or its key is missing.
         """
         from vlagents_ray.serve.launch.haproxy import Tls
 
@@ -114,11 +131,13 @@ def serve_command(options: ServeOptions) -> None:
         address = options.address
         keys = options.keys
         insecure = options.insecure
+
         config = read_deployment(options.source, options.server_args())
         if options.vlagents_port is not None:
             config = with_dialect(config, "vlagents", {"port": options.vlagents_port})
         if address is None:
             require_packages(config)
+
         host = options.host or config.http_options.host
         port = options.port or config.http_options.port
         access: dict[str, Any] = {
@@ -154,8 +173,18 @@ def connection_lines(
     *,
     insecure: bool = False,
 ) -> Iterator[str]:
-    """Return lines with the URL, policy and page of each application, and addresses for clients
-    of other systems.
+    """Describe how to reach a server.
+
+    Args:
+        config: The deployment.
+        urls: The URL of each application.
+        host: The address on which the server listens.
+        keys: The file of the API keys, if an option names it.
+        insecure: Whether the server accepts every client.
+
+    Yields:
+        Lines with the URL, the policy and the pages of each application, and the addresses for
+        clients of other systems.
     """
     from vlagents_ray.registry import registered_class
     from vlagents_ray.serve.config.deployment import ServerArgs
@@ -171,14 +200,17 @@ def connection_lines(
 
         args = ServerArgs(**app.args)
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
-        yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
+        suffix = f" ({settings})" if settings else ""
+        yield f"  policy: {args.policy}{suffix}"
 
         needs_key = not insecure
         if needs_key and keys is None:
             with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
                 needs_key = args.access.keys() is not None
-        ca = "--cacert CA.pem " if needs_key and url.startswith("https") else ""
-        curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if needs_key else ""
+        curl = ""
+        if needs_key:
+            ca = "--cacert CA.pem " if url.startswith("https") else ""
+            curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" '
         yield f"  API: {curl}{url}/docs"
 
         if not (insecure or args.access.insecure):  # --insecure shows no live page

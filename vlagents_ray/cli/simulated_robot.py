@@ -29,7 +29,7 @@ from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.viewers import EpisodeViewer, open_viewer
 
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
-_HZ = 10.0  # of environments that state no rate
+_HZ = 10.0  # the control rate of environments whose contract declares none
 _LABELS: dict[str, Label] = {"y": "success", "n": "failure", "x": "discard"}
 _MOVES = {
     "autonomous": "the policy moves the robot",
@@ -39,11 +39,16 @@ _MOVES = {
 
 
 class EnvPolicy(Wrapper):
-    """A policy in an environment, which supplies the action contract if the policy states none."""
+    """A policy in an environment, whose contract replaces the policy's if that has no actions.
 
-    def __init__(self, agent: Agent, env: Contract) -> None:
+    Args:
+        agent: The policy.
+        env_contract: The contract of the environment.
+    """
+
+    def __init__(self, agent: Agent, env_contract: Contract) -> None:
         super().__init__(agent)
-        self._env = env
+        self._env_contract = env_contract
         self._loaded = False
 
     def initialize(self) -> None:
@@ -57,13 +62,18 @@ class EnvPolicy(Wrapper):
         """The policy's contract, or the environment's if that has no actions."""
         contract = self.agent.contract
         if contract is None or contract.action.relative is None:
-            return self._env
+            return self._env_contract
         return contract
 
 
 def drive(options: argparse.Namespace) -> int:
-    """Run episodes by the options of `vlagents-ray robot --env`, and return the command's exit
-    status.
+    """Run the command `vlagents-ray robot --env`.
+
+    Args:
+        options: The options of the command.
+
+    Returns:
+        The exit status.
     """
     try:
         with errors():
@@ -81,15 +91,24 @@ def drive(options: argparse.Namespace) -> int:
 
 
 class RobotRun:
-    """A run of `vlagents-ray robot --env` with its options."""
+    """A run of `vlagents-ray robot --env`.
+
+    Args:
+        options: The options of the command.
+
+    Raises:
+        ConfigError: A setting cannot be parsed.
+    """
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self._env_options = parse_settings(options.env_set, "--env-set")
         self._settings = parse_settings(options.set, "--set")
+
         self.verdict: Label | None = None  # the operator's label of the running episode
         self.over = False  # the operator has ended the run
         self.recorder: Recorder | None = None
+
         self._control: RobotControl | None = None
         self._viewer: EpisodeViewer | None = None
         self._printed: str | None = None  # the printed source of motion
@@ -114,6 +133,7 @@ class RobotRun:
             )
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
+
             if self.options.record is not None:
                 opened = Recorder(self.options.record, hz, interventions=leader is not None)
                 self.recorder = stack.enter_context(opened)
@@ -141,6 +161,7 @@ class RobotRun:
         out.print(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
+            """Return the operator's label of the episode, or else the environment's."""
             return self.verdict or ("success" if robot.success else "failure")
 
         def check_end() -> bool:
