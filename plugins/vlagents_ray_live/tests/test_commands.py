@@ -54,7 +54,7 @@ class Board:
 
     @property
     def states(self) -> list[str]:
-        return [one["state"] for one in self.board.of("arm")]
+        return [one["state"] for one in self.board.describe("arm")]
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_a_command_goes_into_one_answer_and_the_next_request_says_what_became_of
     }
     assert board.answered(**{COMMANDED: {second: "no hands"}}) is None
     assert board.states == ["done", "refused"]
-    assert board.board.of("arm")[1]["why"] == "no hands"
+    assert board.board.describe("arm")[1]["why"] == "no hands"
 
 
 def test_a_robot_that_does_not_answer_ignores_it(board: Board) -> None:
@@ -196,7 +196,7 @@ def server() -> Iterator[LiveServer]:
 
 
 def states(server: LiveServer, session: str) -> list[str]:
-    return [f"{one['do']} {one['state']}" for one in server.view.commands.of(session)]
+    return [f"{one['do']} {one['state']}" for one in server.view.commands.describe(session)]
 
 
 def test_a_robot_pauses_and_is_marked(server: LiveServer) -> None:

@@ -63,8 +63,8 @@ def drive(agent: RemoteAgent, acts: int) -> str:
 def pressed(server: LiveServer, session: str) -> dict[str, str]:
     """Press "save", and return what became of it."""
     server.view.press(session, "save", "lab")
-    wait_for(lambda: server.view.commands.of(session)[-1]["state"] in ("done", "refused"), 60)
-    found: dict[str, str] = server.view.commands.of(session)[-1]
+    wait_for(lambda: server.view.commands.describe(session)[-1]["state"] in ("done", "refused"), 60)
+    found: dict[str, str] = server.view.commands.describe(session)[-1]
     return found
 
 

@@ -1,11 +1,12 @@
-"""Commands to the sessions of a replica, from the holders of keys that may operate them on the live
-page.
+"""Commands to the sessions of a replica, from the live page.
 
-Over a network a robot can only be stopped: it is paused, stopped, or its episode is marked.
-Commands that make it move (resuming, another instruction, an operator's motion) are given at the
-robot. A command is sent in the answer to the robot's next request, within `_WAITS_S` or never,
-since a late one could stop the robot unexpectedly; a later request reports the outcome. The server
-itself executes `SAVE`.
+The page accepts commands from callers whose key has the scope "operate". Over a network a robot can
+only be stopped: it is paused, stopped, or its episode is marked. Commands that make it move
+(resuming, another instruction, an operator's motion) are given at the robot.
+
+A command is sent in the answer to the robot's next request, within `_WAITS_S` or never, since a
+late command could stop the robot unexpectedly. A later request reports the outcome. The command
+`SAVE` is executed by the server itself.
 """
 
 from __future__ import annotations
@@ -28,30 +29,30 @@ logger = logging.getLogger(__name__)
 
 TO_ROBOT = ("pause", "stop", "success", "failure")
 """The commands that are sent to a robot. None of them makes it move."""
-SAVE = "save"  # the command that saves the session's last seconds, which the server does
+SAVE = "save"  # the command with which the server saves the session's last seconds
 COMMANDS = (*TO_ROBOT, SAVE)
 
-TRACKED_S = 15.0  # time for which the outcome of a command is awaited
-_WAITS_S = 5.0  # time within which a command must reach the robot
-_SHOWN = 5  # number of commands shown per session, the latest ones
-# Number of requests without the outcome of a command after which it counts as ignored.
+TRACKED_S = 15.0  # the time for which the outcome of a command is awaited
+_WAITS_S = 5.0  # the time within which a command must reach the robot
+_SHOWN = 5  # the number of commands that are kept and shown for each session, the latest ones
+# The number of requests without the outcome of a command after which it counts as ignored.
 _UNANSWERED = 3
-_REFUSAL = 200  # maximum length of a reason
+_REFUSAL = 200  # maximum length of a reason, characters
 
 State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
 
 
 @dataclass(slots=True)
 class Press:
-    """A button press."""
+    """A command that was given by a button of the page."""
 
     id: str
-    do: str
-    by: str  # name of the key; empty without keys
+    do: str  # the command, one of `COMMANDS`
+    by: str  # the name of the caller's key; empty without keys
     pressed: float  # s, of the clock of the board
     state: State = "waiting"
-    why: str = ""  # reason for a refusal, or the folder into which the session was saved
-    requests: int = 0  # number of the session's requests since the command was sent
+    why: str = ""  # the reason for a refusal, or the folder into which the session was saved
+    requests: int = 0  # the number of the session's requests since the command was sent
 
     def describe(self) -> dict[str, Any]:
         """Describe the command for viewers."""
@@ -59,7 +60,14 @@ class Press:
 
 
 class CommandBoard:
-    """The commands to the sessions of one replica. Thread-safe."""
+    """The commands to the sessions of one replica. Thread-safe.
+
+    Args:
+        sessions: The sessions of the replica.
+        save: Writes the last seconds of a session and returns the path of the dataset. It may be
+            slow, and may raise errors.
+        clock: Returns the current time, s.
+    """
 
     def __init__(
         self,
@@ -67,21 +75,25 @@ class CommandBoard:
         save: Callable[[str], str] = lambda _: "",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create a board without commands.
-
-        `save` writes the last seconds of a session and returns the path; it may be slow, and may
-        raise errors.
-        """
-        self._save, self._sessions, self._clock = save, sessions, clock
+        self._save = save
+        self._sessions = sessions
+        self._clock = clock
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first
         self._lock = threading.Lock()
 
     def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
-        """Accept the command `do`, one of `COMMANDS`, from the holder of the key `by`, and describe
-        it as `of` does.
+        """Accept a command to a session.
+
+        Args:
+            session_id: The session.
+            do: The command, one of `COMMANDS`.
+            by: The name of the caller's key.
+
+        Returns:
+            The description of the command, see `describe`.
 
         Raises:
-            UnknownSession: The session is not here.
+            UnknownSession: The session is not at this replica.
             InvalidInput: The command is unknown.
             Overloaded: Too many commands wait for the session's next request.
         """
@@ -94,24 +106,22 @@ class CommandBoard:
             raise UnknownSession(
                 f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere"
             )
+
         pressed = Press(uuid.uuid4().hex, do, by, self._clock())
         self.forget_others(self._sessions.ids())
         with self._lock:
-            held = self._presses.setdefault(session_id, [])
-            self._expire(held)
-            if len(held) == _SHOWN:
-                over = next((one for one in held if one.state not in ("waiting", "saving")), None)
-                if over is None and do == "stop":  # a "stop" replaces a less important command
-                    over = next(
-                        (one for one in held if one.state == "waiting" and one.do != "stop"), None
-                    )
-                if over is None:
+            presses = self._presses.setdefault(session_id, [])
+            self._expire(presses)
+            if len(presses) == _SHOWN:
+                replaced = _replaceable(presses, do)
+                if replaced is None:
                     raise Overloaded(
                         f"session {session_id!r}: {_SHOWN} commands wait already for its robot's "
                         "request"
                     )
-                held.remove(over)
-            held.append(pressed)
+                presses.remove(replaced)
+            presses.append(pressed)
+
         if do == SAVE:
             pressed.state = "saving"
             threading.Thread(target=self._save_now, args=(session_id, pressed), daemon=True).start()
@@ -119,40 +129,51 @@ class CommandBoard:
 
     def read_outcomes(self, session_id: str, request: Request) -> None:
         """Read the outcomes of earlier commands that a session's request reports."""
-        if not (held := self._presses.get(session_id)) or request.obs is None:
+        presses = self._presses.get(session_id)
+        if not presses or request.obs is None:
             return
-        stated = request.obs.info.get(COMMANDED)
-        outcomes = stated if isinstance(stated, dict) else {}
+
+        # By id of a command: the reason for a refusal, empty for a command that was executed.
+        outcomes = request.obs.info.get(COMMANDED)
+        if not isinstance(outcomes, dict):
+            outcomes = {}
         with self._lock:
-            for one in held:
-                if one.state not in ("sent", "ignored"):
+            for press in presses:
+                if press.state not in ("sent", "ignored"):
                     continue
-                if isinstance(why := outcomes.get(one.id), str):
-                    one.state, one.why = ("refused", why[:_REFUSAL]) if why else ("done", "")
+                refusal = outcomes.get(press.id)
+                if isinstance(refusal, str):
+                    press.state = "refused" if refusal else "done"
+                    press.why = refusal[:_REFUSAL]
                 elif request.op == "act":
-                    one.requests += 1
-                    one.state = "ignored" if one.requests >= _UNANSWERED else one.state
+                    press.requests += 1
+                    if press.requests >= _UNANSWERED:
+                        press.state = "ignored"
 
     def send(self, session_id: str, reply: Reply) -> None:
-        """Add the oldest waiting command to the answer to a session's act; "stop" has priority."""
-        if not (held := self._presses.get(session_id)) or reply.act is None:
+        """Add the oldest waiting command to an answer with an action of the session; "stop" has
+        priority.
+        """
+        presses = self._presses.get(session_id)
+        if not presses or reply.act is None:
             return
+
         with self._lock:
-            self._expire(held)
-            for one in sorted(held, key=lambda one: one.do != "stop"):
-                if one.state == "waiting":
-                    reply.act.info[COMMAND] = {"id": one.id, "do": one.do, "by": one.by}
-                    one.state = "sent"
+            self._expire(presses)
+            for press in sorted(presses, key=lambda press: press.do != "stop"):
+                if press.state == "waiting":
+                    reply.act.info[COMMAND] = {"id": press.id, "do": press.do, "by": press.by}
+                    press.state = "sent"
                     return
 
-    def of(self, session_id: str) -> list[dict[str, Any]]:
+    def describe(self, session_id: str) -> list[dict[str, Any]]:
         """Describe the last commands to a session, oldest first: `id`, `do`, `by`, `state` and
         `why` of each.
         """
         with self._lock:
-            held = self._presses.get(session_id, [])
-            self._expire(held)
-            return [one.describe() for one in held]
+            presses = self._presses.get(session_id, [])
+            self._expire(presses)
+            return [press.describe() for press in presses]
 
     def forget_others(self, sessions: Collection[str]) -> None:
         """Drop the commands to all other sessions, which have ended."""
@@ -160,17 +181,34 @@ class CommandBoard:
             for session in self._presses.keys() - set(sessions):
                 del self._presses[session]
 
-    def _save_now(self, session_id: str, pressed: Press) -> None:
+    def _save_now(self, session_id: str, press: Press) -> None:
+        """Save the last seconds of a session; runs on a thread of its own."""
         try:
-            pressed.why, pressed.state = self._save(session_id), "done"
+            press.why = self._save(session_id)
+            press.state = "done"
         except Exception as error:
             if not isinstance(error, VLAgentsError):
                 logger.exception("session %s was not saved", session_id)
-            pressed.why, pressed.state = str(error)[:_REFUSAL], "refused"
+            press.why = str(error)[:_REFUSAL]
+            press.state = "refused"
 
-    def _expire(self, held: Collection[Press]) -> None:
+    def _expire(self, presses: Collection[Press]) -> None:
         """Expire the commands that have waited for too long; the caller holds the lock."""
         oldest = self._clock() - _WAITS_S
-        for one in held:
-            if one.state == "waiting" and one.pressed < oldest:
-                one.state = "too late"
+        for press in presses:
+            if press.state == "waiting" and press.pressed < oldest:
+                press.state = "too late"
+
+
+def _replaceable(presses: Collection[Press], do: str) -> Press | None:
+    """Return the oldest command that may be dropped for the new command `do`; None if there is
+    none.
+    """
+    for press in presses:
+        if press.state not in ("waiting", "saving"):
+            return press
+    if do == "stop":  # it is more important than the others
+        for press in presses:
+            if press.state == "waiting" and press.do != "stop":
+                return press
+    return None

@@ -1,10 +1,10 @@
 """The latest answers and observations of a replica's sessions, kept only while a reader renews its
 lease.
 
-Clients determine the data, so all of it is bounded in bytes: answers keep numbers and short texts;
-observations are the latest of each session, at most `RATE` per second; and of both, the oldest are
-dropped beyond `ANSWER_BYTES` and `OBSERVATION_BYTES`. The live page, the last seconds of each
-session and the viewers read the data on their own threads.
+Clients determine the data, so all of it is bounded in bytes. Answers keep numbers and short texts.
+Of each session only the latest observation is kept, at most `RATE` per second. The oldest answers
+and observations are dropped beyond `ANSWER_BYTES` and `OBSERVATION_BYTES`. The live page, the last
+seconds of each session and the viewers read the data on their own threads.
 """
 
 from __future__ import annotations
@@ -26,40 +26,40 @@ from vlagents_ray.serve.engine.observer import Observer, Observers
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray_live.commands import CommandBoard
 
-ENCODING_SHARE = 0.04  # share of a core for encoding pictures
+ENCODING_SHARE = 0.04  # the share of a core that encodes pictures
 RATE = 10.0  # maximum rate of kept observations per session, Hz
-LEASE_S = 2.0  # time after the last reading for which data are kept
+LEASE_S = 2.0  # the time after the last reading for which data are kept
 ANSWER_BYTES = 2**25  # maximum size of the kept answers
 # Maximum size of the observations: 70 sessions of four unencoded VGA cameras.
 OBSERVATION_BYTES = 2**28
 VALUES = 64  # maximum number of values of one part of a state, or of one action
 ROWS = 128  # maximum number of actions of a chunk
-TEXT = 200  # maximum length of a text
+TEXT = 200  # maximum length of a text, characters
 SHOWN_OPS = ("act", "reset")
 _ACTION = 4096  # maximum number of values of an action that is kept with its observation
-_PARTS = 64  # maximum number of cameras, and of parts of the state, of a kept observation
-_INFO = 24  # maximum number of entries of an act's info
-# Entries of an act's info: shown elsewhere, or internal.
-_OWN = ("timing", "policy", "behaviour", "distribution")
+_NAMES = 64  # maximum number of cameras and parts of the state of a kept observation
+_INFO = 24  # maximum number of entries of an action's info
+# Entries of an action's info that are not shown: the page has them elsewhere, or they are internal.
+_HIDDEN = ("timing", "policy", "behaviour", "distribution")
 _MOST = 2**53  # largest integer that JSON represents exactly
-# Estimated size of an answer or an observation besides its arrays, files and texts, bytes.
+# Estimated size of an answer or an observation without its arrays, files and texts, bytes.
 _OBJECTS = 1000
 _ENCODING = threading.Lock()
-_KEPT_S = 1.0  # time for which pixels are kept for a reader
+_KEPT_S = 1.0  # the time for which pixels are kept for a reader
 
 
 class Answer(NamedTuple):
-    """The kept data of one answer."""
+    """The data that are kept for one reply."""
 
     number: int  # increases with every answer of the replica
     session: str
-    op: str
+    op: str  # "act" or "reset"
     priority: str
-    timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
-    error: str = ""  # error code; empty without an error
-    detail: str = ""
-    rows: int = 0  # number of rows of the chunk
-    # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an act.
+    timing: Mapping[str, float]  # ms by stage; completed when the answer is sent
+    error: str = ""  # the code of an error; empty without an error
+    detail: str = ""  # the message of an error
+    rows: int = 0  # the number of rows of the chunk
+    # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an action.
     action: np.ndarray | None = None
     done: bool = False
     # The numbers and short texts in the policy's info.
@@ -69,40 +69,42 @@ class Answer(NamedTuple):
     def size(self) -> int:
         """The size of its memory, bytes."""
         arrays = 0 if self.action is None else self.action.nbytes
-        texts = (self.session, self.detail, *self.info, *self.info.values())
-        return _OBJECTS + arrays + sum(4 * len(text) for text in texts if isinstance(text, str))
+        values = (self.session, self.detail, *self.info, *self.info.values())
+        texts = sum(4 * len(value) for value in values if isinstance(value, str))
+        return _OBJECTS + arrays + texts
 
 
 @dataclass(slots=True)
 class KeptObservation:
-    """An observation as received by the policy."""
+    """An observation as the policy received it."""
 
-    number: int
+    number: int  # increases with every answer and observation of the replica
     time: float  # s, of `time.monotonic`
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty after they are encoded
-    # JPEG or PNG files by camera: those of the client, or those encoded for the reader.
+    # JPEG or PNG files by camera, which the client sent, or which are encoded for the reader.
     files: dict[str, bytes]
-    # (D,) float32, the first row of its answer, after that was sent.
+    # (D,) float32, the first row of the answer; None before the answer is sent.
     action: np.ndarray | None = None
-    counted: int = 0  # size that is included in the observer's sum, bytes
+    counted: int = 0  # the size that is included in the observer's sum, bytes
 
     @property
     def size(self) -> int:
         """The size of its memory, bytes."""
-        arrays = sum(part.nbytes for part in self.state.values()) + (
-            0 if self.action is None else self.action.nbytes
-        )
-        pixels = {id(owner): size for owner, size in map(_owner, self.cameras.values())}
-        return (
-            _OBJECTS
-            + arrays
-            + sum(pixels.values())
-            + sum(len(file) for file in self.files.values())
-        )
+        arrays = sum(vector.nbytes for vector in self.state.values())
+        if self.action is not None:
+            arrays += self.action.nbytes
+        files = sum(len(file) for file in self.files.values())
+
+        # Several images may be in the same memory.
+        pixels: dict[int, int] = {}
+        for image in self.cameras.values():
+            owner, size = _owner(image)
+            pixels[id(owner)] = size
+        return _OBJECTS + arrays + files + sum(pixels.values())
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the files of all cameras; raw pixels are encoded first, which may take
+        """Return the files of all cameras by name, after raw pixels are encoded, which may take
         milliseconds.
         """
         with _ENCODING:  # there may be several readers
@@ -115,6 +117,11 @@ class KeptObservation:
 class LiveObserver(Observer):
     """Keeps the latest answers and observations of a replica, from `renew` to the end of the
     lease. Thread-safe.
+
+    Args:
+        observers: The observers of the replica, to which `renew` adds this one.
+        commands: The commands that are sent in the answers.
+        clock: Returns the current time, s.
     """
 
     def __init__(
@@ -123,20 +130,20 @@ class LiveObserver(Observer):
         commands: CommandBoard | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in
-        the answers.
-        """
-        self._observers, self._commands, self._clock = observers, commands, clock
-        self._until = float("-inf")  # end of the lease, s
+        self._observers = observers
+        self._commands = commands
+        self._clock = clock
+        self._until = float("-inf")  # the end of the lease, s
         self._active = False
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque()
         self._observations: dict[str, KeptObservation] = {}  # by session, oldest first
-        self._answer_bytes = self._observation_bytes = 0
+        self._answer_bytes = 0
+        self._observation_bytes = 0
         self._lock = threading.Lock()
 
     def renew(self, lease_s: float = LEASE_S) -> None:
-        """Keep recording for `lease_s` more seconds."""
+        """Keep data for `lease_s` more seconds."""
         self._until = max(self._until, self._clock() + lease_s)
         if not self._active:
             self._active = True
@@ -153,11 +160,13 @@ class LiveObserver(Observer):
                 self._answers.clear()
                 self._observations.clear()
                 self._answer_bytes = 0
-            for kept in self._observations.values():
-                if kept.time < self._clock() - _KEPT_S:
-                    kept.cameras = {}
-                kept.counted = kept.size  # the pictures have been encoded
-            self._observation_bytes = sum(kept.counted for kept in self._observations.values())
+
+            self._observation_bytes = 0
+            for observation in self._observations.values():
+                if observation.time < self._clock() - _KEPT_S:
+                    observation.cameras = {}
+                observation.counted = observation.size  # pictures may have been encoded
+                self._observation_bytes += observation.counted
 
     def close(self) -> None:
         """End the lease."""
@@ -178,12 +187,11 @@ class LiveObserver(Observer):
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Add the answer to its session's observation."""
         observation = pending.observer_data.pop(self, None)
-        if (
-            observation is not None
-            and reply.act is not None
-            and (row := reply.act.rows()[0]).size <= _ACTION
-        ):
-            observation.action = np.array(row)
+        if observation is not None and reply.act is not None:
+            row = reply.act.rows()[0]
+            if row.size <= _ACTION:
+                observation.action = np.array(row)
+
         answer = _answer(next(self._numbers), pending, reply)
         with self._lock:
             self._answers.append(answer)
@@ -194,8 +202,14 @@ class LiveObserver(Observer):
     def answers(self, since: int) -> list[Answer]:
         """Return the answers with numbers above `since`, oldest first."""
         with self._lock:
-            held = self._answers.copy()
-        return list(itertools.takewhile(lambda one: one.number > since, reversed(held)))[::-1]
+            answers = self._answers.copy()
+
+        newest_first: list[Answer] = []
+        for answer in reversed(answers):
+            if answer.number <= since:
+                break
+            newest_first.append(answer)
+        return newest_first[::-1]
 
     def observation(self, session: str) -> KeptObservation | None:
         """Return the session's latest kept observation, or None."""
@@ -209,76 +223,95 @@ class LiveObserver(Observer):
 
     def _keep(self, pending: PendingRequest) -> KeptObservation | None:
         """Keep a request's observation, unless one was kept just before."""
-        session, obs, now = pending.session_id, pending.request.obs, self._clock()
-        before = self._observations.get(session)
-        if obs is None or (before is not None and now - before.time < 1 / RATE):
+        session = pending.session_id
+        obs = pending.request.obs
+        now = self._clock()
+        last = self._observations.get(session)
+        if obs is None or (last is not None and now - last.time < 1 / RATE):
             return None
         names = (*obs.state, *obs.cameras)
-        if len(names) > _PARTS or any(len(name) > TEXT for name in names):
+        if len(names) > _NAMES or any(len(name) > TEXT for name in names):
             return None
-        state = {name: np.array(part) for name, part in obs.state.items()}
+
+        state = {name: np.array(vector) for name, vector in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
-        files = pending.files or {}
-        sent = {
-            name: bytes(files[id(image)][1])
-            for name, image in obs.cameras.items()
-            if id(image) in files
-        }
-        cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
-        kept = KeptObservation(next(self._numbers), now, state, cameras, sent)
-        kept.counted = kept.size
+
+        # The client may have sent some images as files.
+        sent_files = pending.files or {}
+        files: dict[str, bytes] = {}
+        cameras: dict[str, np.ndarray] = {}
+        for name, image in obs.cameras.items():
+            if id(image) in sent_files:
+                files[name] = bytes(sent_files[id(image)][1])
+            else:
+                cameras[name] = image
+
+        observation = KeptObservation(next(self._numbers), now, state, cameras, files)
+        observation.counted = observation.size
         with self._lock:
-            if (old := self._observations.pop(session, None)) is not None:
-                self._observation_bytes -= old.counted
-            self._observations[session] = kept
-            self._observation_bytes += kept.counted
+            replaced = self._observations.pop(session, None)
+            if replaced is not None:
+                self._observation_bytes -= replaced.counted
+            self._observations[session] = observation
+            self._observation_bytes += observation.counted
+
             while self._observation_bytes > OBSERVATION_BYTES:
-                self._observation_bytes -= self._observations.pop(
-                    next(iter(self._observations))
-                ).counted
-        return kept
+                oldest = self._observations.pop(next(iter(self._observations)))
+                self._observation_bytes -= oldest.counted
+        return observation
 
 
 def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
-    request, act, error = pending.request, reply.act, reply.error
+    """Return the data of a reply that are kept."""
     answer = Answer(
-        number, pending.session_id, request.op, pending.priority.name.lower(), reply.timing
+        number=number,
+        session=pending.session_id,
+        op=pending.request.op,
+        priority=pending.priority.name.lower(),
+        timing=reply.timing,
     )
-    if error is not None:
-        return answer._replace(error=error.code, detail=str(error)[:TEXT])
+    if reply.error is not None:
+        return answer._replace(error=reply.error.code, detail=str(reply.error)[:TEXT])
+
+    act = reply.act
     if act is None:
         return answer
     rows = act.rows()
-    kept = np.array(rows[:ROWS, :VALUES], np.float32)
-    return answer._replace(rows=len(rows), action=kept, done=bool(act.done), info=_info(act.info))
+    action = np.array(rows[:ROWS, :VALUES], np.float32)
+    return answer._replace(rows=len(rows), action=action, done=bool(act.done), info=_info(act.info))
 
 
 def _info(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of an act's info that are numbers or texts; texts are truncated."""
-    stated = ((name[:TEXT], value) for name, value in info.items() if name not in _OWN)
-    plain = (
-        (name, value.item() if isinstance(value, np.generic) else value) for name, value in stated
-    )
-    shown = (
-        (name, value[:TEXT] if isinstance(value, str) else value)
-        for name, value in plain
-        if isinstance(value, (str, float)) or (isinstance(value, int) and -_MOST <= value <= _MOST)
-    )
-    return dict(itertools.islice(shown, _INFO))
+    """Return the entries of an action's info that are numbers or texts; texts are truncated."""
+    entries: list[tuple[str, Any]] = []
+    for name, value in info.items():
+        if name in _HIDDEN:
+            continue
+        if len(entries) == _INFO:
+            break
+
+        plain = value.item() if isinstance(value, np.generic) else value
+        if isinstance(plain, str):
+            entries.append((name[:TEXT], plain[:TEXT]))
+        elif isinstance(plain, float) or (isinstance(plain, int) and -_MOST <= plain <= _MOST):
+            entries.append((name[:TEXT], plain))
+    return dict(entries)
 
 
 def _owner(image: np.ndarray) -> tuple[object, int]:
-    """Return the object whose memory an image keeps alive, and its size: a small image may be part
-    of a large message.
+    """Return the object whose memory an image keeps alive, and its size in bytes: a small image may
+    be part of a large message.
 
-    Of memory shared by a client only the image itself counts, as the rest belongs to the client in
+    Of memory that a client shares only the image itself counts, as the client keeps the memory in
     any case.
     """
     owner: Any = image
-    while (
-        further := getattr(owner, "base" if isinstance(owner, np.ndarray) else "obj", None)
-    ) is not None:
-        owner = further
+    while True:
+        attribute = "base" if isinstance(owner, np.ndarray) else "obj"
+        inner_owner = getattr(owner, attribute, None)
+        if inner_owner is None:
+            break
+        owner = inner_owner
     size = len(owner) if isinstance(owner, (bytes, bytearray)) else getattr(owner, "nbytes", 0)
     return owner, max(size, image.nbytes)

@@ -1,4 +1,4 @@
-"""The live page of an evaluation, which the process that runs it serves: `eval --live` and
+"""The live page of an evaluation, which the process of the command serves: `eval --live` and
 `report --live`.
 """
 
@@ -15,8 +15,8 @@ from vlagents_ray_live.live_page import page_server
 from vlagents_ray_live.live_view import Fleet
 from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
-_PART = "live"  # name of the part of the policies' replicas
-_NAME = "eval"  # the page's application, for keys that are limited to applications
+_PART = "live"  # the name of the part of the policies' replicas
+_NAME = "eval"  # the application of the page, for keys that are limited to applications
 
 
 class LiveEvaluationPage(EvaluationPage):
@@ -31,8 +31,8 @@ class LiveEvaluationPage(EvaluationPage):
         keys: Keys | None,
     ) -> Iterator[str]:
         """Serve the page on a thread; see `EvaluationPage.serve`."""
-        others = _views(apps) if apps else None
-        fleet = Fleet(None, others, document.read)
+        views = _views(apps) if apps else None
+        fleet = Fleet(None, views, document.read)
         with page_server(fleet, address, keys, name=_NAME, videos=document.video) as url:
             yield url
 
@@ -44,6 +44,7 @@ def _views(apps: Collection[str]) -> SiblingViews:
     replicas = ReplicasInCluster(apps)
 
     async def live_parts() -> list[SiblingPart]:
+        """Return the live part of each replica."""
         return [SiblingPart(replica, _PART, METHODS) for replica in await replicas.others()]
 
     return SiblingViews(live_parts)

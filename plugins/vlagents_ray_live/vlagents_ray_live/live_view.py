@@ -141,7 +141,7 @@ class ReplicaView:
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):
             observation, described = self.live.observation(name), sessions[name]
-            described["commands"] = self.commands.of(name)
+            described["commands"] = self.commands.describe(name)
             if observation is None or observation.number <= since:
                 continue
 

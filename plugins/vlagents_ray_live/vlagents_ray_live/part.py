@@ -1,5 +1,4 @@
-"""The live page as a part of a replica: its routes, the data of this replica, and that of the
-others.
+"""The live page as a part of a replica: its routes, and the data of all replicas.
 
 It is on by default. A deployment file adds the last seconds of each session: `parts: {live:
 {folder: /data/kept}}`.
@@ -19,9 +18,9 @@ from vlagents_ray_live.ring import LiveConfig
 from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
 _SUMMARY = (
-    "A page that shows what the sessions do now. With keys, it asks for one with the scope "
-    "`watch`, and has buttons for one that also has the scope `operate`. Robots that offer it are "
-    "stopped there."
+    "A page that shows the sessions as they run. If the server has keys, the page asks for one "
+    "with the scope `watch`, and has buttons for a key that also has the scope `operate`. Robots "
+    "that allow it are stopped there."
 )
 
 
@@ -40,8 +39,8 @@ class LivePart(ReplicaPart):
         self.fleet = Fleet(self.view, SiblingViews(self.siblings))
 
     def open(self) -> None:
-        """Start to end leases that viewers no longer renew, and to keep the last seconds if
-        there is a folder.
+        """Start to drop data that viewers no longer read, and to keep the last seconds of each
+        session if there is a folder.
         """
         self.view.open()
 
@@ -54,7 +53,7 @@ class LivePart(ReplicaPart):
         return live_routes(self.fleet, open_to_network=self.context.open_to_network)
 
     def describe(self) -> Mapping[str, Any]:
-        """Return the page's path and what it shows."""
+        """Return the path of the page and its description."""
         return {"page": PAGE, "summary": _SUMMARY}
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:

@@ -1,5 +1,5 @@
-"""The data for viewers of the other replicas: their snapshots, and the way of a command to the
-session's replica.
+"""The views of the other replicas of an application: their snapshots, and commands to their
+sessions.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from vlagents_ray_live.live_view import OtherReplicas, ReplicaView, SnapshotRead
 
 logger = logging.getLogger(__name__)
 
-# The methods that the live page calls at other replicas, and the time limit of each, s; a late
-# replica is asked again.
+# The methods that the live page calls at other replicas, and the time limit of each, s. The page
+# calls a replica that is late again.
 METHODS = {"read": 0.3, "press": 3.0}
-_VIEW_S = 2.0  # time for which the list of replicas is reused
+_VIEW_S = 2.0  # the time for which the list of replicas is reused
 
 
 class SiblingViews(OtherReplicas):
-    """The views of other replicas, through their live parts."""
+    """The views of other replicas, through their live parts.
+
+    Args:
+        siblings: Returns the live part of each other replica; they may change between two calls.
+    """
 
     def __init__(self, siblings: Callable[[], Awaitable[Sequence[SiblingPart]]]) -> None:
-        """`siblings` returns the live part of each other replica; they may change between two
-        calls.
-        """
         self._siblings = siblings
-        self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
+        self._views: dict[str, SnapshotReader] = {}  # the result of the last lookup
         self._looked_up = float("-inf")
 
     async def views(self) -> dict[str, SnapshotReader]:
@@ -45,8 +46,10 @@ class SiblingViews(OtherReplicas):
         return self._views
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the
-        session.
+        """Give a command to a session, see `CommandBoard.press`.
+
+        Returns:
+            The description of the command; None if no replica has the session.
 
         Raises:
             VLAgentsError: The replica that has the session refused the command.

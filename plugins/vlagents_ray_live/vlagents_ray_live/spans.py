@@ -1,5 +1,5 @@
-"""OpenTelemetry spans of the requests of a replica: from arrival to answer, decoding, queue, and
-batch.
+"""OpenTelemetry spans of the requests of a replica, from arrival to answer, with spans of decoding,
+queue, batch and encoding.
 """
 
 from __future__ import annotations
@@ -17,32 +17,37 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 
-_KEPT = 4096  # maximum number of answers per half second; older ones get no spans
-# Stages in order, after decoding, and names of their spans.
+_KEPT = 4096  # maximum number of answers in half a second; the oldest others have no spans
+# The stages in order, after decoding, and the names of their spans.
 _STAGES = {"queue": "queue", "inference": "batch"}
-_OPS = ("act", "reset")
-_TEXT = 200  # maximum length of an error, or of a client's text
+_OPS = ("act", "reset")  # the requests that have spans
+_TEXT = 200  # maximum length of an error, or of a client's text, characters
 
 
 class _ServedRequest(NamedTuple):
-    """The kept data of a request and its answer, of bounded size."""
+    """The data that are kept for a request and its answer, of bounded size."""
 
     session: str
     op: str
     priority: str
-    traceparent: str
-    decoded_ns: int  # time at which the request was decoded, ns since 1970
-    timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
-    error: str
-    answered_ns: int
+    traceparent: str  # the client's span, in W3C's format; empty if unknown
+    decoded_ns: int  # the time at which the request was decoded, ns since 1970
+    timing: Mapping[str, float]  # ms by stage; completed when the answer is sent
+    error: str  # empty without an error
+    answered_ns: int  # ns since 1970
 
 
 class RequestSpans(Observer):
-    """Creates spans of requests, twice a second and on its own thread, until `close`."""
+    """Creates spans of requests, twice a second and on its own thread, until `close`.
+
+    Args:
+        tracer: The tracer of OpenTelemetry.
+        replica: The name of the replica.
+    """
 
     def __init__(self, tracer: Any, replica: str) -> None:
-        """Trace requests with `tracer`, under the replica's name."""
-        self._tracer, self._replica = tracer, replica
+        self._tracer = tracer
+        self._replica = replica
         self._answered: deque[_ServedRequest] = deque(maxlen=_KEPT)
         self._trace = require("opentelemetry.trace", extra="otel")
         module = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
@@ -57,23 +62,31 @@ class RequestSpans(Observer):
 
     def on_request(self, pending: PendingRequest) -> None:
         """Store the start of the request."""
-        if pending.request.op in _OPS:
-            obs = pending.request.obs
-            # The client's value is untrusted.
-            traceparent = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")
-            if not isinstance(traceparent, str):
-                traceparent = ""
-            pending.observer_data[self] = traceparent[:_TEXT], time.time_ns()
+        if pending.request.op not in _OPS:
+            return
+        obs = pending.request.obs
+        traceparent = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")
+        if not isinstance(traceparent, str):  # the client may send anything
+            traceparent = ""
+        pending.observer_data[self] = traceparent[:_TEXT], time.time_ns()
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Export the span of the answered request."""
+        """Keep the data of the answered request for `export`."""
         begun: tuple[str, int] | None = pending.observer_data.pop(self, None)
-        if begun is not None:
-            about = pending.session_id, pending.request.op, pending.priority.name.lower()
-            error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
-            self._answered.append(
-                _ServedRequest(*about, *begun, reply.timing, error, time.time_ns())
-            )
+        if begun is None:
+            return
+        traceparent, decoded_ns = begun
+        served = _ServedRequest(
+            session=pending.session_id,
+            op=pending.request.op,
+            priority=pending.priority.name.lower(),
+            traceparent=traceparent,
+            decoded_ns=decoded_ns,
+            timing=reply.timing,
+            error="" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT],
+            answered_ns=time.time_ns(),
+        )
+        self._answered.append(served)
 
     def export(self) -> None:
         """Create the spans of the answers since the last call, whose timing is complete by now."""
@@ -106,21 +119,22 @@ class RequestSpans(Observer):
         if served.error:
             request_span.set_status(self._trace.StatusCode.ERROR, served.error)
 
-        inside = self._trace.set_span_in_context(request_span, parent)
-        self._stage("decode", inside, begun_ns, served.decoded_ns)
-        at_ns = served.decoded_ns
-        for stage, span in _STAGES.items():
+        context = self._trace.set_span_in_context(request_span, parent)
+        self._make_stage("decode", context, begun_ns, served.decoded_ns)
+        stage_begun_ns = served.decoded_ns
+        for stage, span_name in _STAGES.items():
             if f"{stage}_ms" in timing:
-                ended_ns = at_ns + _ns(timing[f"{stage}_ms"])
-                self._stage(span, inside, at_ns, ended_ns)
-                at_ns = ended_ns
+                ended_ns = stage_begun_ns + _ns(timing[f"{stage}_ms"])
+                self._make_stage(span_name, context, stage_begun_ns, ended_ns)
+                stage_begun_ns = ended_ns
 
         encoded_ns = served.answered_ns + _ns(timing.get("encode_ms", 0.0))
-        self._stage("encode", inside, served.answered_ns, encoded_ns)
+        self._make_stage("encode", context, served.answered_ns, encoded_ns)
         request_span.end(encoded_ns)
 
-    def _stage(self, name: str, inside: Any, begun_ns: int, ended_ns: int) -> None:
-        self._tracer.start_span(name, inside, start_time=begun_ns).end(ended_ns)
+    def _make_stage(self, name: str, context: Any, begun_ns: int, ended_ns: int) -> None:
+        """Create the span of a stage within the span of its request."""
+        self._tracer.start_span(name, context, start_time=begun_ns).end(ended_ns)
 
 
 class Spans(ReplicaPart):
@@ -135,4 +149,5 @@ class Spans(ReplicaPart):
 
 
 def _ns(milliseconds: float) -> int:
+    """Convert milliseconds to nanoseconds."""
     return int(milliseconds * 1e6)
