@@ -269,7 +269,7 @@ def serve_page() -> None:
     """Serve the live page of an evaluation; print its port as JSON."""
     rated = [_key(key_of(way), rate=1, scopes=["watch"]) for way in PAGES]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot", scopes=["watch"]), *rated]}))
-    fleet = Fleet(None, more=dict)
+    fleet = Fleet(None, extra=dict)
     with page_server(fleet, ("127.0.0.1", 0), keys, name="app", videos=lambda _: None) as url:
         print(json.dumps({"port": urlsplit(url).port, "own": [0, ""]}), flush=True)
         sys.stdin.read()

@@ -62,7 +62,7 @@ def served(
 ) -> Iterator[str]:
     """The address of the page of such a document."""
     with page_server(
-        Fleet(None, more=read), ("127.0.0.1", 0), keys, name="eval", videos=videos
+        Fleet(None, extra=read), ("127.0.0.1", 0), keys, name="eval", videos=videos
     ) as url:
         yield url
 

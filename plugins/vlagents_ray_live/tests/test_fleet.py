@@ -141,7 +141,7 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     said: list[dict[str, Any]] = [{"evaluation": {"done": 1}}]
 
     async def watch() -> list[dict[str, Any]]:
-        gathered = Fleet(None, more=lambda: said[-1])
+        gathered = Fleet(None, extra=lambda: said[-1])
         with gathered.viewer() as viewer:
             found = [(await viewer.next())[0] for _ in range(2)]
             said.append({"evaluation": {"done": 2}})

@@ -281,7 +281,7 @@ def test_viewers_end_with_the_server() -> None:
 
 def fleet() -> Fleet:
     said = {"evaluation": {"done": 1}}
-    return Fleet(None, more=lambda: said)
+    return Fleet(None, extra=lambda: said)
 
 
 def test_it_is_there_until_the_end_of_the_context() -> None:

@@ -1,23 +1,24 @@
 """The live page, and the WebSocket that delivers its data.
 
-    GET /live      the page: it holds no data, and needs no key
-    GET /v1/live   the current state of the replicas, as JSON without pictures; keys need the scope
-    "watch" WS  /v1/live   the same with pictures, at most ten times a second
-    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the
-    scope "operate"
+    GET  /live             the page, which contains no data and needs no key
+    GET  /v1/live          the current data of the replicas, as JSON without pictures; keys need the
+                           scope "watch"
+    WS   /v1/live          the same data with pictures, at most ten times a second
+    POST /v1/live/command  a command, {"session": …, "do": "pause"}, see `CommandBoard.press`; keys
+                           need the scope "operate"
 
-A process other than a replica, such as the driver of an evaluation, serves them by `page_server`.
-Its page has no commands, but videos:
+A process that is not a replica, such as the driver of an evaluation, serves them with
+`page_server`. Its page has no commands, but videos:
 
-    GET /v1/live/videos/7   a video to which the document refers by its number
+    GET  /v1/live/videos/7  a video to which the document refers by its number
 
 The viewer requests each message, with the sessions whose pictures it shows: {"shown": ["arm-1",
-…]}. So a slow viewer misses old messages, and delays no other. The answer is the length of a JSON
-document (32 bits, little-endian), the document, and the files to which it refers by their index in
-`files`, the list of their lengths.
+…]}. So a slow viewer misses old messages, and does not delay the others. The answer consists of the
+length of a JSON document (32 bits, little-endian), the document, and the files to which it refers
+by their index in `files`, the list of their lengths.
 
-A page in a browser cannot set a header: it sends its key among the WebSocket's subprotocols, as
-"vlagents.key.KEY".
+A page in a browser cannot set a header, so it sends its key among the subprotocols of the
+WebSocket, as "vlagents.key.KEY".
 """
 
 from __future__ import annotations
@@ -77,12 +78,12 @@ _VIEWERS = 32  # maximum number of viewers
 _SILENT_S = 30.0  # maximum time between two messages of a viewer
 _SCRIPTS = ("evaluation.js", "live.js")
 _CHARACTERS = 2**16  # maximum length of a viewer's message
-_POLICY_VIOLATION = 1008  # WebSocket close code
-_LAST_S = 0.5  # time in which viewers are sent the end of an evaluation
-_END_S = 1  # time limit for their connections to close, s
-_LEAVE_S = 5.0  # time limit for the whole shutdown
+_POLICY_VIOLATION = 1008  # a close code of WebSocket
+_LAST_S = 0.5  # the time in which viewers receive the end of an evaluation
+_END_S = 1  # the time limit for the connections of viewers to close, s
+_LEAVE_S = 5.0  # the time limit for the whole shutdown
 
-# Returns the file of the video with a number; None if there is none.
+# A function that returns the file of the video with a number; None if there is no such video.
 VideoFiles = Callable[[int], Path | None]
 
 
@@ -92,10 +93,11 @@ def live_routes(
     """Return the routes of the live page.
 
     Args:
+        fleet: The data of the page.
         open_to_network: Whether other machines reach this server without a key. Watching is then
             refused, since the pictures of all robots would be public.
-        videos: Finds the videos that the document of an evaluation refers to; None on a policy's
-            server.
+        videos: Finds the videos to which the document of an evaluation refers; None for the server
+            of a policy.
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
@@ -109,35 +111,40 @@ def live_routes(
 
 
 class _LiveEndpoint:
+    """The handlers of the routes of the live page."""
+
     def __init__(self, fleet: Fleet, open_to_network: bool, videos: VideoFiles | None) -> None:
         self._fleet = fleet
         self._scopes = ScopeCheck("live", open_to_network=open_to_network)
         self._videos = videos
-        self._watching = 0
+        self._watching = 0  # the number of viewers
 
     async def show(self, http: HttpRequest) -> Response:
+        """Return the current data as JSON, without pictures."""
         self._require_watch(http)
         with self._fleet.viewer() as viewer:
             document, _ = await viewer.next()
         return JSONResponse(document)
 
     async def video(self, http: HttpRequest) -> Response:
+        """Return a video of the evaluation."""
         self._require_watch(http)
         path = None if self._videos is None else self._videos(http.path_params["number"])
-        return (
-            Response(status_code=404)
-            if path is None
-            else FileResponse(path, media_type="video/mp4")
-        )
+        if path is None:
+            return Response(status_code=404)
+        return FileResponse(path, media_type="video/mp4")
 
     def _require_watch(self, http: HttpRequest) -> None:
+        """Raise an error unless the caller may see the sessions."""
         require_same_origin(http.headers)
         self._scopes.require(_WATCH)
 
     async def press(self, http: HttpRequest) -> Response:
+        """Give a command to a session, and return its description."""
         self._scopes.require(_OPERATE)
+        by = caller_name()
         try:
-            command, by = await _command(http), caller_name()
+            command = await _command(http)
         except ClientDisconnect:
             return Response(status_code=499)
         pressed = await self._fleet.press(command.session, command.do, by)
@@ -145,7 +152,8 @@ class _LiveEndpoint:
         return JSONResponse(pressed)
 
     async def watch(self, socket: WebSocket) -> None:
-        offered = socket.scope.get("subprotocols") or []
+        """Send the data with pictures to a viewer, until it disconnects."""
+        subprotocols = socket.scope.get("subprotocols") or []
         try:
             self._scopes.require(_WATCH)
             if self._watching >= _VIEWERS:
@@ -153,21 +161,22 @@ class _LiveEndpoint:
         except VLAgentsError as error:
             await deny(socket, error)
             return
-        await socket.accept(_PROTOCOL if _PROTOCOL in offered else None)
+
+        await socket.accept(_PROTOCOL if _PROTOCOL in subprotocols else None)
         caller = current_caller()
         if isinstance(caller, Caller):
             caller.note("watches", "the sessions")
+
         self._watching += 1
         try:
             with self._fleet.viewer() as viewer:
                 while True:
-                    viewer.shown = frozenset(await self._asked(socket))
+                    viewer.shown = frozenset(await self._next_shown(socket))
                     document, files = await viewer.next()
                     self._scopes.require(_WATCH)
                     may_operate = self._videos is None and self._scopes.may(_OPERATE)
-                    await socket.send_bytes(
-                        _message({**document, "may_operate": may_operate}, files)
-                    )
+                    message = _message({**document, "may_operate": may_operate}, files)
+                    await socket.send_bytes(message)
         except WebSocketDisconnect:
             return
         except VLAgentsError as error:
@@ -177,7 +186,8 @@ class _LiveEndpoint:
         finally:
             self._watching -= 1
 
-    async def _asked(self, socket: WebSocket) -> list[str]:
+    async def _next_shown(self, socket: WebSocket) -> list[str]:
+        """Wait for a viewer's request, and return the sessions whose pictures it shows."""
         try:
             message = await asyncio.wait_for(socket.receive(), _SILENT_S)
         except asyncio.TimeoutError:
@@ -186,33 +196,42 @@ class _LiveEndpoint:
             ) from None
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message["code"])
+
         text = message.get("text") or (message.get("bytes") or b"").decode(errors="replace")
         try:
-            return _Viewed.model_validate_json(text[:_CHARACTERS]).shown
+            return _ViewerRequest.model_validate_json(text[:_CHARACTERS]).shown
         except ValidationError as error:
             raise MalformedMessage(
                 f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}'
             ) from error
 
 
-class _Viewed(BaseModel):
-    shown: list[str]  # ids of the sessions
+class _ViewerRequest(BaseModel):
+    """A viewer's request for the next message."""
+
+    shown: list[str]  # ids of the sessions whose pictures it shows
 
 
 class _Command(BaseModel):
+    """The body of a command."""
+
     session: str
     do: str
 
 
 async def _command(http: HttpRequest) -> _Command:
     """Return the command in a body; a body that is too long is not read completely."""
-    kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
-    # No other site's page can send this type without the server's permission.
-    if kind != "application/json":
-        raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
+    header = http.headers.get("content-type", "")
+    content_type = header.partition(";")[0].strip().lower()
+    # The page of another site cannot send this type without the server's permission.
+    if content_type != "application/json":
+        raise MalformedMessage(
+            f"content-type: got {content_type or 'none'!r}, want application/json"
+        )
+
     body = b""
-    async for part in http.stream():
-        body += part
+    async for data in http.stream():
+        body += data
         if len(body) > _COMMAND_BYTES:
             raise MessageTooLarge(f"live: a command of more than {_COMMAND_BYTES} bytes")
     try:
@@ -224,14 +243,16 @@ async def _command(http: HttpRequest) -> _Command:
 
 
 def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
-    text = json.dumps(
-        {**document, "files": [len(file) for file in files]}, allow_nan=False, separators=(",", ":")
-    )
-    data = text.encode()
+    """Return a message of the WebSocket: the document with the lengths of the files, and the
+    files.
+    """
+    document = {**document, "files": [len(file) for file in files]}
+    data = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
     return b"".join([struct.pack("<I", len(data)), data, *files])
 
 
 async def _page(_: HttpRequest) -> Response:
+    """Return the page."""
     html, style, *scripts = live_page()
     more = "connect-src 'self'; img-src blob: data:; media-src blob:"
     return html_response(html, styles=[style], scripts=scripts, more=more)
@@ -241,27 +262,30 @@ async def _page(_: HttpRequest) -> Response:
 def live_page() -> list[str]:
     """Return the page with its style and scripts included, then the style, then the scripts."""
     folder = package_files(__package__) / "page"
-    parts = {
-        name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)
-    }
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
-    for name, part in parts.items():
-        html = html.replace(f"/* {name} */", part)
-    return [html, *parts.values()]
+    included: list[str] = []
+    for name in ("live.css", *_SCRIPTS):
+        text = folder.joinpath(name).read_text(encoding="utf-8")
+        html = html.replace(f"/* {name} */", text)
+        included.append(text)
+    return [html, *included]
 
 
 @contextmanager
 def page_server(
     fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
 ) -> Iterator[str]:
-    """Serve the live page of an evaluation on a thread for the length of the context, and yield its
-    URL.
+    """Serve the live page of an evaluation on a thread within the context.
 
     Args:
-        address: Host and port to listen on; port 0 selects a free one.
+        fleet: The data of the page.
+        address: The host and the port on which the server listens; port 0 selects a free one.
         keys: The accepted keys; None, which only loopback allows, admits all clients.
-        name: The name by which keys for single applications allow this page.
-        videos: See `live_routes`.
+        name: The application of the page, for keys that are limited to applications.
+        videos: Finds the videos to which the document refers.
+
+    Yields:
+        The URL of the page.
 
     Raises:
         ConfigError: Other machines would reach the page without a key, or the address is in use.
@@ -274,12 +298,10 @@ def page_server(
         raise ConfigError(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
         ) from error
-    routes, handlers = (
-        live_routes(fleet, open_to_network=False, videos=videos),
-        {VLAgentsError: answer_error},
-    )
-    inside = Starlette(routes=routes, exception_handlers=handlers)
-    app = FrontMiddleware(AccessMiddleware(inside, keys, name, public=[PAGE]))
+
+    routes = live_routes(fleet, open_to_network=False, videos=videos)
+    inner_app = Starlette(routes=routes, exception_handlers={VLAgentsError: answer_error})
+    app = FrontMiddleware(AccessMiddleware(inner_app, keys, name, public=[PAGE]))
     config = uvicorn.Config(
         app,
         log_config=None,
@@ -296,7 +318,8 @@ def page_server(
     )
     thread.start()
     try:
-        yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{PAGE}"
+        url_host = f"[{host}]" if ":" in host else host
+        yield f"http://{url_host}:{listening.getsockname()[1]}{PAGE}"
     finally:
         if fleet.viewers:
             time.sleep(_LAST_S)

@@ -1,5 +1,5 @@
-"""The data for viewers: the snapshots of a replica, as a JSON document and picture files, and those
-of a fleet.
+"""The data for viewers: the snapshots of a replica, as a JSON document and picture files, and the
+snapshots of all replicas.
 
 The snapshots of all replicas, and the other data of a page, are gathered once for all its viewers.
 """
@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -36,24 +37,31 @@ logger = logging.getLogger(__name__)
 _SESSIONS = 256  # maximum number of sessions that a replica's snapshot describes
 _INSTRUCTION = 1000  # maximum length of an instruction
 PICTURES = 2**24  # maximum size of the pictures in a snapshot; further sessions have none
-_STATE_S = 0.5  # time for which data that are slow to collect are reused
-# Maximum number of gathered snapshots that wait for a slow viewer; it misses the oldest.
+_STATE_S = 0.5  # the time for which data that are slow to collect are reused
+# Maximum number of gathered snapshots that wait for a slow viewer, which misses the oldest.
 _BEHIND = 20
-_WAITING_BYTES = 2**26  # maximum size of the pictures that wait for it
+_WAITING_BYTES = 2**26  # maximum size of the pictures that wait for a slow viewer
 
 
 @dataclass(slots=True)
 class Snapshot:
     """The events of one replica since the previous snapshot."""
 
-    number: int  # number of its last answer or observation
+    number: int  # the number of the last answer or observation in it
     document: dict[str, Any]
-    files: list[bytes] = field(default_factory=list)  # files to which `document` refers by index
+    files: list[bytes] = field(default_factory=list)  # `document` refers to them by index
 
 
 class ReplicaView:
-    """Makes the snapshots of one replica; each viewer in another process states its last
-    snapshot.
+    """Makes the snapshots of one replica.
+
+    Args:
+        engine: The engine of the replica.
+        name: The name of the replica.
+        node: The node on which it runs.
+        metadata: Returns the metadata of its policy.
+        settings: The settings of the live page. With a folder, the last seconds of each session are
+            kept, beginning with `open`.
     """
 
     def __init__(
@@ -64,11 +72,6 @@ class ReplicaView:
         metadata: Callable[[], Mapping[str, Any]],
         settings: LiveConfig | None = None,
     ) -> None:
-        """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its
-        policy.
-
-        With a folder in its `settings`, the last seconds of each session are kept from `open` on.
-        """
         settings = settings or LiveConfig()
         self._engine = engine
         self._about = {
@@ -77,19 +80,21 @@ class ReplicaView:
             "ring_s": None if settings.folder is None else settings.ring_s,
         }
         self._metadata = metadata
+
         self.commands = CommandBoard(engine.sessions, self._save)
         self.live = live.LiveObserver(engine.observers, self.commands)
         self.ring = None
         if settings.folder is not None:
             self.ring = Ring(self.live, engine.sessions, Path(settings.folder), settings, name)
+
         self._meter = LoadMeter(engine.queue)
-        self._slow: dict[str, Any] = {}
-        self._measured = float("-inf")
-        # Number of the observation whose pictures were read last, by session.
+        self._slow_data: dict[str, Any] = {}
+        self._collected_at = float("-inf")
+        # By session: the number of the observation whose pictures were read last.
         self._pictured: dict[str, int] = {}
 
     def open(self) -> None:
-        """Start to end leases that viewers no longer renew."""
+        """Start to drop data that viewers no longer read."""
         each_half_second.add(self.live.expire)
         if self.ring is not None:
             self.ring.open()
@@ -102,8 +107,12 @@ class ReplicaView:
         self.live.close()
 
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session and await its outcome for a limited time; see
-        `CommandBoard.press`.
+        """Give a command to a session, and read its outcome for a limited time.
+
+        Args:
+            session: The session.
+            do: The command, see `CommandBoard.press`.
+            by: The name of the caller's key.
 
         Returns:
             The description of the command; None if the session is not at this replica.
@@ -116,10 +125,16 @@ class ReplicaView:
         return pressed
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return the events since the snapshot with the number `since`, with pictures of the
-        sessions `shown`.
+        """Make a snapshot.
 
         This may take milliseconds, too long for an event loop or the policy's thread.
+
+        Args:
+            since: The number of the viewer's last snapshot; 0 for the first one.
+            shown: The sessions whose pictures are wanted.
+
+        Returns:
+            The events since the last snapshot.
         """
         engine = self._engine
         self.live.renew()
@@ -136,39 +151,42 @@ class ReplicaView:
         for session in ordered_sessions[:_SESSIONS]:
             sessions[session.id] = _session(session, last_answers.get(session.id))
 
-        # The sessions are read in the order of their pictures' age, the oldest first.
+        # The session whose pictures are the oldest comes first.
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):
-            observation, described = self.live.observation(name), sessions[name]
+            observation = self.live.observation(name)
+            described = sessions[name]
             described["commands"] = self.commands.describe(name)
             if observation is None or observation.number <= since:
                 continue
 
             snapshot.number = max(snapshot.number, observation.number)
-            described["state"] = {
-                state_name: _numbers(values[: live.VALUES])
-                for state_name, values in observation.state.items()
-            }
+            state = {}
+            for state_name, values in observation.state.items():
+                state[state_name] = _numbers(values[: live.VALUES])
+            described["state"] = state
+
             if name in shown and time.thread_time() - begun < live.ENCODING_SHARE / live.RATE:
                 described["pictures"] = _pictures(observation, snapshot.files)
                 if described["pictures"]:
                     self._pictured[name] = observation.number
 
+        waiting = {}
+        for priority, depth in engine.queue.depth_by_priority().items():
+            waiting[priority.name.lower()] = depth
         snapshot.document = {
             **self._about,
             **self._state(),
-            **_counted(answers),
-            "waiting": {
-                priority.name.lower(): depth
-                for priority, depth in engine.queue.depth_by_priority().items()
-            },
+            **_counts(answers),
+            "waiting": waiting,
             "sessions": list(sessions.values()),
             "sessions_held": len(engine.sessions),
         }
         return snapshot
 
     def _save(self, session: str) -> str:
+        """Save the last seconds of a session, and return the path of the dataset."""
         if self.ring is None:
             raise ConfigError(
                 "save: this server keeps nothing; set `parts: {live: {folder: ...}}` in its "
@@ -177,11 +195,12 @@ class ReplicaView:
         return self.ring.save(session)
 
     def _state(self) -> dict[str, Any]:
-        """Return the facts that change slowly and take long to collect."""
-        engine, now = self._engine, time.monotonic()
-        if now - self._measured > _STATE_S:
+        """Return the data that change slowly and take long to collect."""
+        engine = self._engine
+        now = time.monotonic()
+        if now - self._collected_at > _STATE_S:
             metadata = self._metadata()
-            self._slow = {
+            self._slow_data = {
                 "policy": metadata["policy"],
                 "checkpoint": metadata["checkpoint"],
                 "digest": (metadata["weights"] or {}).get("digest"),
@@ -196,8 +215,8 @@ class ReplicaView:
                 "session_limit": engine.sessions.limit,
                 "utilisation": round(self._meter.read().utilisation, 3),
             }
-            self._measured = now
-        return self._slow
+            self._collected_at = now
+        return self._slow_data
 
 
 def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[str, Any]:
@@ -223,9 +242,11 @@ def _pictures(observation: live.KeptObservation, files: list[bytes]) -> dict[str
     if sum(map(len, files)) + sum(map(len, pictures.values())) > PICTURES:
         return {}
 
-    first = len(files)
-    files += pictures.values()
-    return {camera: first + number for number, camera in enumerate(pictures)}
+    indices = {}
+    for camera, file in pictures.items():
+        indices[camera] = len(files)
+        files.append(file)
+    return indices
 
 
 def _act(answer: live.Answer) -> dict[str, Any]:
@@ -249,9 +270,12 @@ def _numbers(values: np.ndarray) -> list[Any]:
     return rounded
 
 
-def _counted(answers: list[live.Answer]) -> dict[str, Any]:
-    """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and
-    their times, ms.
+def _counts(answers: list[live.Answer]) -> dict[str, Any]:
+    """Count the actions and the errors among answers.
+
+    Returns:
+        The number of answers with an action, the number of each error, and the batch sizes and
+        times (ms by stage) of a sample of the actions.
     """
     timings = [answer.timing for answer in answers if answer.op == "act" and not answer.error]
     sample = timings[:: max(1, len(timings) // SAMPLE)]
@@ -268,7 +292,9 @@ def _counted(answers: list[live.Answer]) -> dict[str, Any]:
 
 
 SnapshotReader = Callable[[int, Collection[str]], Awaitable[Snapshot]]
-"""Returns another replica's snapshot: since which, and the sessions whose pictures are wanted."""
+"""A function that returns another replica's snapshot. Its arguments are the number of the last
+snapshot, and the sessions whose pictures are wanted.
+"""
 
 
 class OtherReplicas(Protocol):
@@ -284,33 +310,34 @@ class OtherReplicas(Protocol):
 
 
 class Viewer:
-    """The unsent data of one viewer."""
+    """The data that are not sent to one viewer yet."""
 
     def __init__(self) -> None:
-        self.shown: frozenset[str] = frozenset()  # sessions whose pictures it shows
+        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
         self._waiting: deque[list[Snapshot]] = deque()
-        self._came = asyncio.Event()
-        self._more: dict[str, Any] = {}  # latest data to send beside the snapshots
-        self._sent = self._more
+        self._has_data = asyncio.Event()
+        self._extra: dict[str, Any] = {}  # the latest further entries of the document
+        self._sent_extra = self._extra
 
-    def put(self, snapshots: list[Snapshot], more: dict[str, Any] | None = None) -> None:
-        """Queue data to be sent, and drop the oldest if there are too many; `more` is sent only
-        if it has changed.
+    def put(self, snapshots: list[Snapshot], extra: dict[str, Any] | None = None) -> None:
+        """Queue data to be sent, and drop the oldest if there are too many.
+
+        Args:
+            snapshots: The snapshots of all replicas.
+            extra: Further entries of the document, which are sent only if they have changed.
         """
         self._waiting.append(snapshots)
-        self._came.set()
-        while len(self._waiting) > 1 and (
-            len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES
-        ):
+        self._has_data.set()
+        while len(self._waiting) > 1 and self._is_behind():
             self._waiting.popleft()
-        self._more = more or self._more
+        self._extra = extra or self._extra
 
     async def next(self) -> tuple[dict[str, Any], list[bytes]]:
-        """Wait for snapshots; return all waiting ones as one document, with the files to which
+        """Wait for snapshots; return all that are queued as one document, and the files to which
         it refers.
         """
-        await self._came.wait()
-        self._came.clear()
+        await self._has_data.wait()
+        self._has_data.clear()
         gathered, self._waiting = self._waiting, deque()
 
         files: list[bytes] = []
@@ -320,43 +347,50 @@ class Viewer:
                 replicas.append(_with_files(snapshot, files, self.shown))
 
         document = {"time": time.time(), "replicas": replicas}
-        if self._more is not self._sent:
-            self._sent = self._more
-            document |= self._more
+        if self._extra is not self._sent_extra:
+            self._sent_extra = self._extra
+            document |= self._extra
         return document, files
 
-    def _waiting_bytes(self) -> int:
-        """Return the size of the files of the waiting snapshots."""
+    def _is_behind(self) -> bool:
+        """Return whether too many snapshots, or too large files, are queued."""
+        if len(self._waiting) > _BEHIND:
+            return True
         size = 0
         for snapshots in self._waiting:
             for snapshot in snapshots:
                 size += sum(map(len, snapshot.files))
-        return size
+        return size > _WAITING_BYTES
 
 
 class Fleet:
-    """Gathers snapshots while there are viewers."""
+    """Gathers snapshots of all replicas while there are viewers.
+
+    Args:
+        view: The view of this replica; None if this process is not a replica.
+        other_replicas: The other replicas.
+        extra: Returns further entries of the document. If nothing has changed, it returns the same
+            object as before.
+    """
 
     def __init__(
         self,
-        own: ReplicaView | None,
-        others: OtherReplicas | None = None,
-        more: Callable[[], dict[str, Any]] | None = None,
+        view: ReplicaView | None,
+        other_replicas: OtherReplicas | None = None,
+        extra: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
-        """Gather snapshots of `own`, if this process is a replica, and of the `others`.
-
-        `more` returns further entries of the document; if nothing has changed, it returns the same
-        object as before.
-        """
-        self._own, self._others, self._more = own, others, more
+        self._view = view
+        self._other_replicas = other_replicas
+        self._extra = extra
         self.viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
-        self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one
+        # By name of a replica: the number of the last snapshot. "" is this replica.
+        self._last_numbers: dict[str, int] = {}
 
     @contextmanager
     def viewer(self) -> Iterator[Viewer]:
-        """Yield a viewer, for which snapshots are gathered within the context; without viewers
-        nothing is gathered.
+        """Yield a viewer, for which snapshots are gathered within the context. Nothing is gathered
+        while there are no viewers.
         """
         viewer = Viewer()
         self.viewers.add(viewer)
@@ -371,42 +405,57 @@ class Fleet:
                 self._gathering = None
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
-        """Give a command to a session of any replica, and describe it, as `CommandBoard.press`
-        does.
+        """Give a command to a session of any replica.
+
+        Args:
+            session: The session.
+            do: The command, see `CommandBoard.press`.
+            by: The name of the caller's key.
+
+        Returns:
+            The description of the command.
+
+        Raises:
+            UnknownSession: No replica has the session.
         """
-        pressed = None if self._own is None else self._own.press(session, do, by)
-        if pressed is None and self._others is not None:
-            pressed = await self._others.press(session, do, by)
+        pressed = None if self._view is None else self._view.press(session, do, by)
+        if pressed is None and self._other_replicas is not None:
+            pressed = await self._other_replicas.press(session, do, by)
         if pressed is None:
             raise UnknownSession(f"session {session[:80]!r}: no replica has it; it has ended")
         return pressed
 
     async def _gather(self) -> None:
+        """Gather snapshots for all viewers, at most `live.RATE` times a second."""
+        period_s = 1 / live.RATE
         while True:
             begun = time.monotonic()
             try:
                 snapshots = await self._snapshots()
-                more = None if self._more is None else await asyncio.to_thread(self._more)
+                extra = None if self._extra is None else await asyncio.to_thread(self._extra)
             except Exception:
                 logger.exception("the live view was not read; tried again")
             else:
                 for viewer in self.viewers:
-                    viewer.put(snapshots, more)
-            await asyncio.sleep(max(1 / live.RATE / 2, 1 / live.RATE - (time.monotonic() - begun)))
+                    viewer.put(snapshots, extra)
+            took_s = time.monotonic() - begun
+            await asyncio.sleep(max(period_s / 2, period_s - took_s))
 
     async def _snapshots(self) -> list[Snapshot]:
+        """Return the snapshots of all replicas that answer in time."""
         shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
         readers: dict[str, SnapshotReader] = {}
-        if self._others is not None:
-            readers |= await self._others.views()
-        view = self._own
+        if self._other_replicas is not None:
+            readers |= await self._other_replicas.views()
+        view = self._view
         if view is not None:
-            readers[""] = lambda since, shown: asyncio.to_thread(view.read, since, shown)
+            readers[""] = partial(asyncio.to_thread, view.read)
 
-        results = await asyncio.gather(
-            *(read(self._read.get(name, 0), shown) for name, read in readers.items()),
-            return_exceptions=True,
-        )
+        reads = []
+        for name, read in readers.items():
+            reads.append(read(self._last_numbers.get(name, 0), shown))
+        results = await asyncio.gather(*reads, return_exceptions=True)
+
         snapshots = []
         last_numbers = {}
         for name, result in zip(readers, results, strict=True):
@@ -414,25 +463,33 @@ class Fleet:
                 snapshots.append(result)
                 last_numbers[name] = result.number
             else:
-                last_numbers[name] = self._read.get(name, 0)
-        self._read = last_numbers
+                last_numbers[name] = self._last_numbers.get(name, 0)
+        self._last_numbers = last_numbers
 
         if view is not None:
-            own_result = results[-1]
-            if isinstance(own_result, BaseException):
-                raise own_result
+            result_here = results[-1]
+            if isinstance(result_here, BaseException):
+                raise result_here
         return snapshots
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
-    """Return the document of a snapshot, which refers to the collected `files`, with pictures of
-    `shown` only.
+    """Add the pictures of a snapshot to a message.
+
+    Args:
+        snapshot: The snapshot.
+        files: The files of the message, to which the pictures are added.
+        shown: The sessions whose pictures are added.
+
+    Returns:
+        The document of the snapshot, which refers to `files`.
     """
     sessions = []
     for session in snapshot.document["sessions"]:
         pictures: dict[str, int] = {}
-        for camera, index in session["pictures"].items() if session["id"] in shown else ():
-            pictures[camera] = len(files)
-            files.append(snapshot.files[index])
+        if session["id"] in shown:
+            for camera, index in session["pictures"].items():
+                pictures[camera] = len(files)
+                files.append(snapshot.files[index])
         sessions.append(session | {"pictures": pictures})
     return snapshot.document | {"sessions": sessions}

@@ -1,11 +1,10 @@
-"""Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write
-them.
+"""Records requests and answers of sessions as LeRobotDatasets, on separate threads.
 
 A deployment file turns it on: `parts: {record: {folder: /data/traces}}`.
 
 The thread that handles a message only puts references into a queue. A second thread copies the
 observations, since their memory may belong to the client, and a third one encodes and writes. If
-these are too slow, or the disk is full, frames are dropped and counted; they delay no answer.
+these are too slow, or the disk is full, frames are dropped and counted. No answer is delayed.
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ from vlagents_ray_live.episodes import EpisodeWriter, RecordedAct, RecordingEnde
 
 logger = logging.getLogger(__name__)
 
-NO_VERSION = -1  # version of the weights for answers without one
+NO_VERSION = -1  # the version of the weights for answers that contain none
 _HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be written
-# Estimated size of an act besides its pictures and the bytes in its `info`.
+# Estimated size of a request without its pictures and the bytes in its `info`.
 _OTHER_BYTES = 16 * 2**10
-_NICE = 5  # lower priority than the policy's thread
-_CLOSING_S = 30.0  # time for the threads to write the waiting frames
+_NICE = 5  # a lower priority than that of the policy's thread
+_CLOSING_S = 30.0  # the time for the threads to write the waiting frames
 
 
 class RecordConfig(PartConfig):
@@ -61,22 +60,25 @@ class RecordConfig(PartConfig):
 
     folder: AbsolutePath = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica "
-        "writes its own below it"
+        "writes its own datasets in it"
     )
     share: float = Field(
-        default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset"
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of the episodes that are recorded, drawn at each reset",
     )
     pictures: Literal["exact", "small"] = Field(
         default="exact",
-        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos "
-        "for training, some "
-        "twenty times smaller, on which the same policy acts a little differently",
+        description="exact: each pixel as the policy received it, in lossless H.264; small: as in "
+        "videos for training, about twenty times smaller, with which the same policy acts slightly "
+        "differently",
     )
     fps: float = Field(
         default=10.0,
         gt=0,
         le=10_000,
-        description="rate of the frames, one for each act, that the videos assume",
+        description="rate of the frames in the videos, one for each action request",
     )
     most_gb: float = Field(
         default=50.0,
@@ -92,7 +94,12 @@ class Recording(ReplicaPart):
     Config = RecordConfig
 
     def open(self) -> None:
-        """Start to record; raises `ConfigError` or `MissingDependency` as `open_recorder` does."""
+        """Start to record.
+
+        Raises:
+            ConfigError: The folder is not writable.
+            MissingDependency: The extra "record" is not installed.
+        """
         context = self.context
         self.recorder = open_recorder(
             context.engine.sessions, self.settings, context.replica, context.metadata
@@ -110,16 +117,20 @@ class Recording(ReplicaPart):
 
 
 class RecordingMetrics:
-    """Exports the counts of a recorder to Ray once a second, on a separate thread."""
+    """Exports the counts of a recorder to Ray once a second, on a separate thread.
+
+    Args:
+        recorder: The recorder.
+        tags: The tags of the replica's series.
+    """
 
     def __init__(self, recorder: SessionRecorder, tags: Mapping[str, str]) -> None:
-        """Create the series of a replica with these `tags`."""
         make = partial(series, tags)
         self._frames = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
-        # 1 while sessions are recorded, 0 once that has ended.
+        # 1 while sessions are recorded, 0 after the recording has ended.
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._recorder = recorder
-        self._exported = Counts[str]()  # exported part of the recorder's counts
+        self._exported = Counts[str]()  # the counts that are exported already
         self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
@@ -143,31 +154,37 @@ class RecordingMetrics:
 
 
 class Worker:
-    """A thread for scheduled calls, at a lower priority than the policy's; its user bounds their
-    number.
+    """A thread that makes scheduled calls, at a lower priority than the policy's thread. The
+    number of waiting calls is not limited.
+
+    Args:
+        name: The name of the thread.
     """
 
     def __init__(self, name: str) -> None:
-        """Start the thread with the given name."""
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def put(self, call: Callable[[], None]) -> None:
-        """Schedule `call` to run on the thread; its errors are logged, and do not end the
+        """Schedule a call on the thread; an error of the call is logged, and does not end the
         thread.
         """
         self._calls.put(call)
 
     def close(self, timeout_s: float) -> None:
-        """End the thread after the scheduled calls, and wait for that."""
+        """End the thread after the scheduled calls, and wait at most `timeout_s` for that."""
         self._calls.put(None)
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while (call := self._calls.get()) is not None:
+
+        while True:
+            call = self._calls.get()
+            if call is None:
+                return
             try:
                 call()
             except Exception:
@@ -182,12 +199,12 @@ class _Recorded:
     recorder: SessionRecorder
     session: str
     op: str
-    at: float  # s since 1970
-    obs: Obs | None  # of an act
+    received_at: float  # s since 1970
+    obs: Obs | None  # None for a reset or a close
     instruction: str
-    # Options of the reset, before the queue removes some of them; converted to text by `_copy`.
+    # The options of the reset, before the queue removes some of them; `_copy` makes them a text.
     options: Any
-    size: int  # size of its memory, bytes
+    size: int  # the size of its memory, bytes
     info: str = ""  # the observation's info, as text
 
     def __del__(self) -> None:
@@ -195,30 +212,39 @@ class _Recorded:
 
 
 class SessionRecorder(Observer):
-    """Records a share of the sessions of one replica until `close`."""
+    """Records a share of the episodes of one replica until `close`.
+
+    Args:
+        writer: The writer of the episodes.
+        sessions: The sessions of the replica.
+        share: The share of the episodes that are recorded, in [0, 1], drawn at each reset.
+    """
 
     def __init__(
         self, writer: EpisodeWriter, sessions: SessionTable[LoadedModel], *, share: float = 1.0
     ) -> None:
-        """Create a recorder, and start its threads; `share` of the episodes, in [0, 1], is drawn
-        at each reset.
-        """
-        # Number of acts that exceeded the memory, or whose episode could not be written.
+        # The number of requests that exceeded the memory, or whose episode could not be written.
         self.dropped = 0
-        self.ended: str | None = None  # reason why nothing more is recorded
-        self._writer, self._sessions = writer, sessions
-        self._share, self._held_bytes = share, _HELD_BYTES
-        self._held = 0
+        self.ended: str | None = None  # the reason why nothing more is recorded
+        self._writer = writer
+        self._sessions = sessions
+        self._share = share
+
+        self._held_bytes = _HELD_BYTES
+        self._held = 0  # the size of the waiting requests, bytes
         # Guards `_held`, which the garbage collector may reduce at any time.
         self._lock = threading.RLock()
-        # Whether a comparison of the current sessions with `_first` is scheduled.
-        self._looking = False
-        # Sessions in `_first` that were not here when they were looked up.
+
+        # By session: the step at its reset; None if it is not recorded.
+        self._first_steps: dict[str, int | None] = {}
+        # Whether a comparison of the current sessions with `_first_steps` is scheduled.
+        self._is_comparing = False
+        # The sessions in `_first_steps` that were missing in the last comparison.
         self._missing: set[str] = set()
-        # Step at the reset of each session; None if it is not recorded.
-        self._first: dict[str, int | None] = {}
-        self._copier, self._worker = Worker("record-copy"), Worker("record-write")
-        each_half_second.add(self._look)
+
+        self._copier = Worker("record-copy")
+        self._worker = Worker("record-write")
+        each_half_second.add(self._compare_sessions)
 
     @property
     def saved(self) -> int:
@@ -227,7 +253,7 @@ class SessionRecorder(Observer):
 
     @property
     def lost(self) -> int:
-        """The number of acts that the recording lacks."""
+        """The number of action requests that the recording lacks."""
         return self.dropped + self._writer.lost
 
     def on_request(self, pending: PendingRequest) -> None:
@@ -236,7 +262,8 @@ class SessionRecorder(Observer):
         if self.ended is not None or request.op not in ("act", "reset", "close"):
             return
 
-        obs, size = None, 0
+        obs = None
+        size = 0
         if request.op == "act" and request.obs is not None:
             obs = request.obs
             picture_bytes = sum(image.nbytes for image in obs.cameras.values())
@@ -245,16 +272,17 @@ class SessionRecorder(Observer):
                 self.dropped += 1
                 return
 
-        recorded = pending.observer_data[self] = _Recorded(
-            self,
-            pending.session_id,
-            request.op,
-            time.time(),
-            obs,
-            request.instruction or "",
-            request.kwargs,
-            size,
+        recorded = _Recorded(
+            recorder=self,
+            session=pending.session_id,
+            op=request.op,
+            received_at=time.time(),
+            obs=obs,
+            instruction=request.instruction or "",
+            options=request.kwargs,
+            size=size,
         )
+        pending.observer_data[self] = recorded
         self._copier.put(partial(self._copy, recorded))
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
@@ -265,11 +293,11 @@ class SessionRecorder(Observer):
 
     def close(self) -> None:
         """Write the waiting frames, and complete all episodes, if the disk is fast enough."""
-        each_half_second.remove(self._look)
-        until = time.monotonic() + _CLOSING_S
+        each_half_second.remove(self._compare_sessions)
+        deadline = time.monotonic() + _CLOSING_S
         self._copier.close(_CLOSING_S)
         self._worker.put(partial(self._write, self._writer.close))
-        self._worker.close(max(0.0, until - time.monotonic()))
+        self._worker.close(max(0.0, deadline - time.monotonic()))
 
     def count_held(self, size: int) -> None:
         """Add `size` bytes to the size of the waiting requests."""
@@ -277,6 +305,7 @@ class SessionRecorder(Observer):
             self._held += size
 
     def _hold(self, size: int) -> bool:
+        """Count a waiting request; return False if it exceeds the memory."""
         with self._lock:
             if self._held + size > self._held_bytes:
                 return False
@@ -292,8 +321,11 @@ class SessionRecorder(Observer):
                 info = dict(obs.info)
                 captured = info.pop(CAPTURED, None)
                 recorded.info = to_text(info) if info else ""
-                captured_at = float(captured) if isinstance(captured, (int, float)) else recorded.at
+                captured_at = recorded.received_at
+                if isinstance(captured, (int, float)):
+                    captured_at = float(captured)
                 recorded.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
+
             texts = len(recorded.options) + len(recorded.info)
             recorded.size += texts
             self.count_held(texts)
@@ -302,13 +334,15 @@ class SessionRecorder(Observer):
                 "recording: an act of session %s is left out: %s", recorded.session, error
             )
             self.dropped += 1
-            recorded.obs, recorded.options = None, ""
+            recorded.obs = None
+            recorded.options = ""
 
     def _write_later(self, write: Callable[[], None]) -> None:
-        """Write after all earlier requests."""
+        """Call a function on the writing thread, after all earlier requests."""
         self._copier.put(lambda: self._worker.put(partial(self._write, write)))
 
     def _write(self, write: Callable[[], None]) -> None:
+        """Call a function that writes; end the recording if the disk or the folder is full."""
         if self.ended is not None:
             return
         try:
@@ -320,24 +354,26 @@ class SessionRecorder(Observer):
 
     def _handle(self, recorded: _Recorded, reply: Reply) -> None:
         """Begin, continue or end the episode of a session."""
-        session, op = recorded.session, recorded.op
+        session = recorded.session
+        op = recorded.op
 
         try:
             if op == "reset":
-                self._first[session] = reply.step if random.random() < self._share else None
-                if self._first[session] is None:
+                is_drawn = random.random() < self._share
+                self._first_steps[session] = reply.step if is_drawn else None
+                if self._first_steps[session] is None:
                     self._writer.end(session)
                 else:
                     weights = to_text(reply.identity) if reply.identity else ""
                     self._writer.begin(session, recorded.instruction, recorded.options, weights)
             elif op == "close":
-                self._first.pop(session, None)
+                self._first_steps.pop(session, None)
                 self._writer.end(session)
-            elif recorded.obs is not None and self._records(session):
+            elif recorded.obs is not None and self._is_recorded(session):
                 if session in self._writer:
-                    first = self._first[session] or 0
-                    self._writer.add(session, _frame(recorded, recorded.obs, reply, first))
-                else:  # too many sessions at once
+                    first_step = self._first_steps[session] or 0
+                    self._writer.add(session, _frame(recorded, recorded.obs, reply, first_step))
+                else:  # too many sessions are recorded
                     self.dropped += 1
 
         except (OSError, RecordingEnded):
@@ -346,33 +382,33 @@ class SessionRecorder(Observer):
             self.dropped += 1
         except Exception as error:  # noqa: BLE001 - affects one session's episode
             logger.warning("recording: the episode of session %s is lost: %s", session, error)
-            self._first[session] = None
+            self._first_steps[session] = None
             self._writer.drop(session)
 
-    def _records(self, session: str) -> bool:
-        """Return whether the session is recorded; for one from another replica this is drawn
-        here.
+    def _is_recorded(self, session: str) -> bool:
+        """Return whether the session is recorded; for a session from another replica this is
+        drawn here.
         """
-        if session not in self._first:
-            self._first[session] = None
+        if session not in self._first_steps:
+            self._first_steps[session] = None
             if random.random() < self._share:
                 current = self._sessions.get(session)
-                self._first[session] = current.first
+                self._first_steps[session] = current.first
                 self._writer.begin(session, current.instruction)
-        return self._first[session] is not None
+        return self._first_steps[session] is not None
 
-    def _look(self) -> None:
-        """Look for sessions that have ended; called twice a second."""
-        if not self._looking:
-            self._looking = True
+    def _compare_sessions(self) -> None:
+        """Schedule the search for sessions that have ended; called twice a second."""
+        if not self._is_comparing:
+            self._is_comparing = True
             self._write_later(partial(self._end_others, frozenset(self._sessions.ids())))
 
     def _end_others(self, current: frozenset[str]) -> None:
-        """End the episodes of ended sessions; a new session may be missing once."""
-        self._looking = False
-        missing = self._first.keys() - current
+        """End the episodes of sessions that have ended; a new session may be missing once."""
+        self._is_comparing = False
+        missing = self._first_steps.keys() - current
         for session in missing & self._missing:
-            del self._first[session]
+            del self._first_steps[session]
             self._writer.end(session)
         self._missing = missing
 
@@ -384,6 +420,12 @@ def open_recorder(
     metadata: Callable[[], Mapping[str, Any]],
 ) -> SessionRecorder:
     """Create a recorder of the sessions of a replica.
+
+    Args:
+        sessions: The sessions of the replica.
+        args: The settings of the recording.
+        replica: The name of the replica, which the names of the datasets contain.
+        metadata: Returns the metadata of the policy.
 
     Raises:
         ConfigError: The folder is not writable.
@@ -401,10 +443,11 @@ def open_recorder(
             f"parts.record.folder: {folder} cannot be written to ({error})"
         ) from error
 
-    name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
+    begun_at = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    replica_name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
     writer = EpisodeWriter(
         folder,
-        f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}",
+        f"{begun_at}-{replica_name}",
         args.fps,
         lossless=args.pictures == "exact",
         most_bytes=args.most_gb * 1e9,
@@ -413,16 +456,28 @@ def open_recorder(
     return SessionRecorder(writer, sessions, share=args.share)
 
 
-def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedAct:
+def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first_step: int) -> RecordedAct:
+    """Return the frame of a request and its answer.
+
+    Args:
+        recorded: The request.
+        obs: Its observation.
+        reply: The answer.
+        first_step: The step at the reset of the session.
+    """
     act = reply.act
     if act is None:
         raise PolicyFailed("the answer has no action")
 
     info = {key: value for key, value in act.info.items() if key != "timing"}
     version = info.get(POLICY) or {}
+    times_ms = {}
+    for name in (*STAGES, "total"):
+        times_ms[f"{name}_ms"] = float(reply.timing.get(f"{name}_ms", 0.0))
+
     columns: dict[str, Any] = {
-        "received_at": recorded.at,
-        **{f"{name}_ms": float(reply.timing.get(f"{name}_ms", 0.0)) for name in (*STAGES, "total")},
+        "received_at": recorded.received_at,
+        **times_ms,
         "batch_size": int(reply.timing.get("batch_size", 1)),
         "policy_version": int(version.get("version", NO_VERSION)),
         "policy_done": bool(act.done),
@@ -430,7 +485,11 @@ def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedA
         "answer": to_text(info) if info else "",
     }
     return RecordedAct(
-        obs, act.rows(), float(obs.info[CAPTURED]), (reply.step or 0) - first - 1, columns
+        obs=obs,
+        chunk=act.rows(),
+        captured_at=float(obs.info[CAPTURED]),
+        tick=(reply.step or 0) - first_step - 1,
+        columns=columns,
     )
 
 

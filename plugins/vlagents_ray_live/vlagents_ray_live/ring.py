@@ -1,10 +1,11 @@
 """The last seconds of each session, which a button of the live page saves as an episode of a
 LeRobotDataset.
 
-A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files:
-those of clients unchanged, others encoded with at most 4 % of a core, by omitting frames. All
-sessions together hold at most `memory_mb`; beyond that the oldest frames are dropped. One session
-is saved at a time, and one frame of it decoded at a time, until the folder holds `most_gb`.
+A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files.
+Files of clients are kept unchanged; other pictures are encoded with at most 4 % of a core, by
+omitting frames. The frames of all sessions need at most `memory_mb`; beyond that the oldest frames
+are dropped. One session is saved at a time, and one of its frames decoded at a time, until the size
+of the folder is `most_gb`.
 """
 
 from __future__ import annotations
@@ -41,17 +42,17 @@ class LiveConfig(PartConfig):
     folder: AbsolutePath | None = Field(
         default=None,
         description="folder of the datasets, on each replica's own node or shared; each replica "
-        "writes its own below "
-        "it. Unset: nothing is kept",
+        "writes its own datasets in it. If it is not set, nothing is kept",
     )
     ring_s: float = Field(
-        default=30.0, gt=0, le=600, description="how much of each session is held, s"
+        default=30.0, gt=0, le=600, description="time of each session that is kept, s"
     )
     memory_mb: float = Field(
         default=256.0,
         gt=0,
         le=1_000_000,
-        description="memory that all sessions of a replica take at most, MB; the oldest goes first",
+        description="most memory for the sessions of a replica, MB; beyond it, the oldest frames "
+        "are dropped",
     )
     most_gb: float = Field(
         default=50.0,
@@ -62,21 +63,34 @@ class LiveConfig(PartConfig):
 
     @model_validator(mode="after")
     def _with_a_folder(self) -> LiveConfig:
-        if self.folder is None:
-            changed = []
-            for name, field in type(self).model_fields.items():
-                if getattr(self, name) != field.default:
-                    changed.append(name)
-            if changed:
-                raise ValueError(
-                    f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a "
-                    "folder"
-                )
+        """Reject settings that have no effect without a folder."""
+        if self.folder is not None:
+            return self
+
+        changed = []
+        for name, field in type(self).model_fields.items():
+            if getattr(self, name) != field.default:
+                changed.append(name)
+        if changed:
+            raise ValueError(
+                f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a folder"
+            )
         return self
 
 
 class Ring:
-    """The last seconds of the sessions of one replica, from `open` to `close`."""
+    """The last seconds of the sessions of one replica, from `open` to `close`.
+
+    Args:
+        live: The live observer, whose observations are kept.
+        sessions: The sessions of the replica.
+        folder: The folder of the datasets.
+        settings: The settings of the live page.
+        name: The name of the replica, with which the names of the datasets begin.
+
+    Raises:
+        MissingDependency: The extra "record" is not installed.
+    """
 
     def __init__(
         self,
@@ -86,17 +100,13 @@ class Ring:
         settings: LiveConfig,
         name: str,
     ) -> None:
-        """Create an empty buffer.
-
-        Its episodes go to datasets below `folder`, whose names begin with the replica's `name`.
-
-        Raises:
-            MissingDependency: The extra "record" is not installed.
-        """
         for module in ("av", "pyarrow"):
             require(module)
-        self.bytes = 0  # size of the held frames
-        self._live, self._sessions, self._settings = live, sessions, settings
+
+        self.bytes = 0  # the size of the kept frames
+        self._live = live
+        self._sessions = sessions
+        self._settings = settings
         self._writer = EpisodeWriter(
             folder, name, RATE, lossless=False, most_bytes=settings.most_gb * 1e9
         )
@@ -122,10 +132,12 @@ class Ring:
         self._live.forget_others(session_ids)
 
         begun = time.thread_time()
-        longest_without = sorted(session_ids, key=self._newest)
-        for session_id in longest_without:
+        # The session whose last frame is the oldest comes first.
+        for session_id in sorted(session_ids, key=self._last_number):
             frame = self._live.observation(session_id)
-            if frame is None or frame.action is None or frame.number == self._newest(session_id):
+            if frame is None or frame.action is None:
+                continue
+            if frame.number == self._last_number(session_id):
                 continue
             if frame.cameras and time.thread_time() - begun >= ENCODING_SHARE / RATE:
                 continue
@@ -139,10 +151,16 @@ class Ring:
             self._drop(session_ids)
 
     def save(self, session: str) -> str:
-        """Write the session's frames as an episode, and return the path of its dataset.
+        """Write the frames of a session as an episode.
+
+        Args:
+            session: The id of the session.
+
+        Returns:
+            The path of the dataset.
 
         Raises:
-            InvalidInput: No frame of the session is held.
+            InvalidInput: No frame of the session is kept.
             Overloaded: Another session is being saved.
             StorageFailed: The folder is full.
         """
@@ -171,16 +189,17 @@ class Ring:
         except RecordingEnded as error:
             raise StorageFailed(f"parts.live.folder: {error}; make room there") from error
         finally:
-            self._writer.drop(session)  # remains of a failed attempt
+            self._writer.drop(session)  # the remains of a failed attempt
             self._saving.release()
 
-    def _newest(self, session: str) -> int:
+    def _last_number(self, session: str) -> int:
+        """Return the number of the session's last frame; 0 without frames."""
         frames = self._frames.get(session)
         return frames[-1].number if frames else 0
 
     def _drop(self, session_ids: list[str]) -> None:
-        """Drop ended sessions, old frames, and the oldest ones over the memory limit; the caller
-        holds the lock.
+        """Drop the sessions that have ended, frames that are too old, and the oldest frames beyond
+        the limit of memory; the caller holds the lock.
         """
         for session_id in self._frames.keys() - set(session_ids):
             self.bytes -= sum(frame.size for frame in self._frames.pop(session_id))
@@ -191,21 +210,28 @@ class Ring:
                 self.bytes -= frames.popleft().size
 
         while self.bytes > self._settings.memory_mb * 1e6:
-            first = min(
-                (frames for frames in self._frames.values() if frames),
-                key=lambda frames: frames[0].time,
-            )
-            self.bytes -= first.popleft().size
+            not_empty = [frames for frames in self._frames.values() if frames]
+            oldest_frames = min(not_empty, key=lambda frames: frames[0].time)
+            self.bytes -= oldest_frames.popleft().size
 
 
 def _recorded(frame: KeptObservation) -> RecordedAct:
     """Decode the pictures of a frame, and convert it for the writer."""
-    cameras, left = {}, _PIXELS
+    cameras = {}
+    max_pixels = _PIXELS
     for name, file in frame.pictures().items():
-        cameras[name] = decode(file, left)
-        left -= cameras[name].shape[0] * cameras[name].shape[1]
+        image = decode(file, max_pixels)
+        max_pixels -= image.shape[0] * image.shape[1]
+        cameras[name] = image
+
     state = dict(frame.state)
     gripper = float(state.pop(GRIPPER)[0]) if GRIPPER in state else None
     action = np.zeros(0, np.float32) if frame.action is None else frame.action
-    at = time.time() - (time.monotonic() - frame.time)
-    return RecordedAct(Obs(cameras, gripper, state), action[np.newaxis], at, frame.number, {})
+    age_s = time.monotonic() - frame.time
+    return RecordedAct(
+        obs=Obs(cameras, gripper, state),
+        chunk=action[np.newaxis],
+        captured_at=time.time() - age_s,
+        tick=frame.number,
+        columns={},
+    )

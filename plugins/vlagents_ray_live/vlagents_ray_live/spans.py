@@ -17,7 +17,7 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 
-_KEPT = 4096  # maximum number of answers in half a second; the oldest others have no spans
+_KEPT = 4096  # maximum number of answers in half a second; of more, the oldest have no spans
 # The stages in order, after decoding, and the names of their spans.
 _STAGES = {"queue": "queue", "inference": "batch"}
 _OPS = ("act", "reset")  # the requests that have spans
