@@ -31,24 +31,29 @@ from vlagents_ray.errors import (
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
-_SILENT_S = 2.0
+_SILENT_S = 2.0  # after this time without a message, the connection or a topic is checked
 _GET_ROS = (
     "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach "
     "ROS through a rosbridge, `link: ws://arm-pc:9090`"
 )
-# The kernel's time limit for a send, which websockets lacks: a dead link would block the control
-# loop for minutes.
+# The kernel's time limit for a send, 0.2 s, as websockets has none: a dead link would block the
+# control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
-_LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
+_LARGEST = 64 << 20  # largest frame, bytes; a 4K image in base64 has 34 million
 
 
 class Ros2:
-    """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS
-    was not sourced.
+    """A node of ROS 2, which a thread spins.
+
+    Args:
+        node: The name of the node.
+
+    Raises:
+        MissingDependency: rclpy is not installed, or the setup file of ROS was not sourced.
     """
 
     name = "ros2"
-    up = True  # it has no connection; a lost peer is silent
+    up = True  # there is no connection; a lost peer is silent
     connections = 1
 
     def __init__(self, node: str = "vlagents_ray") -> None:
@@ -56,6 +61,7 @@ class Ros2:
             rclpy: Any = require("rclpy")
         except MissingDependency as error:
             raise MissingDependency(f"'rclpy' is not installed; {_GET_ROS}") from error
+
         self._context: Any = rclpy.context.Context()
         self._context.init()
         self._node: Any = rclpy.create_node(node, context=self._context)
@@ -63,21 +69,26 @@ class Ros2:
         self._executor: Any = None
         self._thread: threading.Thread | None = None
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Pass messages of a topic to `take` on the link's thread; call it before `open`.
+    def subscribe(self, topic: str, message_type: str, take: Callable[[Any], None]) -> None:
+        """Pass the messages of a topic to a function, on the link's thread; called before `open`.
 
-        Only the newest message is kept, and a lost one is not sent again; this also matches
+        Only the newest message is kept, and a lost message is not sent again; this also matches
         reliable publishers.
+
+        Args:
+            topic: The topic.
+            message_type: The type of its messages, such as "sensor_msgs/msg/Image".
+            take: The function.
         """
         qos = require("rclpy.qos")
         newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
-        self._node.create_subscription(message_class(kind), topic, take, newest)
+        self._node.create_subscription(message_class(message_type), topic, take, newest)
 
-    def advertise(self, topic: str, kind: str) -> None:
-        """Announce that messages of this type will be published; call it before `open`."""
-        message_type = message_class(kind)
-        publisher = self._node.create_publisher(message_type, topic, 1)
-        self._publishers[topic] = publisher, message_type
+    def advertise(self, topic: str, message_type: str) -> None:
+        """Announce that messages of a type will be published on a topic; called before `open`."""
+        cls = message_class(message_type)
+        publisher = self._node.create_publisher(cls, topic, 1)
+        self._publishers[topic] = publisher, cls
 
     def open(self) -> None:
         """Begin to receive messages."""
@@ -87,9 +98,9 @@ class Ros2:
         self._thread.start()
 
     def publish(self, topic: str, message: Mapping[str, Any]) -> bool:
-        """Publish a message; returns True."""
-        publisher, message_type = self._publishers[topic]
-        publisher.publish(filled(message_type(), message))
+        """Publish a message with these fields; return True, as there is no connection to lose."""
+        publisher, cls = self._publishers[topic]
+        publisher.publish(filled(cls(), message))
         return True
 
     def close(self) -> None:
@@ -100,80 +111,105 @@ class Ros2:
         self._node.destroy_node()
 
     def _spin(self) -> None:
+        """Receive messages until the node ends; runs on its own thread."""
         with contextlib.suppress(require("rclpy.executors").ExternalShutdownException):
             self._executor.spin()
 
 
-def message_class(kind: str) -> type[Any]:
-    """Return the class of a message type such as "sensor_msgs/msg/Image"; raises `ConfigError`
-    if it is missing.
+def message_class(message_type: str) -> type[Any]:
+    """Return the class of a type of messages.
+
+    Args:
+        message_type: The type, such as "sensor_msgs/msg/Image".
+
+    Raises:
+        ConfigError: ROS has no such type on this machine.
     """
-    package, _, name = kind.split("/")
+    package, _, name = message_type.split("/")
     try:
-        message_type: type[Any] = getattr(import_module(f"{package}.msg"), name)
+        cls: type[Any] = getattr(import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"{kind}: ROS has no such message here ({error}); install the package {package} of "
-            "this ROS"
+            f"{message_type}: ROS has no such message here ({error}); install the package "
+            f"{package} of this ROS"
         ) from error
-    return message_type
+    return cls
 
 
 def filled(instance: Any, message: Mapping[str, Any]) -> Any:
-    """Set fields of a message and return it; other fields keep their values.
+    """Set fields of a message, and return it; other fields keep their values.
 
-    Lists of mappings are lists of the messages that the type of the field names.
+    Args:
+        instance: The message, an object of rclpy.
+        message: The values of its fields. A list of mappings becomes a list of the messages that
+            the type of the field names.
     """
     for name, value in message.items():
         if isinstance(value, Mapping):
             filled(getattr(instance, name), value)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            # The type reads as "sequence<trajectory_msgs/JointTrajectoryPoint>".
-            kind = instance.get_fields_and_field_types()[name].partition("<")[2].removesuffix(">")
-            package, type_name = kind.partition(",")[0].split("/")
-            item_type = message_class(f"{package}/msg/{type_name}")
-            setattr(instance, name, [filled(item_type(), item) for item in value])
+            # The type is written as "sequence<trajectory_msgs/JointTrajectoryPoint>".
+            field_type = instance.get_fields_and_field_types()[name]
+            item_type = field_type.partition("<")[2].removesuffix(">").partition(",")[0]
+            package, type_name = item_type.split("/")
+            item_class = message_class(f"{package}/msg/{type_name}")
+            setattr(instance, name, [filled(item_class(), item) for item in value])
         else:
             setattr(instance, name, value)
     return instance
 
 
 class Rosbridge:
-    """A link to ROS that needs no ROS here, by the URL of a server, "ws://arm-pc:9090".
+    """A link through a rosbridge, which needs no ROS on this machine.
 
-    A thread receives, and connects again if the connection is lost.
+    A thread receives messages, and connects again if the connection is lost.
+
+    Args:
+        url: The URL of the server, such as "ws://arm-pc:9090".
     """
 
     name = "rosbridge"
 
     def __init__(self, url: str) -> None:
         self._url = url
+        # By subscribed topic: the function for its messages, its type, and the time of its last
+        # message or subscription, s of `time.monotonic`.
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
-        # By topic: the time of its last message or subscription, s of `time.monotonic`.
-        self._heard: dict[str, float] = {}
-        self._outlets: dict[str, str] = {}
+        self._heard_at: dict[str, float] = {}
+        self._published_types: dict[str, str] = {}  # by topic
+
         self._socket: ClientConnection | None = None
         self._open = contextlib.ExitStack()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self.connections = 0  # since `open`
+        self.connections = 0  # the number of connections since `open`
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Pass messages of a topic to `take` on the link's thread; call it before `open`.
+    def subscribe(self, topic: str, message_type: str, take: Callable[[Any], None]) -> None:
+        """Pass the messages of a topic to a function, on the link's thread; called before `open`.
 
-        While the topic is silent, it is subscribed to again: the server sets the quality of service
-        by the present publishers, and would miss a later one with best effort.
+        While the topic is silent, it is subscribed to again: the server chooses the quality of
+        service from the publishers at that time, and would miss a later publisher with best effort.
+
+        Args:
+            topic: The topic.
+            message_type: The type of its messages, such as "sensor_msgs/msg/Image".
+            take: The function.
         """
-        self._take[topic], self._types[topic] = take, kind
-        self._heard[topic] = 0.0
+        self._take[topic] = take
+        self._types[topic] = message_type
+        self._heard_at[topic] = 0.0
 
-    def advertise(self, topic: str, kind: str) -> None:
-        """Announce that messages of this type will be published; call it before `open`."""
-        self._outlets[topic] = kind
+    def advertise(self, topic: str, message_type: str) -> None:
+        """Announce that messages of a type will be published on a topic; called before `open`."""
+        self._published_types[topic] = message_type
 
     def open(self) -> None:
-        """Connect; raises `ConnectionLost` if the server cannot be reached."""
+        """Connect, and begin to receive messages.
+
+        Raises:
+            ConnectionLost: The server cannot be reached.
+        """
         self._connect()
         self._thread = threading.Thread(
             target=self._run, name="vlagents-ray-rosbridge", daemon=True
@@ -182,7 +218,7 @@ class Rosbridge:
 
     @property
     def up(self) -> bool:
-        """Whether the connection is up, as far as is known here."""
+        """Whether the connection is up, as far as this machine knows."""
         return self._socket is not None
 
     def publish(self, topic: str, message: dict[str, Any]) -> bool:
@@ -190,10 +226,9 @@ class Rosbridge:
         socket = self._socket
         if socket is None:
             return False
+        request = {"op": "publish", "topic": topic, "msg": message}
         try:
-            socket.send(
-                json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False)
-            )
+            socket.send(json.dumps(request, allow_nan=False))
         except (WebSocketException, OSError):
             self._lose(socket)
             return False
@@ -211,6 +246,7 @@ class Rosbridge:
         self._open.close()
 
     def _connect(self) -> None:
+        """Connect to the server, and announce and subscribe to the topics."""
         self._open.close()  # the previous connection
         try:
             opening = connect(
@@ -218,10 +254,10 @@ class Rosbridge:
             )
             socket = self._open.enter_context(opening)
             socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
-            for topic, kind in self._outlets.items():
-                socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
+            for topic, message_type in self._published_types.items():
+                socket.send(json.dumps({"op": "advertise", "topic": topic, "type": message_type}))
             for topic in self._types:
-                self._ask_for(topic, socket)
+                self._send_subscription(topic, socket)
         except (WebSocketException, OSError, TimeoutError) as error:
             raise ConnectionLost(
                 f"{self._url}: cannot connect ({error}); does a rosbridge_server run there? "
@@ -231,34 +267,37 @@ class Rosbridge:
         self.connections += 1
 
     def _run(self) -> None:
+        """Receive messages, and connect again if the connection is lost; runs on its own thread."""
         while not self._closing.is_set():
             socket = self._socket
             if socket is None:
                 self._reconnect()
                 continue
+
             try:
                 try:
                     self._receive(socket.recv(_SILENT_S))
                 except TimeoutError:
-                    # Without an answer, the server is gone, as after a power failure.
+                    # Without an answer, the server is lost, for instance after a power failure.
                     if not socket.ping().wait(_SILENT_S):
                         self._lose(socket)
                         continue
 
-                for topic, heard_s in self._heard.items():
-                    if time.monotonic() - heard_s > _SILENT_S:
+                for topic, heard_at in self._heard_at.items():
+                    if time.monotonic() - heard_at > _SILENT_S:
                         socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
-                        self._ask_for(topic, socket)
+                        self._send_subscription(topic, socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
-    def _ask_for(self, topic: str, socket: ClientConnection) -> None:
-        # Only the newest message: it replaces unsent ones on a slow link.
+    def _send_subscription(self, topic: str, socket: ClientConnection) -> None:
+        """Subscribe to a topic. On a slow link, the newest message replaces unsent ones."""
         request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "queue_length": 1}
         socket.send(json.dumps(request))
-        self._heard[topic] = time.monotonic()
+        self._heard_at[topic] = time.monotonic()
 
     def _reconnect(self) -> None:
+        """Try to connect again once; wait for half a second if that fails."""
         try:
             self._connect()
         except ConnectionLost:
@@ -282,6 +321,7 @@ class Rosbridge:
             socket.socket.shutdown(SHUT_RDWR)
 
     def _receive(self, frame: str | bytes) -> None:
+        """Handle a message of the server."""
         try:
             message = decoded(frame)
         except VLAgentsError as error:
@@ -292,7 +332,7 @@ class Rosbridge:
             topic = str(message.get("topic"))
             take = self._take.get(topic)
             if take is not None:
-                self._heard[topic] = time.monotonic()
+                self._heard_at[topic] = time.monotonic()
                 take(message.get("msg"))
         elif message.get("op") == "status":
             logger.warning("%s: %s: %s", self._url, message.get("level"), message.get("msg"))
@@ -302,7 +342,17 @@ Link = Ros2 | Rosbridge
 
 
 def decoded(frame: str | bytes) -> dict[str, Any]:
-    """Decode a message of the protocol, which is JSON; raises `MalformedMessage`."""
+    """Decode a message of the protocol.
+
+    Args:
+        frame: The message, JSON.
+
+    Returns:
+        The message, an object with the key "op".
+
+    Raises:
+        MalformedMessage: The message is not such an object.
+    """
     try:
         message = json.loads(frame)
     except (ValueError, RecursionError) as error:

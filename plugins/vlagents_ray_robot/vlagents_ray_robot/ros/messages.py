@@ -1,8 +1,8 @@
-"""ROS 2 messages to numbers and images, and actions to messages; nothing here needs ROS.
+"""Converts messages of ROS 2 to numbers and images, and actions to messages; ROS is not needed.
 
 A received message is a mapping, as from rosbridge, or an object with the same fields, as from
-rclpy. A message to send is a mapping of its fields. The fields and their units are those of ROS 2's
-packages `sensor_msgs`, `geometry_msgs`, `std_msgs` and `trajectory_msgs`.
+rclpy. A message to send is a mapping of its fields. ROS 2's packages `sensor_msgs`,
+`geometry_msgs`, `std_msgs` and `trajectory_msgs` define the fields and their units.
 """
 
 from __future__ import annotations
@@ -27,14 +27,20 @@ from vlagents_ray.images.jpeg_png import MAX_PIXELS, decode
 
 Values = Literal["position", "velocity", "effort"]
 PoseRotation = Literal["quat_xyzw", "quat_wxyz", "euler_xyz", "none"]
-# Bytes of a pixel by encoding; see `sensor_msgs/image_encodings.hpp`.
+# By encoding: the number of bytes of a pixel; see `sensor_msgs/image_encodings.hpp`.
 _PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2}
 TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.z")
 
 
 def field(message: Any, path: str) -> Any:
-    """Return a field of a message, such as "header.stamp.sec"; raises `MalformedMessage` if it
-    is missing.
+    """Return a field of a message.
+
+    Args:
+        message: The message.
+        path: The field, such as "header.stamp.sec".
+
+    Raises:
+        MalformedMessage: The field is missing.
     """
     for name in path.split("."):
         try:
@@ -52,12 +58,13 @@ def stamp(message: Any) -> float | None:
     empty one.
     """
     try:
-        sec, nanosec = field(message, "header.stamp.sec"), field(message, "header.stamp.nanosec")
+        sec = field(message, "header.stamp.sec")
+        nanosec = field(message, "header.stamp.nanosec")
     except MalformedMessage:
         return None
-    return (
-        _whole("header.stamp.sec", sec) + _whole("header.stamp.nanosec", nanosec) * 1e-9
-    ) or None
+    seconds = _whole("header.stamp.sec", sec)
+    nanoseconds = _whole("header.stamp.nanosec", nanosec)
+    return (seconds + nanoseconds * 1e-9) or None
 
 
 def image(message: Any) -> np.ndarray:
@@ -66,9 +73,9 @@ def image(message: Any) -> np.ndarray:
     Rows may be longer than their pixels (`step`). Of "mono16" the upper 8 bits are used.
 
     Raises:
-        InvalidObservation: The encoding is not one of colours or greys.
+        InvalidObservation: The encoding is neither of colours nor of greys.
         MalformedMessage: The size of the data differs from the fields.
-        MessageTooLarge: It has more pixels than 4096 x 4096.
+        MessageTooLarge: The image has more than 4096 x 4096 pixels.
     """
     encoding = field(message, "encoding")
     if not isinstance(encoding, str) or encoding not in _PIXEL:
@@ -88,14 +95,14 @@ def image(message: Any) -> np.ndarray:
     if height * width > MAX_PIXELS:
         raise MessageTooLarge(f"image: got {height} x {width} pixels, want at most {MAX_PIXELS}")
 
-    used = width * _PIXEL[encoding]
-    if step < used or len(data) < step * height:
+    row_bytes = width * _PIXEL[encoding]
+    if step < row_bytes or len(data) < step * height:
         raise MalformedMessage(
-            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more "
-            f"for {width} pixels of {encoding}"
+            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {row_bytes} or "
+            f"more for {width} pixels of {encoding}"
         )
 
-    rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :used]
+    rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :row_bytes]
     pixels = rows.reshape(height, width, _PIXEL[encoding])
     if encoding == "mono16":
         pixels = pixels[..., :1] if field(message, "is_bigendian") else pixels[..., 1:]
@@ -107,8 +114,8 @@ def image(message: Any) -> np.ndarray:
 
 
 def compressed_image(message: Any) -> np.ndarray:
-    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file, as
-    `decode` does.
+    """Return the pixels of a `sensor_msgs/msg/CompressedImage` with a JPEG or PNG file, (H, W, 3)
+    uint8 RGB; raises errors as `decode` does.
     """
     return decode(_bytes("image", field(message, "data")))
 
@@ -151,20 +158,27 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
 
 
 def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
-    """Return position (m) and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`, (7,), (6,)
-    or (3,) float32.
+    """Return position and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`.
 
-    `rotation` is its form after the position: "quat_xyzw" or "quat_wxyz" (of unit length),
-    "euler_xyz" (roll, pitch and yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if
-    a number is not finite, or the quaternion is zero.
+    Args:
+        message: The message.
+        rotation: The form of the rotation: "quat_xyzw" or "quat_wxyz" (of unit length), "euler_xyz"
+            (roll, pitch and yaw about fixed axes, rad), or "none".
+
+    Returns:
+        The position in m and the rotation after it, (7,), (6,) or (3,) float32.
+
+    Raises:
+        MalformedMessage: A number is not finite, or the quaternion is zero.
     """
-    stamped = "pose" in message if isinstance(message, Mapping) else hasattr(message, "pose")
-    at = field(message, "pose") if stamped else message
-    position = _numbers("pose", [field(at, f"position.{axis}") for axis in "xyz"])
+    is_stamped = "pose" in message if isinstance(message, Mapping) else hasattr(message, "pose")
+    inner_pose = field(message, "pose") if is_stamped else message
+    position = _numbers("pose", [field(inner_pose, f"position.{axis}") for axis in "xyz"])
     if rotation == "none":
         return _finite("pose", position)
 
-    quaternion = _numbers("pose", [field(at, f"orientation.{axis}") for axis in "xyzw"])
+    components = [field(inner_pose, f"orientation.{axis}") for axis in "xyzw"]
+    quaternion = _numbers("pose", components)
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
         raise MalformedMessage(
@@ -190,7 +204,9 @@ def numbers(message: Any) -> np.ndarray:
     flat, (D,) float32.
     """
     data = field(message, "data")
-    return _finite("data", _numbers("data", [data] if isinstance(data, (int, float)) else data))
+    if isinstance(data, (int, float)):
+        data = [data]
+    return _finite("data", _numbers("data", data))
 
 
 def float64_multi_array(row: np.ndarray) -> dict[str, Any]:
@@ -208,8 +224,11 @@ def joint_state(
 
 
 def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
-    """Return a `geometry_msgs/msg/Twist` with numbers at these of its fields, m/s and rad/s; the
-    others are 0.
+    """Return a `geometry_msgs/msg/Twist`.
+
+    Args:
+        row: The numbers, (D,), m/s and rad/s.
+        fields: The fields of the numbers, such as "linear.x"; all others are 0.
     """
     message: dict[str, Any] = {
         "linear": dict.fromkeys("xyz", 0.0),
@@ -222,10 +241,13 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
 
 
 def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
-    """Return a `trajectory_msgs/msg/JointTrajectory` of one point: positions, (D,) in the order of
-    `names`.
+    """Return a `trajectory_msgs/msg/JointTrajectory` of one point.
 
-    The arm should reach it `reach_s` seconds after the controller receives the message.
+    Args:
+        row: The positions of the point, (D,).
+        names: The joints of the positions.
+        reach_s: The time in which the arm should reach the point, after the controller receives
+            the message, s.
     """
     nanoseconds = round(reach_s * 1e9)
     point = {
@@ -238,6 +260,7 @@ def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> d
 
 
 def _whole(name: str, value: Any) -> int:
+    """Return the whole number in a field."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise MalformedMessage(
             f"{name}: got {value!r}, want a whole number; is the topic's type right?"
@@ -246,8 +269,8 @@ def _whole(name: str, value: Any) -> int:
 
 
 def _bytes(name: str, value: Any) -> bytes | memoryview:
-    """Return the bytes of a uint8 array: an array from rclpy; base64, or from some servers a
-    list, from rosbridge.
+    """Return the bytes of a field of type uint8[]: an array from rclpy, base64 from a rosbridge,
+    or a list from some servers.
     """
     try:
         if isinstance(value, str):
@@ -260,6 +283,7 @@ def _bytes(name: str, value: Any) -> bytes | memoryview:
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:
+    """Return the numbers in a field, (D,) float64."""
     try:
         array = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
     except (TypeError, ValueError) as error:
@@ -270,8 +294,8 @@ def _numbers(name: str, values: Any) -> np.ndarray:
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
-    """Return finite numbers as float32; rosbridge writes others as null, which numpy reads as
-    NaN.
+    """Return numbers as float32; raise `MalformedMessage` if one is not finite. A rosbridge writes
+    such numbers as null, which numpy reads as NaN.
     """
     with np.errstate(over="ignore"):
         numbers = values.astype(np.float32)

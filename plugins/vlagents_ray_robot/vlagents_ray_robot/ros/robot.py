@@ -1,6 +1,4 @@
-"""A robot behind topics of ROS 2, the parts of its observation and its action, and the file that
-names the topics.
-"""
+"""A robot behind topics of ROS 2, and the file that names the topics of observation and action."""
 
 from __future__ import annotations
 
@@ -30,55 +28,56 @@ from vlagents_ray_robot.ros.messages import TWIST, PoseRotation, Values
 
 logger = logging.getLogger(__name__)
 ROS2 = "ros2"
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-JOINT_STATE, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
+# Types of messages.
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+BOOL = "std_msgs/msg/Bool"
 POSES = ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped")
-NUMBERS = tuple(
-    f"std_msgs/msg/{name}"
-    for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32")
-)
-ARRAY, TWIST_TYPE, TRAJECTORY = (
-    NUMBERS[0],
-    "geometry_msgs/msg/Twist",
-    "trajectory_msgs/msg/JointTrajectory",
-)
-ZEROS, NOTHING = "zeros", "nothing"
-_AGES = ("max_age_s", "silent_s")
+ARRAY = "std_msgs/msg/Float64MultiArray"
+NUMBERS = (ARRAY, "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64", "std_msgs/msg/Float32")
+TWIST_TYPE = "geometry_msgs/msg/Twist"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+# Values of `stop` that are no part of the state.
+ZEROS = "zeros"
+NOTHING = "nothing"
+_AGE_KEYS = ("max_age_s", "silent_s")
 
 
 @dataclass(frozen=True)
 class InputTopic:
-    """A topic that a part of the observation is read from."""
+    """A topic from which a camera, a part of the state or the gripper is read."""
 
     topic: str
-    type: str = ""  # such as "sensor_msgs/msg/Image"; "" is the default of its place in the file
+    type: str = ""  # such as "sensor_msgs/msg/Image"; the file's section has a default
     names: tuple[str, ...] = ()  # joints of a JointState, in the policy's order; all if empty
-    values: Values = "position"  # field of a JointState
-    rotation: PoseRotation = "quat_xyzw"  # form of the rotation of a pose
-    open: float | None = None  # of the gripper: the number at which it is open
-    closed: float | None = None
-    max_age_s: float = 0.3  # without a newer message the robot holds still
-    silent_s: float = 1.0  # without a newer message the robot is stopped
+    values: Values = "position"  # the field of a JointState
+    rotation: PoseRotation = "quat_xyzw"  # the form of the rotation of a pose
+    open: float | None = None  # the number of the topic at which the gripper is open
+    closed: float | None = None  # the number of the topic at which it is closed
+    max_age_s: float = 0.3  # if the newest message is older, the robot holds still
+    silent_s: float = 1.0  # if the newest message is older, the watchdog stops the robot
 
 
 @dataclass(frozen=True)
 class ActionTopic:
-    """A topic that numbers of an action are published on."""
+    """A topic on which numbers of an action are published."""
 
     topic: str
     type: str
-    stop: str = ""  # to stop: "zeros", "nothing", or the part of the state with the measured pose
-    numbers: int | None = None  # count of numbers of a Float64MultiArray
-    names: tuple[str, ...] = ()  # joints of a JointState or JointTrajectory
-    values: Values = "position"  # field of a JointState
-    fields: tuple[str, ...] = TWIST  # of a Twist
-    reach_s: float = 0.1  # time in which the arm should reach the point of a JointTrajectory
-    # Which of its numbers; None: the joints of the gripper's topic.
+    # What a stop publishes: "zeros", "nothing", or the part of the state with the measured pose.
+    stop: str = ""
+    numbers: int | None = None  # the number of numbers of a Float64MultiArray
+    names: tuple[str, ...] = ()  # the joints of a JointState or JointTrajectory
+    values: Values = "position"  # the field of a JointState
+    fields: tuple[str, ...] = TWIST  # the fields of a Twist
+    reach_s: float = 0.1  # the time in which the arm should reach the point of a JointTrajectory
+    # The indices of the grippers among its numbers; None for the joints of the gripper's topic.
     grippers: tuple[int, ...] | None = None
 
     @property
     def dim(self) -> int:
-        """The count of an action's numbers that it takes."""
+        """The number of an action's numbers that are published on this topic."""
         if self.type == ARRAY:
             return self.numbers or 0
         return len(self.fields) if self.type == TWIST_TYPE else len(self.names)
@@ -86,8 +85,8 @@ class ActionTopic:
 
 @dataclass(frozen=True)
 class HeartbeatTopic:
-    """A `std_msgs/msg/Bool`, published while the control loop runs: whether it may move the
-    robot.
+    """A topic of type `std_msgs/msg/Bool` that tells, while the control loop runs, whether it may
+    move the robot.
     """
 
     topic: str
@@ -98,146 +97,183 @@ class HeartbeatTopic:
 class RosSettings:
     """The settings of the file; see docs/ros.md."""
 
-    link: str  # "ros2", or the address of a rosbridge: "ws://arm-pc:9090"
-    actions: tuple[ActionTopic, ...]  # together they take the numbers of an action, in this order
+    link: str  # "ros2", or the address of a rosbridge, such as "ws://arm-pc:9090"
+    actions: tuple[ActionTopic, ...]  # the numbers of an action are published on them in this order
     cameras: Mapping[str, InputTopic] = field(default_factory=dict)
     state: Mapping[str, InputTopic] = field(default_factory=dict)
     gripper: InputTopic | None = None
     heartbeat: HeartbeatTopic | None = None
-    # Whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
+    # The age of a message counts from the time stamp in its header ("stamp") or from its arrival
+    # ("arrival").
     clock: str = "stamp"
-    ready_s: float = 10.0  # time limit for the first message of each topic
+    ready_s: float = 10.0  # the time limit for the first message of each topic
 
     @property
     def sensors(self) -> list[InputTopic]:
         """The topics whose readings must be recent."""
-        return [
-            *self.cameras.values(),
-            *self.state.values(),
-            *([self.gripper] if self.gripper else []),
-        ]
+        topics = [*self.cameras.values(), *self.state.values()]
+        if self.gripper is not None:
+            topics.append(self.gripper)
+        return topics
 
     @property
     def dim(self) -> int:
-        """The count of numbers of an action."""
+        """The number of numbers of an action."""
         return sum(command.dim for command in self.actions)
 
     @property
     def delta(self) -> bool | None:
-        """Whether actions are relative: False if the measured pose stops the robot, as their
-        numbers are targets then.
+        """Whether actions are relative: False if the measured pose stops the robot, as the numbers
+        of an action are targets then.
 
-        Else it is None: zeros stop velocities as well as deltas, and a topic without a stop states
-        nothing.
+        It is None otherwise: zeros stop velocities as well as deltas, and a topic without a stop
+        does not show the meaning of its numbers.
         """
         stops = {command.stop for command in self.actions} - {NOTHING}
         return False if stops and stops <= self.state.keys() else None
 
     def gripper_columns(self, command: ActionTopic) -> list[int]:
-        """Return which numbers of a topic are grippers; joints are compared by name with those
-        of `gripper`.
+        """Return the indices of the grippers among the numbers of a topic.
+
+        Without a setting, these are the joints that the topic of the gripper names.
         """
         if command.grippers is not None:
             return list(command.grippers)
+
         measured = self.state.get(command.stop)
-        names = command.names or (() if measured is None else measured.names)
+        names = command.names
+        if not names and measured is not None:
+            names = measured.names
         fingers = () if self.gripper is None else self.gripper.names
-        return [number for number, name in enumerate(names) if name in fingers]
+        return [index for index, name in enumerate(names) if name in fingers]
 
 
 def read_settings(file: Path | str) -> RosSettings:
     """Read a YAML file of topics, as docs/ros.md explains it.
+
+    Args:
+        file: The path of the file.
+
+    Returns:
+        The settings.
 
     Raises:
         ConfigError: The file cannot be read, or a setting is unknown, missing or wrong.
         MissingDependency: PyYAML is not installed.
     """
     try:
-        stated = load_yaml(
-            Path(file).read_text(encoding="utf-8"), extra="ros", distribution=DISTRIBUTION
-        )
+        text = Path(file).read_text(encoding="utf-8")
+        document = load_yaml(text, extra="ros", distribution=DISTRIBUTION)
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read as a file of ROS topics ({error})") from error
-    return settings_from(stated, str(file))
+    return settings_from(document, str(file))
 
 
-def settings_from(stated: Any, where: str) -> RosSettings:
-    """Check the decoded document of a file with the name `where`, and return it; raises
-    `ConfigError`.
+def settings_from(document: Any, where: str) -> RosSettings:
+    """Check the content of a file of topics.
+
+    Args:
+        document: The decoded content.
+        where: The name of the file, for errors.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ConfigError: A setting is unknown, missing or wrong.
     """
-    top = dict(_mapping(stated, where))
-    usual = {key: top.pop(key) for key in _AGES if key in top}  # of all readings
-    for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
-        named = _mapping(top.get(part) or {}, f"{where}: {part}")
-        top[part] = {
-            str(name): _reading(one, f"{where}: {part}.{name}", kind, usual)
-            for name, one in named.items()
-        }
+    top = dict(_mapping(document, where))
+    # Ages at the top of the file are defaults for all sensors.
+    default_ages = {key: top.pop(key) for key in _AGE_KEYS if key in top}
+
+    for section, default_type in (("cameras", IMAGE), ("state", JOINT_STATE)):
+        topics = {}
+        for name, node in _mapping(top.get(section) or {}, f"{where}: {section}").items():
+            setting = f"{where}: {section}.{name}"
+            topics[str(name)] = _input_topic(node, setting, default_type, default_ages)
+        top[section] = topics
+
     if top.get("gripper") is not None:
-        top["gripper"] = _reading(top["gripper"], f"{where}: gripper", JOINT_STATE, usual)
+        setting = f"{where}: gripper"
+        top["gripper"] = _input_topic(top["gripper"], setting, JOINT_STATE, default_ages)
     if top.get("heartbeat") is not None:
-        top["heartbeat"] = _made(HeartbeatTopic, top["heartbeat"], f"{where}: heartbeat")
-    actions = top.get("actions") or []
-    if not isinstance(actions, list):
-        raise ConfigError(f"{where}: actions: got {type(actions).__name__}, want a list of topics")
-    top["actions"] = tuple(
-        _made(ActionTopic, one, f"{where}: actions[{i}]") for i, one in enumerate(actions)
-    )
-    settings: RosSettings = _made(RosSettings, top, where)
-    _check(settings, where)
+        top["heartbeat"] = _settings(HeartbeatTopic, top["heartbeat"], f"{where}: heartbeat")
+
+    nodes = top.get("actions") or []
+    if not isinstance(nodes, list):
+        raise ConfigError(f"{where}: actions: got {type(nodes).__name__}, want a list of topics")
+    actions = []
+    for i, node in enumerate(nodes):
+        actions.append(_settings(ActionTopic, node, f"{where}: actions[{i}]"))
+    top["actions"] = tuple(actions)
+
+    settings: RosSettings = _settings(RosSettings, top, where)
+    _check_sensors(settings, where)
+    _check_actions(settings, where)
+    _check_link(settings, where)
     return settings
 
 
-def _check(settings: RosSettings, where: str) -> None:
-    readings = [
-        *((f"cameras.{name}", one, (IMAGE, COMPRESSED)) for name, one in settings.cameras.items()),
-        *(
-            (f"state.{name}", one, (JOINT_STATE, *POSES, *NUMBERS))
-            for name, one in settings.state.items()
-        ),
-        *(
-            [("gripper", gripper, (JOINT_STATE, *NUMBERS))]
-            if (gripper := settings.gripper) is not None
-            else []
-        ),
-    ]
-    for name, reading, types in readings:
-        _one_of(f"{where}: {name}: type", reading.type, types)
-        _one_of(f"{where}: {name}: values", reading.values, get_args(Values))
-        _one_of(f"{where}: {name}: rotation", reading.rotation, get_args(PoseRotation))
-    types_of: dict[str, str] = {}
-    for name, reading, _ in readings:
-        if types_of.setdefault(reading.topic, reading.type) != reading.type:
+def _named_sensors(settings: RosSettings) -> list[tuple[str, InputTopic, tuple[str, ...]]]:
+    """Return the name of each sensor in the file, its topic, and the types that it may have."""
+    sensors: list[tuple[str, InputTopic, tuple[str, ...]]] = []
+    for name, topic in settings.cameras.items():
+        sensors.append((f"cameras.{name}", topic, (IMAGE, COMPRESSED)))
+    for name, topic in settings.state.items():
+        sensors.append((f"state.{name}", topic, (JOINT_STATE, *POSES, *NUMBERS)))
+    if settings.gripper is not None:
+        sensors.append(("gripper", settings.gripper, (JOINT_STATE, *NUMBERS)))
+    return sensors
+
+
+def _check_sensors(settings: RosSettings, where: str) -> None:
+    """Raise `ConfigError` if a setting of a sensor is wrong."""
+    sensors = _named_sensors(settings)
+    for name, topic, types in sensors:
+        _require_one_of(f"{where}: {name}: type", topic.type, types)
+        _require_one_of(f"{where}: {name}: values", topic.values, get_args(Values))
+        _require_one_of(f"{where}: {name}: rotation", topic.rotation, get_args(PoseRotation))
+
+    type_of_topic: dict[str, str] = {}
+    for name, topic, _ in sensors:
+        if type_of_topic.setdefault(topic.topic, topic.type) != topic.type:
             raise ConfigError(
-                f"{where}: {name}: got {reading.topic} as {reading.type}, and elsewhere as "
-                f"{types_of[reading.topic]}"
+                f"{where}: {name}: got {topic.topic} as {topic.type}, and elsewhere as "
+                f"{type_of_topic[topic.topic]}"
             )
 
     if not settings.sensors:
         raise ConfigError(
             f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped"
         )
-    if not settings.actions:
-        raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
-    if gripper is not None and (
-        gripper.open is None or gripper.closed is None or gripper.open == gripper.closed
-    ):
+    for name, topic, _ in sensors:
+        _require_above_zero(f"{where}: {name}: max_age_s", topic.max_age_s)
+        _require_above_zero(f"{where}: {name}: silent_s", topic.silent_s)
+
+    gripper = settings.gripper
+    if gripper is None:
+        return
+    if gripper.open is None or gripper.closed is None or gripper.open == gripper.closed:
         raise ConfigError(
             f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives "
             "them"
         )
+
+
+def _check_actions(settings: RosSettings, where: str) -> None:
+    """Raise `ConfigError` if a setting of a topic for actions is wrong."""
+    if not settings.actions:
+        raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
     for i, command in enumerate(settings.actions):
         _check_command(command, settings, f"{where}: actions[{i}]")
 
-    limits = [
-        ("ready_s", settings.ready_s),
-        *([("heartbeat: hz", beat.hz)] if (beat := settings.heartbeat) else []),
-    ]
-    limits += [(f"{name}: {key}", getattr(one, key)) for name, one, _ in readings for key in _AGES]
-    for name, limit in limits:
-        if not limit > 0:
-            raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
-    _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
+
+def _check_link(settings: RosSettings, where: str) -> None:
+    """Raise `ConfigError` if a setting of the connection is wrong."""
+    _require_above_zero(f"{where}: ready_s", settings.ready_s)
+    if settings.heartbeat is not None:
+        _require_above_zero(f"{where}: heartbeat: hz", settings.heartbeat.hz)
+    _require_one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
         raise ConfigError(
             f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as "
@@ -246,10 +282,12 @@ def _check(settings: RosSettings, where: str) -> None:
 
 
 def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> None:
-    _one_of(f"{where}: type", command.type, (ARRAY, JOINT_STATE, TWIST_TYPE, TRAJECTORY))
-    _one_of(f"{where}: values", command.values, get_args(Values))
+    """Raise `ConfigError` if a setting of one topic for actions is wrong."""
+    types = (ARRAY, JOINT_STATE, TWIST_TYPE, TRAJECTORY)
+    _require_one_of(f"{where}: type", command.type, types)
+    _require_one_of(f"{where}: values", command.values, get_args(Values))
     for name in command.fields:
-        _one_of(f"{where}: fields", name, TWIST)
+        _require_one_of(f"{where}: fields", name, TWIST)
     if command.dim < 1:
         wants = (
             "numbers, how many it takes" if command.type == ARRAY else "names, those of the joints"
@@ -257,6 +295,7 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         raise ConfigError(f"{where}: got a {command.type} without numbers, want {wants}")
     if command.type == TRAJECTORY and not command.reach_s > 0:
         raise ConfigError(f"{where}: reach_s: got {command.reach_s}, want above 0")
+
     if not command.stop and command.type != TWIST_TYPE:
         raise ConfigError(
             f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers "
@@ -265,9 +304,10 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
             "right"
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
-        _one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
-    for number in command.grippers or ():
-        _one_of(f"{where}: grippers", number, tuple(range(command.dim)))
+        _require_one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
+
+    for index in command.grippers or ():
+        _require_one_of(f"{where}: grippers", index, tuple(range(command.dim)))
     if command.grippers and command.stop == ZEROS and settings.gripper is None:
         raise ConfigError(
             f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no "
@@ -275,15 +315,18 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         )
 
 
-def _reading(stated: Any, where: str, kind: str, usual: Mapping[str, Any]) -> InputTopic:
-    reading: InputTopic = _made(
-        InputTopic, {"type": kind, **usual, **_mapping(stated, where)}, where
-    )
-    return reading
+def _input_topic(
+    node: Any, where: str, default_type: str, default_ages: Mapping[str, Any]
+) -> InputTopic:
+    """Return the settings of a sensor, with the defaults of the file."""
+    values = {"type": default_type, **default_ages, **_mapping(node, where)}
+    topic: InputTopic = _settings(InputTopic, values, where)
+    return topic
 
 
-def _made(kind: type[Any], stated: Any, where: str) -> Any:
-    arguments = dict(_mapping(stated, where))
+def _settings(cls: type[Any], node: Any, where: str) -> Any:
+    """Return an object of a dataclass of settings, from a mapping in the file."""
+    arguments = dict(_mapping(node, where))
     for name in arguments.keys() & {"names", "fields"}:
         value = arguments[name]
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
@@ -298,56 +341,79 @@ def _made(kind: type[Any], stated: Any, where: str) -> Any:
             )
         arguments["grippers"] = tuple(grippers)
 
-    require_arguments(where, kind, arguments)
-    return kind(**arguments)
+    require_arguments(where, cls, arguments)
+    return cls(**arguments)
 
 
-def _mapping(stated: Any, where: str) -> Mapping[str, Any]:
-    if not isinstance(stated, Mapping):
+def _mapping(node: Any, where: str) -> Mapping[str, Any]:
+    """Return a node of the file; raise `ConfigError` if it is not a mapping."""
+    if not isinstance(node, Mapping):
         raise ConfigError(
-            f"{where}: got {type(stated).__name__}, want keys with values; see docs/ros.md"
+            f"{where}: got {type(node).__name__}, want keys with values; see docs/ros.md"
         )
-    return stated
+    return node
 
 
-def _one_of(what: str, got: object, want: tuple[object, ...]) -> None:
-    if got not in want:
-        raise ConfigError(f"{what}: got {got!r}, want one of {list(want)}")
+def _require_one_of(setting: str, value: object, allowed: tuple[object, ...]) -> None:
+    """Raise `ConfigError` if the value of a setting is not allowed."""
+    if value not in allowed:
+        raise ConfigError(f"{setting}: got {value!r}, want one of {list(allowed)}")
+
+
+def _require_above_zero(setting: str, value: float) -> None:
+    """Raise `ConfigError` if the value of a setting is not above 0."""
+    if not value > 0:
+        raise ConfigError(f"{setting}: got {value}, want above 0")
 
 
 class TopicReader:
-    """The newest readable message of a topic, as one part of the observation."""
+    """The newest readable message of a topic, as a value of the observation.
+
+    Args:
+        reading: The settings of the topic.
+        by_stamp: Whether the age of a message counts from the time stamp in its header.
+    """
 
     def __init__(self, reading: InputTopic, by_stamp: bool) -> None:
         self.topic = reading.topic
         self.value: Any = None  # None before the first message
         self.captured_at = 0.0  # s since 1970
-        self.unreadable = 0  # messages
+        self.unreadable = 0  # the number of messages that could not be read
+
         self._reading = reading
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
-        self._seen_at = -math.inf  # s of `time.monotonic`
-        # A stop by the watchdog reads the pose beside the control loop.
+        self._captured_s = -math.inf  # s of `time.monotonic`
+
+        # A stop by the watchdog reads the pose at the same time as the control loop.
         self._lock = threading.Lock()
-        self._came: tuple[Any, float] | None = None
-        self._looked_at: tuple[Any, float] | None = None
+        # Messages and the times of their arrival, s since 1970: the newest, and the one that was
+        # decoded last.
+        self._newest: tuple[Any, float] | None = None
+        self._decoded: tuple[Any, float] | None = None
 
     def take(self, message: Any) -> None:
         """Keep a message, on the link's thread; the control loop decodes only the newest one."""
-        self._came = message, time.time()
+        self._newest = message, time.time()
 
     def refresh(self) -> None:
-        """Decode the newest message, if any. An unreadable one is ignored, so that the reading
-        ages.
+        """Decode the newest message, if there is one that is not decoded yet.
+
+        An unreadable message is ignored, so that the reading ages.
+
+        Raises:
+            ConfigError: The first message is unreadable.
         """
         with self._lock:
-            came = self._came
-            if came is None or came is self._looked_at:
+            newest = self._newest
+            if newest is None or newest is self._decoded:
                 return
-            self._looked_at = message, arrived_at = came
+            self._decoded = newest
+            message, arrived_at = newest
+
             try:
                 value = self._read(message)
-                at = (messages.stamp(message) if self._by_stamp else None) or arrived_at
+                stamp = messages.stamp(message) if self._by_stamp else None
             except VLAgentsError as error:
                 self.unreadable += 1
                 if self.value is None:
@@ -357,36 +423,37 @@ class TopicReader:
                         "%s: a message is left out, as are others like it: %s", self.topic, error
                     )
                 return
-            self.value, self.captured_at = value, at
-            self._seen_at = self._clock(Obs(info={CAPTURED: at}))
+
+            self.value = value
+            self.captured_at = stamp or arrived_at
+            self._captured_s = self._clock(Obs(info={CAPTURED: self.captured_at}))
 
     def _read(self, message: Any) -> Any:
-        """Return the image, the part of the state or, by its first number, the gripper's opening
-        in a message.
+        """Return the image, the part of the state or the gripper's opening in a message; the
+        opening follows from the first number.
         """
         reading = self._reading
         if reading.type == IMAGE:
             return messages.image(message)
         if reading.type == COMPRESSED:
             return messages.compressed_image(message)
+
         if reading.type == JOINT_STATE:
-            part = messages.joints(message, reading.names, reading.values)
+            numbers = messages.joints(message, reading.names, reading.values)
+        elif reading.type in POSES:
+            numbers = messages.pose(message, reading.rotation)
         else:
-            part = (
-                messages.pose(message, reading.rotation)
-                if reading.type in POSES
-                else messages.numbers(message)
-            )
+            numbers = messages.numbers(message)
+
         if reading.open is None or reading.closed is None:
-            return part
-        return min(
-            1.0, max(0.0, (float(part[0]) - reading.closed) / (reading.open - reading.closed))
-        )
+            return numbers
+        opening = (float(numbers[0]) - reading.closed) / (reading.open - reading.closed)
+        return min(1.0, max(0.0, opening))
 
     @property
     def age_s(self) -> float:
         """The age of the reading, s; infinite if its time is in the future."""
-        return time.monotonic() - self._seen_at
+        return time.monotonic() - self._captured_s
 
 
 class RosRobot:
@@ -394,18 +461,18 @@ class RosRobot:
 
     An observation has the newest message of each topic, and the time of the oldest of them as
     `captured_at`. While a message is older than its `max_age_s`, or the link is lost, `holds` is
-    the reason: the control loop stops the robot, and continues by itself later. After `silent_s`
-    without a new message the watchdog stops it. Use it as a context manager, which connects and
-    waits for the first message of each topic.
+    the reason why the control loop stops the robot; it continues by itself later. After `silent_s`
+    without a new message the watchdog stops the robot. Use it as a context manager, which connects
+    and waits for the first message of each topic.
 
     Args:
         settings: The topics, or the path of their YAML file.
-        link: The link to them; by default that of the settings.
+        link: The link to the topics; default: the link that the settings name.
     """
 
     dates_pictures = True
-    """Whether `captured_at` is from the messages, so that a camera that hangs is found by the
-    age of its picture.
+    """Whether `captured_at` is from the messages, so that the age of a picture shows when its
+    camera hangs.
     """
 
     def __init__(self, settings: RosSettings | Path | str, link: Link | None = None) -> None:
@@ -415,18 +482,24 @@ class RosRobot:
         self.holds: str | None = None
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
-        self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link))
-        self._readers = {
-            id(one): TopicReader(one, settings.clock == "stamp") for one in settings.sensors
-        }
-        self._beat_at = -math.inf
+        if link is None:
+            link = Ros2() if settings.link == ROS2 else Rosbridge(settings.link)
+        self._link: Link = link
+
+        self._readers: dict[int, TopicReader] = {}  # by the id of their settings
+        for sensor in settings.sensors:
+            self._readers[id(sensor)] = TopicReader(sensor, settings.clock == "stamp")
+
+        self._beat_at = -math.inf  # the time of the last heartbeat, s of `time.monotonic`
         self._connections = 0
         self._lost_at = -math.inf  # s of `time.monotonic`
         self._stop_unsent = False
-        # The last numbers of each topic of the actions, by its place.
+        # The last numbers on each topic of the actions, by its index.
         self._commanded: dict[int, np.ndarray] = {}
-        for topic, kind in {reading.topic: reading.type for reading in settings.sensors}.items():
-            self._link.subscribe(topic, kind, partial(self._take, topic))
+
+        types = {sensor.topic: sensor.type for sensor in settings.sensors}
+        for topic, message_type in types.items():
+            self._link.subscribe(topic, message_type, partial(self._take, topic))
         for command in settings.actions:
             self._link.advertise(command.topic, command.type)
         if settings.heartbeat is not None:
@@ -459,16 +532,19 @@ class RosRobot:
     @property
     def joint_names(self) -> list[str]:
         """The joints in the order of an action, as far as the settings of its topics name them."""
-        return [name for topic in self.settings.actions for name in topic.names]
+        names: list[str] = []
+        for command in self.settings.actions:
+            names += command.names
+        return names
 
     @property
     def contract(self) -> Contract:
         """The contract of the topics, from the messages received so far."""
-        cameras = {name: self._value(one) for name, one in self.settings.cameras.items()}
-        state = {name: self._value(one) for name, one in self.settings.state.items()}
+        images = self._values(self.settings.cameras)
+        state = self._values(self.settings.state)
         return Contract(
-            cameras={name: CameraSpec(*image.shape[:2]) for name, image in cameras.items()},
-            state={name: StateSpec(len(part)) for name, part in state.items()},
+            cameras={name: CameraSpec(*image.shape[:2]) for name, image in images.items()},
+            state={name: StateSpec(len(vector)) for name, vector in state.items()},
             gripper=self.settings.gripper is not None,
             action=ActionSpec(dim=self.settings.dim, delta=self.settings.delta),
         )
@@ -479,19 +555,24 @@ class RosRobot:
             reader.refresh()
         self._hold_if_old()
         self._beat(alive=True)
+
         gripper = self.settings.gripper
+        captured_at = min(reader.captured_at for reader in self._readers.values())
         return Obs(
-            {name: self._value(one) for name, one in self.settings.cameras.items()},
-            None if gripper is None else self._value(gripper),
-            {name: self._value(one) for name, one in self.settings.state.items()},
-            {CAPTURED: min(reader.captured_at for reader in self._readers.values())},
+            cameras=self._values(self.settings.cameras),
+            gripper=None if gripper is None else self._value(gripper),
+            state=self._values(self.settings.state),
+            info={CAPTURED: captured_at},
         )
 
     def apply(self, action: np.ndarray) -> None:
-        """Publish an action.
+        """Publish an action on the topics.
+
+        Args:
+            action: The numbers of all topics, (D,), in the order of the settings.
 
         Raises:
-            InvalidAction: The number of values differs from that of the topics.
+            InvalidAction: The action has another number of numbers than the topics.
         """
         if action.shape != (self.settings.dim,):
             raise InvalidAction(
@@ -499,7 +580,8 @@ class RosRobot:
             )
         first = 0
         for index, command in enumerate(self.settings.actions):
-            row = self._commanded[index] = action[first : first + command.dim].copy()
+            row = action[first : first + command.dim].copy()
+            self._commanded[index] = row
             self._publish(command, row)
             first += command.dim
 
@@ -508,7 +590,7 @@ class RosRobot:
 
         Grippers keep their last command, as the measured opening would loosen their grasp.
         """
-        self._stop_unsent = not self._link.up  # if so, it is sent on reconnection
+        self._stop_unsent = not self._link.up  # then it is sent when the link is up again
         for index, command in enumerate(self.settings.actions):
             if command.stop == NOTHING:
                 continue
@@ -522,7 +604,7 @@ class RosRobot:
                 reader = self._readers[id(reading)]
                 reader.refresh()
                 if reader.age_s > reading.max_age_s or self._from_before_loss(reader):
-                    self._stop_unsent = True  # until a pose is known
+                    self._stop_unsent = True  # it is sent when a pose is known
                     logger.warning(
                         "%s: no stop was published, as the pose of %s is old",
                         command.topic,
@@ -543,9 +625,11 @@ class RosRobot:
         return float(reading.closed + self._value(reading) * (reading.open - reading.closed))
 
     def _from_before_loss(self, reader: TopicReader) -> bool:
+        """Return whether the reading is older than the last loss of the connection."""
         return time.monotonic() - self._lost_at <= reader.age_s < math.inf
 
     def _publish(self, command: ActionTopic, row: np.ndarray) -> None:
+        """Publish numbers on a topic, as a message of its type."""
         if command.type == ARRAY:
             message = messages.float64_multi_array(row)
         elif command.type == JOINT_STATE:
@@ -557,47 +641,71 @@ class RosRobot:
         self._link.publish(command.topic, message)
 
     def _hold_if_old(self) -> None:
-        up, connections = self._link.up, self._link.connections
-        if not up or connections != self._connections:  # or the link was lost between two ticks
-            self._connections, self._lost_at = connections, time.monotonic()
+        """Set `holds` if a reading is too old or the link is lost, and report the signs of life of
+        the topics to the watchdog.
+        """
+        connections = self._link.connections
+        was_lost = connections != self._connections  # between two ticks
+        if not self._link.up or was_lost:
+            self._connections = connections
+            self._lost_at = time.monotonic()
             # The last stop may have been sent before the loss was detected.
             self._stop_unsent = True
+
         lost = any(self._from_before_loss(reader) for reader in self._readers.values())
         self.holds = f"the connection to the {self._link.name} was lost" if lost else None
         for reading in self.settings.sensors:
             reader = self._readers[id(reading)]
-            if reader.age_s > reading.max_age_s:
+            if reader.age_s > reading.max_age_s and self.holds is None:
                 self.holds = (
-                    self.holds
-                    or f"no new message of {reading.topic} for more than {reading.max_age_s:g} s"
+                    f"no new message of {reading.topic} for more than {reading.max_age_s:g} s"
                 )
             if self.watchdog is not None and reader.age_s < math.inf:
                 self.watchdog.heard(reading.topic, max(0.0, reader.age_s))
+
         if self._stop_unsent and self.holds is None:
             self.stop()
 
     def _beat(self, *, alive: bool) -> None:
-        beat, now = self.settings.heartbeat, time.monotonic()
-        if beat is None or (alive and now - self._beat_at < 1 / beat.hz):
+        """Publish the heartbeat, if it is time.
+
+        Args:
+            alive: Whether the control loop runs; otherwise a last heartbeat is sent at once.
+        """
+        heartbeat = self.settings.heartbeat
+        now = time.monotonic()
+        if heartbeat is None or (alive and now - self._beat_at < 1 / heartbeat.hz):
             return
+
         self._beat_at = now
-        stopped = self.watchdog is not None and self.watchdog.control.stopped
-        self._link.publish(beat.topic, {"data": alive and not stopped and self.holds is None})
+        is_stopped = self.watchdog is not None and self.watchdog.control.stopped
+        may_move = alive and not is_stopped and self.holds is None
+        self._link.publish(heartbeat.topic, {"data": may_move})
 
     def _value(self, reading: InputTopic) -> Any:
+        """Return the newest value of a topic."""
         return self._readers[id(reading)].value
 
+    def _values(self, readings: Mapping[str, InputTopic]) -> dict[str, Any]:
+        """Return the newest value of each topic, by name."""
+        return {name: self._value(reading) for name, reading in readings.items()}
+
     def _take(self, topic: str, message: Any) -> None:
+        """Pass a message of a topic to the readers of the topic."""
         for reader in self._readers.values():
             if reader.topic == topic:
                 reader.take(message)
 
     def _wait_for_messages(self) -> None:
+        """Wait for the first message of each topic, and check it; raise `ConfigError` if one is
+        missing or wrong.
+        """
         deadline = time.monotonic() + self.settings.ready_s
         while True:
             for reader in self._readers.values():
                 reader.refresh()
-            missing = sorted({one.topic for one in self._readers.values() if one.value is None})
+            readers = self._readers.values()
+            missing = sorted({reader.topic for reader in readers if reader.value is None})
             if not missing:
                 break
             if time.monotonic() > deadline:
