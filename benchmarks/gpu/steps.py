@@ -335,7 +335,7 @@ def pushes(lab: Lab) -> None:
 
         def take(values: Any, version: int) -> None:
             options = PushOptions("keep", allow_same=True)
-            engine.weights.stage(version, values.host_values if lab.dry else values, options)
+            engine.weights.stage(version, values.others if lab.dry else values, options)
             engine.weights.commit(version, options)
 
         before, rows, publisher = act(), list[dict[str, Any]](), Publisher(engine)

@@ -295,7 +295,7 @@ class _Joint(NamedTuple):
     rotation: list[float]  # from the child's frame to the parent's, (9,), row by row
     offset: list[float]  # of the child's frame in the parent's, (3,), m
     axis: list[float]  # unit vector, (3,)
-    index: int  # of its number in an action; -1 without one
+    action_index: int  # of its number in an action; -1 without one
     slides: bool
 
 
@@ -342,7 +342,7 @@ class Chain:
                     rotation=rotation.ravel().tolist(),
                     offset=_three(attributes.get("xyz", "0 0 0")),
                     axis=direction.tolist(),
-                    index=names.index(name) if is_moved else -1,
+                    action_index=names.index(name) if is_moved else -1,
                     slides=joint_type == "prismatic",
                 )
             )

@@ -58,10 +58,10 @@ class SharedValues:
     gpu: str  # UUID
     storages: dict[int, StorageHandle]  # by their addresses in the learner's process
     views: dict[str, ValueView]
-    host_values: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
+    others: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything except `host_values` as JSON values, which `from_json` reads."""
+        """Return everything except `others` as JSON values, which `from_json` reads."""
         storages = {}
         for address, handle in self.storages.items():
             storages[address] = [
@@ -75,12 +75,12 @@ class SharedValues:
         return {"gpu": self.gpu, "storages": storages, "views": views}
 
     @classmethod
-    def from_json(cls, node: dict[str, Any], host_values: Mapping[str, Any]) -> SharedValues:
+    def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
         """Read the handles that `to_json` returned.
 
         Args:
             node: The JSON values.
-            host_values: The values that are not on a GPU, by name.
+            others: The values that are not on a GPU, by name.
         """
         storages = {}
         for address, fields in node["storages"].items():
@@ -91,7 +91,7 @@ class SharedValues:
         views = {}
         for name, (storage, dtype, begin, shape, stride) in node["views"].items():
             views[name] = ValueView(storage, dtype, begin, tuple(shape), tuple(stride))
-        return cls(node["gpu"], storages, views, host_values)
+        return cls(node["gpu"], storages, views, others)
 
 
 def gpu_of(values: Mapping[str, Any]) -> str:
@@ -126,12 +126,12 @@ def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
     """
     with ExitStack() as stack:
         stack.callback(_MEMORY.collect)  # after all handles have ended
-        host_values: dict[str, Any] = {}
-        shared_values = SharedValues(gpu_of(values_by_name), {}, {}, host_values)
+        others: dict[str, Any] = {}
+        shared_values = SharedValues(gpu_of(values_by_name), {}, {}, others)
         devices = set()
         for name, value in values_by_name.items():
             if not _MEMORY.gpu(value):
-                host_values[name] = portable(value) if is_array(value) else value
+                others[name] = portable(value) if is_array(value) else value
                 continue
 
             devices.add(value.device)
@@ -178,7 +178,7 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
         ) from error
 
     devices = {storage.device for storage in storages.values()}
-    values_by_name = dict(values.host_values)
+    values_by_name = dict(values.others)
     for name, view in values.views.items():
         dtype = getattr(torch, view.dtype)
         empty = torch.empty(0, dtype=dtype, device=storages[view.storage].device)

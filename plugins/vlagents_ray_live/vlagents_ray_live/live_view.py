@@ -13,7 +13,6 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -184,6 +183,10 @@ class ReplicaView:
             "sessions_held": len(engine.sessions),
         }
         return snapshot
+
+    async def read_on_thread(self, since: int, shown: Collection[str]) -> Snapshot:
+        """Make a snapshot on another thread, see `read`."""
+        return await asyncio.to_thread(self.read, since, shown)
 
     def _save(self, session: str) -> str:
         """Save the last seconds of a session, and return the path of the dataset."""
@@ -449,7 +452,7 @@ class Fleet:
             readers |= await self._other_replicas.views()
         view = self._view
         if view is not None:
-            readers[""] = partial(asyncio.to_thread, view.read)
+            readers[""] = view.read_on_thread
 
         reads = []
         for name, read in readers.items():
