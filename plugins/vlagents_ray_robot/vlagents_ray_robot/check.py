@@ -1,6 +1,4 @@
-"""A conformance suite for `observe`, `apply` and `stop` of a robot: what to know of an arm
-before a policy moves it.
-"""
+"""A conformance suite for `observe`, `apply` and `stop` of a robot, before a policy moves it."""
 
 from __future__ import annotations
 
@@ -45,24 +43,30 @@ CHECKS = {  # in the order in which they run
     "commands": "each single command is executed",
     "gripper": "the gripper closes when it is told to close",
 }
-_STEPS = {"rad": 0.05, "deg": 3.0, "m": 0.01}  # size of a small move by the unit of the joints
-_OTHER_STEP = 3.0  # of LeRobot's units, per cent of the range
-_RAMP_S = 0.4  # time of a small move
-_HOLD_S = 1.0  # time after it in which it must be measured
-_RUNAWAY = 3  # small moves; an arm that is farther from where it should be is stopped at once
+_STEPS = {"rad": 0.05, "deg": 3.0, "m": 0.01}  # the size of a small move, by unit of the joints
+_OTHER_STEP = 3.0  # the size of a small move in LeRobot's units, per cent of the range
+_RAMP_S = 0.4  # the time of a small move
+_HOLD_S = 1.0  # the time after a small move within which it must be measured
+# An arm that is farther from its target than this number of small moves is stopped at once.
+_RUNAWAY = 3
 _STOP_S = 0.1  # longest call of `stop`
-_SKEW_S = (-1.0, 0.1)  # age of an observation's time stamp: as SKEW_S of the chunk player, s
-_FROZEN_S = 1.0  # time in which each camera must give a new picture
-_MOST_M = 5.0  # an arm with a longer reach gives millimetres
-_RED = 40  # of 255, by which red has to exceed green and blue where the card is
+# Range of the difference from an observation's time stamp to the present, as SKEW_S of the chunk
+# player, s.
+_SKEW_S = (-1.0, 0.1)
+_FROZEN_S = 1.0  # the time within which each camera must give a new picture
+_MOST_M = 5.0  # a position that is farther away is in millimetres
+_RED = 40  # where the card is, red must exceed green and blue by this much of 255
 _DECLARE = "the robot's contract does not declare what this check needs"
 
 
 class Operator:
-    """The person at the robot, who is asked at the terminal; a subclass answers otherwise.
+    """The person at the robot, who answers questions at the terminal; a subclass may answer in
+    another way.
 
-    An answer None means that they cannot tell: the check is listed as not made. Without `move` they
-    agree to no motion.
+    The answer None means that the operator cannot tell; then the check is listed as not made.
+
+    Args:
+        move: Whether the robot may move; otherwise the operator agrees to no motion.
     """
 
     def __init__(self, *, move: bool = True) -> None:
@@ -70,42 +74,52 @@ class Operator:
 
     def agrees(self, motion: str) -> bool:
         """Return whether the robot may make this motion now."""
-        return (
-            self._move and _asked(f"The robot will do this: {motion}. Is its space free?") is True
-        )
+        question = f"The robot will do this: {motion}. Is its space free?"
+        return self._move and _ask(question) is True
 
     def holds_card(self, camera: str | None) -> bool:
-        """Hold something red in the upper left quarter of what a camera sees; None: take it
-        away. False: no card.
+        """Hold something red in the upper left quarter of the picture of a camera.
+
+        Args:
+            camera: The camera; None to take the card away.
+
+        Returns:
+            Whether it is done; False if there is no card.
         """
-        where = f"Hold something red in the upper left quarter of what camera {camera!r} sees"
-        return _asked(f"{'Take the card away' if camera is None else where}. Done?") is True
+        request = "Take the card away"
+        if camera is not None:
+            request = f"Hold something red in the upper left quarter of what camera {camera!r} sees"
+        return _ask(f"{request}. Done?") is True
 
     def saw_joint(self, name: str, side: int) -> bool | None:
         """Return whether this joint alone has moved since `agrees`, towards its positive (1) or
         negative (-1) side.
         """
-        return _asked(
-            f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?"
-        )
+        sign = "+" if side > 0 else "-"
+        return _ask(f"Did {name} alone move, to the side that its manual calls {sign}?")
 
     def saw_closing(self) -> bool | None:
         """Return whether the gripper is closed now."""
-        return _asked("Is the gripper closed?")
+        return _ask("Is the gripper closed?")
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether an arm's hand is at a pose, (7,): m from its base, x forwards, z up,
-        and quaternion xyzw.
+        """Return whether the hand of an arm is at a pose.
+
+        Args:
+            pose: The pose, (7,): position in m from the base, x forwards, z up, and quaternion
+                xyzw.
+            arm: The index of the arm.
         """
         x, y, z, *quaternion = np.round(pose, 2).tolist()
         pose_text = (
             f"{x} m in front of the base, {y} m to its left, {z} m above it, with the "
             f"quaternion xyzw {quaternion}"
         )
-        return _asked(f"Is the hand of arm {arm + 1} there: {pose_text}?")
+        return _ask(f"Is the hand of arm {arm + 1} there: {pose_text}?")
 
 
-def _asked(question: str) -> bool | None:
+def _ask(question: str) -> bool | None:
+    """Ask a question at the terminal; return None if the operator cannot tell."""
     try:
         answer = input(f"{question} [y/n, Enter: cannot tell] ").strip().lower()
     except EOFError:
@@ -115,12 +129,12 @@ def _asked(question: str) -> bool | None:
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation: what was measured, what is right, and what to change."""
+    """A violation that a check found."""
 
     check: str  # a key of CHECKS
-    got: str
-    want: str
-    cure: str
+    got: str  # the measurement
+    want: str  # the right value
+    cure: str  # what to change
     when: str  # "before any motion", or the motion at which it was found
 
     def __str__(self) -> str:
@@ -129,16 +143,16 @@ class Finding:
 
 @dataclass
 class RobotReport:
-    """The result of a check: findings, passed and skipped checks, figures and pictures."""
+    """The result of an examination: findings, passed and skipped checks, figures and pictures."""
 
     findings: list[Finding] = field(default_factory=list)
     passed: list[str] = field(default_factory=list)  # keys of CHECKS
-    skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
-    figures: dict[str, float] = field(default_factory=dict)  # measured, with the unit in the name
+    skipped: dict[str, str] = field(default_factory=dict)  # by key of CHECKS: the reason
+    figures: dict[str, float] = field(default_factory=dict)  # measurements; the names have units
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 by title
-    # What the robot has to declare before its motion can be checked; "" if nothing is missing.
+    # The declarations that the check of the motion needs and the robot lacks; "" if there are none.
     undeclared: str = ""
-    robot: str = ""  # its name
+    robot: str = ""  # the name of the robot
     at: float = field(default_factory=time.time)  # s since 1970
 
     @property
@@ -158,18 +172,17 @@ class RobotReport:
         return "nothing found in any check"
 
     def lines(self) -> list[str]:
-        """Return the report as lines of text."""
-        reasons: dict[str, list[str]] = {}
+        """Return the report as lines of text, of which the last one is the verdict."""
+        names_by_reason: dict[str, list[str]] = {}
         for name, reason in self.skipped.items():
-            reasons.setdefault(reason, []).append(name)
+            names_by_reason.setdefault(reason, []).append(name)
 
-        return [
-            *(f"FOUND {finding}" for finding in self.findings),
-            *(f"ok {name}: {CHECKS[name]}" for name in self.passed),
-            *(f"not checked {', '.join(names)}: {reason}" for reason, names in reasons.items()),
-            *(f"{name}: {value:.3g}" for name, value in self.figures.items()),
-            self.verdict,
-        ]
+        lines = [f"FOUND {finding}" for finding in self.findings]
+        lines += [f"ok {name}: {CHECKS[name]}" for name in self.passed]
+        for reason, names in names_by_reason.items():
+            lines.append(f"not checked {', '.join(names)}: {reason}")
+        lines += [f"{name}: {value:.3g}" for name, value in self.figures.items()]
+        return [*lines, self.verdict]
 
     def write(self, file: str | Path) -> None:
         """Write the report with its pictures as one HTML page, which needs no network."""
@@ -183,17 +196,17 @@ class RobotReport:
         style = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
         style += f"h2{{color:{colour}}}figure{{display:inline-block;margin:8px}}img{{height:240px}}"
 
-        page = (
-            f"<!doctype html><meta charset=utf-8><title>Check of {html.escape(self.robot)}</title>"
-        )
-        page += f"<style>{style}</style><h1>Check of {html.escape(self.robot)}</h1>"
+        title = f"Check of {html.escape(self.robot)}"
+        page = f"<!doctype html><meta charset=utf-8><title>{title}</title>"
+        page += f"<style>{style}</style><h1>{title}</h1>"
         page += f"<h2>{html.escape(self.verdict)}</h2><p>{date}</p>"
-        page += f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines()[:-1])}</ul>"
+        items = [f"<li>{html.escape(line)}</li>" for line in self.lines()[:-1]]
+        page += f"<ul>{''.join(items)}</ul>"
 
-        for title, picture in self.pictures.items():
+        for caption, picture in self.pictures.items():
             url = data_url("image/jpeg", encode_jpeg(picture))
             page += (
-                f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
+                f'<figure><img src="{url}"><figcaption>{html.escape(caption)}</figcaption></figure>'
             )
 
         Path(file).write_text(page, encoding="utf-8")
@@ -208,22 +221,22 @@ def examine(
     latency_s: float = 0.4,
     clock: Any = time,
 ) -> RobotReport:
-    """Check a robot, first at rest, then by small moves of one joint at a time to which the
-    operator agrees.
+    """Check a robot, first at rest, then with small moves of one joint at a time, each after the
+    operator has agreed.
 
-    A finding at rest prevents all motion, one in motion stops the robot and ends the check.
+    A finding at rest prevents all motion; a finding in motion stops the robot and ends the check.
 
     Args:
         robot: The robot, at rest and away from the limits of its joints.
-        contract: What the robot provides and accepts; by default its own. Moves need `action.dim`,
-            and whether actions are relative.
-        operator: The person at the robot; None: nothing moves.
-        hz: The control rate, Hz; by default the contract's, else 50.
+        contract: The contract of observations and actions; default: the robot's own. Moves need
+            `action.dim`, and whether actions are relative.
+        operator: The person at the robot; without one, nothing moves.
+        hz: The control rate, Hz; default: the contract's, else 50.
         latency_s: The longest time from a command to its measured motion, s.
         clock: The module `time`, or the `SimulatedClock` of a simulated robot.
 
     Returns:
-        The findings, and which checks passed or were not made.
+        The findings, and the checks that passed or were not made.
     """
     contract = contract or contract_of(robot)
     period_s = 1 / (hz or contract.control_hz or 50.0)
@@ -246,18 +259,19 @@ def examine(
     finally:
         robot.stop()
 
-    suite.skip_others(
-        "an earlier check found something" if suite.report.findings else "nothing moved"
-    )
+    reason = "an earlier check found something" if suite.report.findings else "nothing moved"
+    suite.skip_others(reason)
     return suite.report
 
 
 class _FoundInMotionError(Exception):
-    """Ends the check, as a finding in motion was reported."""
+    """Ends the check after a finding in motion."""
 
 
 @dataclass
 class _Suite:
+    """The checks of one robot."""
+
     _robot: Robot
     _contract: Contract
     _operator: Operator | None
@@ -265,25 +279,33 @@ class _Suite:
     _latency_s: float
     _clock: Any
     report: RobotReport = field(default_factory=RobotReport)
-    _when: str = ""  # the present motion; empty at rest
-    _stamp_s: float = -np.inf
-    _stamped: bool = True  # time stamps were right so far
-    _observe_s: list[float] = field(default_factory=list)
-    _apply_s: list[float] = field(default_factory=list)
-    _lags_s: list[float] = field(default_factory=list)
+    _motion: str = ""  # the present motion; empty at rest
+    _stamp_s: float = -np.inf  # the last time stamp, s since 1970
+    _stamps_are_right: bool = True
+    _observe_s: list[float] = field(default_factory=list)  # times of the calls of `observe`
+    _apply_s: list[float] = field(default_factory=list)  # times of the calls of `apply`
+    _lags_s: list[float] = field(default_factory=list)  # times from a command to its motion
     _command: np.ndarray = field(default_factory=lambda: np.zeros(0))  # the last action
     _layout: _Layout | None = None
 
     def find(self, check: str, got: str, want: str, cure: str, *, ends: bool = True) -> None:
-        """Report a finding; one in motion stops the robot and ends the check."""
-        when = f"during {self._when}" if self._when else "before any motion"
+        """Report a finding.
+
+        Args:
+            check: The check, a key of CHECKS.
+            got: The measurement.
+            want: The right value.
+            cure: What to change.
+            ends: Whether a finding in motion stops the robot and ends the check.
+        """
+        when = f"during {self._motion}" if self._motion else "before any motion"
         self.report.findings.append(Finding(check, got, want, cure, when))
-        if ends and self._when:
+        if ends and self._motion:
             self._robot.stop()
             raise _FoundInMotionError
 
     def at_rest(self) -> None:
-        """Run the checks that move nothing."""
+        """Run the checks for which the robot does not move."""
         first_obs = self._observe()
         self._layout = _Layout.find(self._robot, self._contract, first_obs)
         check_observation(first_obs, self._contract)
@@ -291,7 +313,7 @@ class _Suite:
             self.report.undeclared = _undeclared(self._contract)
         if self._contract == Contract():
             self.report.skipped["observation"] = _DECLARE
-        self._passes("observation")
+        self._pass("observation")
 
         names = getattr(self._robot, "joint_names", ())
         for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
@@ -307,8 +329,8 @@ class _Suite:
         for _ in range(20):
             self._clock.sleep(self._period_s)
             last_obs = self._observe()
-        if self._stamped:
-            self._passes("clock")
+        if self._stamps_are_right:
+            self._pass("clock")
 
         median_ms = 1e3 * float(np.quantile(self._observe_s, 0.5))
         p99_ms = 1e3 * float(np.quantile(self._observe_s, 0.99))
@@ -339,41 +361,43 @@ class _Suite:
         if layout is None or self._contract.action.relative is None:
             self.skip_others(_DECLARE)
             return
-        if not self._agreed("the command of the present pose, at which nothing should move"):
+        if not self._ask_to_move("the command of the present pose, at which nothing should move"):
             return
 
         self._check_meaning(layout)
-        self._passes("meaning", "blocking")
+        self._pass("meaning", "blocking")
 
         for joint, name in enumerate(layout.names):
-            if not self._agreed(f"a move of {name} by {layout.step:g} {layout.unit} and back"):
+            if not self._ask_to_move(f"a move of {name} by {layout.step:g} {layout.unit} and back"):
                 return
             self._move(layout, joint, name)
             if joint == 0:
                 self._check_single_commands(layout, name)
                 self._check_stop_in_motion(layout, name)
 
-        self._passes("order", "sign", "size", "latency", "rate", "pose", "commands", "stop")
+        self._pass("order", "sign", "size", "latency", "rate", "pose", "commands", "stop")
         self.report.figures["command to measured motion, ms"] = 1e3 * float(np.median(self._lags_s))
         self._check_grippers(layout)
 
     def skip_others(self, reason: str) -> None:
-        """List the checks without a result as not made."""
+        """List all checks without a result as not made, for this reason."""
         done = {*self.report.passed, *(finding.check for finding in self.report.findings)}
         for name in CHECKS:
             if name not in done:
                 self.report.skipped.setdefault(name, reason)
 
-    def _agreed(self, motion: str) -> bool:
+    def _ask_to_move(self, motion: str) -> bool:
+        """Return whether the operator agrees to a motion; if not, skip the other checks."""
         agrees = self._operator is not None and self._operator.agrees(motion)
-        self._when = motion if agrees else ""
+        self._motion = motion if agrees else ""
         if self._operator is None:
             self.skip_others("no operator agreed to a motion")
         elif not agrees:
             self.skip_others(f"the operator did not agree to {motion}")
         return agrees
 
-    def _passes(self, *checks: str) -> None:
+    def _pass(self, *checks: str) -> None:
+        """List checks as passed, unless they have a finding or were skipped."""
         not_passed = {finding.check for finding in self.report.findings}
         not_passed |= self.report.skipped.keys()
         for check in checks:
@@ -381,6 +405,7 @@ class _Suite:
                 self.report.passed.append(check)
 
     def _observe(self) -> Obs:
+        """Return an observation, and check its time stamp."""
         began_s = self._clock.monotonic()
         obs = self._robot.observe()
         self._observe_s.append(self._clock.monotonic() - began_s)
@@ -388,12 +413,12 @@ class _Suite:
         stamp_s = obs.info.get(CAPTURED)
         if stamp_s is None:
             self.report.skipped.setdefault("clock", f"observations have no {CAPTURED!r}")
-        elif self._stamped:
+        elif self._stamps_are_right:
             ahead_s = stamp_s - self._clock.time()
             back_s = self._stamp_s - stamp_s
             self._stamp_s = stamp_s
             if back_s > 0 or not _SKEW_S[0] <= ahead_s <= _SKEW_S[1]:
-                self._stamped = False
+                self._stamps_are_right = False
                 if back_s > 0:
                     got = f"a time stamp {back_s:.3g} s before the last one"
                 else:
@@ -406,40 +431,44 @@ class _Suite:
         return obs
 
     def _apply(self, action: np.ndarray) -> None:
+        """Command an action, and check that `apply` does not wait."""
         self._command = action
         began_s = self._clock.monotonic()
         self._robot.apply(action.astype(np.float32))
         took_s = self._clock.monotonic() - began_s
         self._apply_s.append(took_s)
 
-        if np.median(self._apply_s) > max(0.005, self._period_s / 4):
-            limit = f"at most {1e3 * max(0.005, self._period_s / 4):.3g} ms"
+        limit_s = max(0.005, self._period_s / 4)
+        if np.median(self._apply_s) > limit_s:
+            limit = f"at most {1e3 * limit_s:.3g} ms"
             cure = "send the command and return; do not wait until the arm is there"
             self.find("blocking", f"{1e3 * took_s:.3g} ms for apply", limit, cure)
 
     def _check_units(self, obs: Obs) -> None:
+        """Check the units of joints, positions, quaternions and the gripper."""
         for name, values in obs.state.items():
             spec = (self._contract.state or {}).get(name)
             unit = spec.unit if spec else None
-            kind = name.rpartition("/")[2]
+            base_name = name.rpartition("/")[2]  # without the name of the arm
 
-            if kind == "joints" and unit in (None, "rad") and np.abs(values).max() > 2.1 * np.pi:
-                got = f"{np.abs(values).max():.4g} in {name!r}, more than a full turn"
-                self.find(
-                    "units", got, "rad", "convert degrees by np.deg2rad, in observe and in apply"
-                )
+            if base_name == "joints" and unit in (None, "rad"):
+                largest = np.abs(values).max()
+                if largest > 2.1 * np.pi:
+                    got = f"{largest:.4g} in {name!r}, more than a full turn"
+                    cure = "convert degrees by np.deg2rad, in observe and in apply"
+                    self.find("units", got, "rad", cure)
 
-            if kind in ("tquat", "xyzrpy") and np.abs(values[:3]).max() > _MOST_M:
-                self.find(
-                    "units",
-                    f"{np.abs(values[:3]).max():.4g} in {name!r}",
-                    "m",
-                    "divide millimetres by 1000",
-                )
+            if base_name in ("tquat", "xyzrpy"):
+                farthest = np.abs(values[:3]).max()
+                if farthest > _MOST_M:
+                    got = f"{farthest:.4g} in {name!r}"
+                    self.find("units", got, "m", "divide millimetres by 1000")
 
-            if kind == "tquat" and abs(np.linalg.norm(values[3:]) - 1) > 0.01:
-                got = f"a quaternion of length {np.linalg.norm(values[3:]):.3g} in {name!r}"
-                self.find("units", got, "1", "give position and then quaternion xyzw")
+            if base_name == "tquat":
+                length = np.linalg.norm(values[3:])
+                if abs(length - 1) > 0.01:
+                    got = f"a quaternion of length {length:.3g} in {name!r}"
+                    self.find("units", got, "1", "give position and then quaternion xyzw")
 
         if obs.gripper is not None and not 0 <= obs.gripper <= 1:
             self.find(
@@ -449,9 +478,10 @@ class _Suite:
                 "scale it by its closed and open",
             )
 
-        self._passes("units")
+        self._pass("units")
 
     def _check_limits(self, obs: Obs) -> None:
+        """Check that the joints are within their limits."""
         layout = self._layout
         if any(finding.check == "units" for finding in self.report.findings):
             return
@@ -461,8 +491,9 @@ class _Suite:
             )
             return
 
+        measured_joints = layout.measured(obs)
         for name, measured, (low, high) in zip(
-            layout.names, layout.measured(obs), layout.limits, strict=True
+            layout.names, measured_joints, layout.limits, strict=True
         ):
             if not low <= measured <= high:
                 self.find(
@@ -473,17 +504,20 @@ class _Suite:
                 )
                 break
 
-        self._passes("limits")
+        self._pass("limits")
 
     def _check_stop(self) -> None:
-        def in_thread() -> None:
+        """Check that `stop` returns at once, can be repeated, and works from another thread."""
+
+        def stop_from_thread() -> None:
+            """Call `stop` on another thread."""
             with ThreadPoolExecutor(1) as thread:
                 thread.submit(self._robot.stop).result()
 
         calls = (
             ("", self._robot.stop),
             (" again", self._robot.stop),
-            (" from a thread", in_thread),
+            (" from a thread", stop_from_thread),
         )
         for occasion, call in calls:
             began_s = self._clock.monotonic()
@@ -509,8 +543,8 @@ class _Suite:
                 return
 
     def _check_new_pictures(self) -> None:
-        """Find cameras that repeat one picture; the noise of a sensor changes each picture, also
-        of a still scene.
+        """Find cameras that repeat one picture; the noise of a sensor changes each picture, even
+        if the scene does not change.
         """
         if getattr(self._robot, "simulated", False):
             return
@@ -537,17 +571,15 @@ class _Suite:
             self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
 
     def _check_new_dates(self) -> None:
-        """Find a sensor that gives nothing new, by the time stamps; a simulation may render one
-        picture repeatedly.
+        """Find a sensor whose time stamps do not advance; a simulation may render one picture
+        repeatedly.
         """
         began_s = self._clock.monotonic()
         began_at = self._clock.time()
         while self._observe().info[CAPTURED] < began_at:
             if self._clock.monotonic() - began_s > _FROZEN_S:
-                got = (
-                    getattr(self._robot, "holds", None)
-                    or f"nothing newer than {_FROZEN_S:g} s from a sensor"
-                )
+                reason = getattr(self._robot, "holds", None)
+                got = reason or f"nothing newer than {_FROZEN_S:g} s from a sensor"
                 self.find(
                     "cameras", got, "new pictures and states", "restart the driver of this sensor"
                 )
@@ -555,6 +587,7 @@ class _Suite:
             self._clock.sleep(self._period_s)
 
     def _check_cameras(self) -> None:
+        """Check each camera with a red card that the operator holds."""
         if any(finding.check == "cameras" for finding in self.report.findings):
             return
 
@@ -568,17 +601,23 @@ class _Suite:
             self._clock.sleep(0.3)
             after = self._observe().cameras
             self.report.pictures[f"{camera}, with the red card in the upper left"] = after[camera]
-            self._judge_card(camera, {name: _card(before[name], after[name]) for name in before})
+            cards = {name: _find_card(before[name], after[name]) for name in before}
+            self._judge_card(camera, cards)
 
         if not before:
             self.report.skipped["cameras"] = "there is none"
         elif self._operator is not None:
             self._operator.holds_card(None)
 
-        self._passes("cameras")
+        self._pass("cameras")
 
     def _judge_card(self, camera: str, cards: dict[str, _Card | None]) -> None:
-        """Check the card in the picture of one camera; `cards` are those of all cameras."""
+        """Check the card in the picture of one camera.
+
+        Args:
+            camera: The camera.
+            cards: The card in the picture of each camera, by name.
+        """
         card = cards[camera]
         want = f"the card, red, in the upper left of {camera!r}"
 
@@ -617,6 +656,7 @@ class _Suite:
             )
 
     def _check_place(self, obs: Obs) -> None:
+        """Check that the operator sees each hand at its pose."""
         for number, arm in enumerate(self._contract.action.arms or ("",)):
             pose = obs.state.get(arm_part(arm, "tquat"))
             sees: bool | None = None
@@ -628,17 +668,16 @@ class _Suite:
                     "observations have no 'tquat', or the operator cannot tell"
                 )
             elif not sees and not self.report.findings:
-                got = (
-                    f"the hand at {np.round(pose[:3], 2)} m with the quaternion "
-                    f"{np.round(pose[3:], 2)}, as it is not"
-                )
+                position = np.round(pose[:3], 2)
+                quaternion = np.round(pose[3:], 2)
+                got = f"the hand at {position} m with the quaternion {quaternion}, as it is not"
                 cure = (
                     "give the pose in the frame of the arm's base, x forwards and z up, and the "
                     "quaternion as xyzw"
                 )
                 self.find("place", got, "the pose that the operator sees", cure)
 
-        self._passes("place")
+        self._pass("place")
 
     def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
         """Return the action that should move nothing."""
@@ -649,13 +688,13 @@ class _Suite:
         spec = self._contract.action
         if layout.grippers and spec.gripper_open is not None and spec.gripper_closed is not None:
             opening = 1.0 if obs.gripper is None else obs.gripper
-            action[layout.grippers] = spec.gripper_closed + opening * (
-                spec.gripper_open - spec.gripper_closed
-            )
+            width = spec.gripper_open - spec.gripper_closed
+            action[layout.grippers] = spec.gripper_closed + opening * width
 
         return action
 
     def _check_meaning(self, layout: _Layout) -> None:
+        """Check that the command of the present pose moves nothing."""
         obs = self._observe()
         start = layout.measured(obs)
         self._apply(self._hold_command(layout, obs))
@@ -665,16 +704,23 @@ class _Suite:
             if np.abs(moved).max() > _RUNAWAY * layout.step:
                 joint = int(np.argmax(np.abs(moved)))
                 got = f"a motion of {layout.names[joint]} by {moved[joint]:+.3g} and more"
-                kind = "absolute targets" if layout.relative else "deltas"
+                other_meaning = "absolute targets" if layout.relative else "deltas"
                 cure = (
-                    f"the arm takes {kind}, or other units: correct apply, or action.delta of "
-                    "the contract"
+                    f"the arm takes {other_meaning}, or other units: correct apply, or "
+                    "action.delta of the contract"
                 )
                 self.find("meaning", got, "none at the command of the present pose", cure)
 
     def _ramp(self, layout: _Layout, joint: int, change: float) -> list[tuple[float, np.ndarray]]:
-        """Move a joint by `change`; return times and measured joints during the move and until
-        it is over.
+        """Move a joint within `_RAMP_S`, and measure it until the motion is over.
+
+        Args:
+            layout: The numbers of an action.
+            joint: The joint.
+            change: The change of its position.
+
+        Returns:
+            The times, s, and the measured joints, (D,), at each tick.
         """
         base = layout.measured(self._observe())
         ticks = max(1, round(_RAMP_S / self._period_s))
@@ -734,6 +780,7 @@ class _Suite:
 
         positions = [measured[joint] for _, measured in readings]
         ticks = round(_RAMP_S / self._period_s)
+        # An arm that is read at the control rate has a new position at each tick.
         changes = int(np.count_nonzero(np.abs(np.diff(positions)) > 1e-3 * layout.step))
         if changes < ticks / 2:
             got = f"{changes} new readings of {name} in a move of {ticks} ticks"
@@ -789,12 +836,14 @@ class _Suite:
             self.report.skipped["pose"] = "observations have no 'tquat', the pose of the hand"
             return
 
-        p0, q0 = before.state[key][:3], before.state[key][3:].astype(float)
-        p1, q1 = after.state[key][:3], after.state[key][3:].astype(float)
+        path = after.state[key][:3] - before.state[key][:3]
+        q0 = before.state[key][3:].astype(float)
+        q1 = after.state[key][3:].astype(float)
         # The quaternion of the turn: q1 times the inverse of q0.
         axis = q0[3] * q1[:3] - q1[3] * q0[:3] - np.cross(q1[:3], q0[:3])
         sine = np.linalg.norm(axis)
         angle = 2 * np.arctan2(sine, abs(q1 @ q0))
+
         change = abs(layout.measured(after)[joint] - layout.measured(before)[joint])
         if layout.unit == "deg":
             change = np.deg2rad(change)
@@ -810,8 +859,8 @@ class _Suite:
             )
 
         # The other joints may give way by 1 mm and a sixth of the hand's path.
-        along = abs(float((p1 - p0) @ axis)) / max(1e-9, float(sine))
-        if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
+        along = abs(float(path @ axis)) / max(1e-9, float(sine))
+        if along > 0.001 + float(np.linalg.norm(path)) / 6:
             got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
             self.find(
                 "pose",
@@ -821,6 +870,7 @@ class _Suite:
             )
 
     def _check_single_commands(self, layout: _Layout, name: str) -> None:
+        """Check that the first joint moves at each of six single commands."""
         half = layout.step / 2
         for number in range(6):
             before = layout.measured(self._observe())[0]
@@ -837,6 +887,7 @@ class _Suite:
                 )
 
     def _check_stop_in_motion(self, layout: _Layout, name: str) -> None:
+        """Check that `stop` ends a motion of the first joint."""
         before = layout.measured(self._observe())[0]
         self._apply(layout.changed(self._command, 0, layout.step))
         self._robot.stop()
@@ -855,12 +906,13 @@ class _Suite:
         self._command = self._hold_command(layout, self._observe())
 
     def _check_grippers(self, layout: _Layout) -> None:
+        """Check that the grippers close when they are commanded to close."""
         spec = self._contract.action
         obs = self._observe()
         if not layout.grippers or obs.gripper is None or spec.gripper_closed is None:
             self.report.skipped["gripper"] = "the contract states no gripper"
             return
-        if not self._agreed("closing and opening the gripper"):
+        if not self._ask_to_move("closing and opening the gripper"):
             return
 
         action = self._hold_command(layout, obs)
@@ -887,11 +939,11 @@ class _Suite:
             self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
 
         opening_after(spec.gripper_open)
-        self._passes("gripper")
+        self._pass("gripper")
 
 
 def _undeclared(contract: Contract) -> str:
-    """Return what a robot has to declare before its motion can be checked."""
+    """Return the declarations that the check of the motion needs and a contract lacks, in words."""
     action = contract.action
     missing = [name for name in ("dim", "space", "delta") if getattr(action, name) is None]
     if missing:
@@ -910,39 +962,41 @@ def _undeclared(contract: Contract) -> str:
 class _Layout:
     """The numbers of an action, and the parts of the state that measure them."""
 
-    names: list[str]  # of the joints
+    names: list[str]  # the names of the joints
     limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
-    joints: list[int]  # their numbers in an action
-    grippers: list[int]
-    parts: list[str]  # of the state, which together have the joints
-    pose_of: list[str | None]  # of each joint, the part with the pose of its hand
-    unit: str
-    relative: bool
+    joints: list[int]  # the indices of the joints in an action
+    grippers: list[int]  # the indices of the grippers in an action
+    joint_parts: list[str]  # the parts of the state that together contain the joints
+    pose_of: list[str | None]  # for each joint, the part with the pose of its hand
+    unit: str  # of the joints
+    relative: bool  # whether actions are relative
 
     @classmethod
     def find(cls, robot: Robot, contract: Contract, obs: Obs) -> _Layout | None:
-        """Return the layout; None if actions are not joints, each arm's gripper after them."""
+        """Return the layout of a robot's actions; None if an action does not consist of the joints
+        of each arm, with its gripper after them.
+        """
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
             return None
 
         keys = [arm_part(arm, "joints") for arm in action.arms or ("",)]
-        parts = [key for key in keys if key in obs.state]
-        counts = [len(obs.state[key]) for key in parts]
-        grippers_per_arm = (action.dim - sum(counts)) // max(1, len(parts))
-        dim = sum(counts) + grippers_per_arm * len(parts)
-        if not parts or grippers_per_arm not in (0, 1) or dim != action.dim:
+        joint_parts = [key for key in keys if key in obs.state]
+        counts = [len(obs.state[key]) for key in joint_parts]
+        grippers_per_arm = (action.dim - sum(counts)) // max(1, len(joint_parts))
+        dim = sum(counts) + grippers_per_arm * len(joint_parts)
+        if not joint_parts or grippers_per_arm not in (0, 1) or dim != action.dim:
             return None
 
         grippers: list[int] = []
         if grippers_per_arm:
             # The gripper is the last number of its arm.
-            arm_ends = np.cumsum(counts) + np.arange(1, len(parts) + 1)
+            arm_ends = np.cumsum(counts) + np.arange(1, len(joint_parts) + 1)
             grippers = [int(arm_end) - 1 for arm_end in arm_ends]
-        joints = [number for number in range(action.dim) if number not in grippers]
+        joints = [index for index in range(action.dim) if index not in grippers]
 
         pose_of: list[str | None] = []
-        for key, count in zip(parts, counts, strict=True):
+        for key, count in zip(joint_parts, counts, strict=True):
             pose_key = key.replace("joints", "tquat")
             pose_of += [pose_key if pose_key in obs.state else None] * count
 
@@ -950,15 +1004,25 @@ class _Layout:
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
 
-        limits = np.asarray(getattr(robot, "joint_limits", [(-np.inf, np.inf)] * len(joints)))
+        unlimited = [(-np.inf, np.inf)] * len(joints)
+        limits = np.asarray(getattr(robot, "joint_limits", unlimited))
         if limits.shape != (len(joints), 2):
             raise ConfigError(
                 f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for "
                 "each"
             )
 
-        unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
-        return cls(names, limits, joints, grippers, parts, pose_of, unit, bool(action.relative))
+        spec = (contract.state or {}).get(joint_parts[0]) or StateSpec()
+        return cls(
+            names=names,
+            limits=limits,
+            joints=joints,
+            grippers=grippers,
+            joint_parts=joint_parts,
+            pose_of=pose_of,
+            unit=spec.unit or "rad",
+            relative=bool(action.relative),
+        )
 
     @property
     def step(self) -> float:
@@ -966,8 +1030,12 @@ class _Layout:
         return _STEPS.get(self.unit, _OTHER_STEP)
 
     def changed(self, last: np.ndarray, joint: int, change: float) -> np.ndarray:
-        """Return the action that moves one joint by `change` from where the `last` action,
-        (dim,), put it.
+        """Return the action that moves one joint from the target of the last action.
+
+        Args:
+            last: The last action, (dim,).
+            joint: The joint.
+            change: The change of its position.
         """
         action = last.copy()
         if self.relative:
@@ -977,22 +1045,28 @@ class _Layout:
 
     def measured(self, obs: Obs) -> np.ndarray:
         """Return the measured joints in the order of an action, (D,)."""
-        return np.concatenate([obs.state[part] for part in self.parts]).astype(float)
+        return np.concatenate([obs.state[name] for name in self.joint_parts]).astype(float)
 
 
 @dataclass(frozen=True)
 class _Card:
-    """What a card changed in a picture."""
+    """A card in a picture."""
 
-    red: bool  # else blue
+    red: bool  # otherwise it is blue
     x: float  # of its middle, in [0, 1] from the left
-    y: float  # from the top
+    y: float  # of its middle, in [0, 1] from the top
     share: float  # of all pixels
 
 
-def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
-    """Find the pixels of (H, W, 3) uint8 pictures that became red, or blue where red and blue
-    are exchanged.
+def _find_card(before: np.ndarray, after: np.ndarray) -> _Card | None:
+    """Find a card in a picture: the pixels that became red, or blue if red and blue are exchanged.
+
+    Args:
+        before: The picture without the card, (H, W, 3) uint8.
+        after: The picture with the card, (H, W, 3) uint8.
+
+    Returns:
+        The card; None if there is none.
     """
     red, green, blue = np.moveaxis(after.astype(int), -1, 0)
     changed = np.abs(after.astype(int) - before).max(-1) > _RED
@@ -1013,5 +1087,7 @@ def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
 
 
 def arm_part(arm: str, name: str) -> str:
-    """Return the name of a part of the state for an arm; "" is the only one."""
+    """Return the name of a part of the state for an arm; the name "" is for a robot with one
+    arm.
+    """
     return f"{arm}/{name}" if arm else name

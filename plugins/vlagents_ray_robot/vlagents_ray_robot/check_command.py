@@ -1,11 +1,11 @@
 """Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
 joint by joint.
 
-Nothing moves without --move, and then each motion only after a person at the robot has agreed. A
-simulated arm, "mujoco:ARM", is checked without a person.
+Nothing moves without --move. With it, each motion begins only after the operator at the robot has
+agreed. A simulated arm, "mujoco:ARM", is checked without an operator.
 
-Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run, 3 if the robot does
-not declare what the checks of its motion need.
+Exit status: 0 if no check found a violation, 1 if one did, 2 if the check could not run, 3 if the
+robot does not declare what the checks of its motion need.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def main(arguments: Sequence[str]) -> int:
 
     try:
         with contextlib.ExitStack() as stack:
-            # Standard output is for the document alone, without the questions to the operator.
+            # Standard output has only the document; questions to the operator go to standard error.
             if options.json:
                 stack.enter_context(contextlib.redirect_stdout(sys.stderr))
-            report = _checked(options, stack)
+            report = _examine(options, stack)
         report.robot = options.robot
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
@@ -64,7 +64,8 @@ def main(arguments: Sequence[str]) -> int:
     return 0 if report.ok else UNDECLARED
 
 
-def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
+def _examine(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
+    """Open the robot within the context of `stack`, and check it."""
     make = robot_factory("robot", options.robot, options.robot_set)
     if options.robot.startswith("mujoco:"):
         make = partial(make, clock=SimulatedClock())
@@ -95,8 +96,8 @@ def command_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
 
     names = (
-        "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or URDF "
-        "file, or ros:FILE"
+        "the robot: my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or "
+        "URDF file, or ros:FILE"
     )
     add("robot", help=names)
 
@@ -105,7 +106,7 @@ def command_parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="an argument of the robot, repeatable",
+        help="an argument of the robot; may be repeated",
     )
     add(
         "--move",
@@ -115,20 +116,20 @@ def command_parser() -> argparse.ArgumentParser:
     add(
         "--policy",
         metavar="URL",
-        help="check by the contract of the policy of this server, not by the robot's own",
+        help="check against the contract of the policy of this server, not against the robot's own",
     )
     add(
         "--hz",
         type=number(above=True, maximum=10_000.0),
-        help="control rate (default: the contract's, or 50)",
+        help="control rate in Hz (default: the contract's, or 50)",
     )
     add(
         "--latency-ms",
         type=number(maximum=60_000.0),
         default=400.0,
-        help="longest time from command to motion (%(default)s)",
+        help="longest time from a command to its motion, in ms (default: %(default)s)",
     )
 
     add("--out", metavar="FILE", help="write the report with pictures as an HTML page")
-    add("--json", action="store_true", help="as JSON, for programs")
+    add("--json", action="store_true", help="print the report as JSON, for programs")
     return parser

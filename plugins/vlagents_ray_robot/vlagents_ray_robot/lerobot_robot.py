@@ -1,4 +1,4 @@
-"""A robot class of LeRobot as a robot here: `--robot lerobot:so101_follower`."""
+"""Robots of LeRobot for the control loop: `--robot lerobot:so101_follower`."""
 
 from __future__ import annotations
 
@@ -25,9 +25,12 @@ logger = logging.getLogger(__name__)
 class OneAtATime:
     """A bus of motors whose methods run one at a time.
 
-    LeRobot's buses have no lock, and the watchdog's thread stops a robot while the loop may be in a
-    transfer. Each call is locked by itself, so that a stop waits for a transfer and not for the
-    cameras that are read after it.
+    LeRobot's buses have no lock, and the watchdog's thread may stop a robot during a transfer of
+    the control loop. Each call is locked by itself, so that a stop waits for a transfer, but not
+    for the cameras that are read after it.
+
+    Args:
+        bus: The bus of LeRobot.
     """
 
     def __init__(self, bus: Any) -> None:
@@ -50,15 +53,15 @@ class OneAtATime:
 class LeRobotRobot:
     """Any robot that LeRobot drives, by the name that its configuration registers.
 
-    Joints stay in LeRobot's order and units, which are those of its datasets and of policies that
-    were trained on them. The part `joints`, (D,), of an observation and an action have the same
-    numbers, the gripper among them. The motors whose name contains "gripper" keep their goal at a
-    stop, and with it what they hold.
+    Joints stay in LeRobot's order and units, which its datasets and policies trained on them also
+    have. The part `joints`, (D,), of an observation has the same numbers as an action, including
+    the gripper. The motors whose name contains "gripper" keep their goal at a stop, so that they
+    do not drop what they hold.
 
     Args:
-        kind: The registered name, such as "so101_follower".
-        unit: The unit of the joints; by default "deg", or "%" of the calibrated range, as its
-            `use_degrees` says.
+        robot_type: The registered name, such as "so101_follower".
+        unit: The unit of the joints; default: "deg" or "%" of the calibrated range, depending on
+            `use_degrees` of the configuration.
         settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and
             `cameras`.
 
@@ -67,15 +70,15 @@ class LeRobotRobot:
         MissingDependency: LeRobot, or the driver of the robot's motors, is not installed.
     """
 
-    _measured: np.ndarray | None = None  # the joints as measured last, (D,)
+    _measured: np.ndarray | None = None  # the last measured joints, (D,)
     _goal: np.ndarray | None = None  # the last action, (D,)
 
-    def __init__(self, kind: str, *, unit: str = "", **settings: Any) -> None:
+    def __init__(self, robot_type: str, *, unit: str = "", **settings: Any) -> None:
         try:
             package = require("lerobot.robots")
         except MissingDependency as error:
             raise MissingDependency(
-                f"lerobot:{kind}: LeRobot is not installed in this Python; run `pip install "
+                f"lerobot:{robot_type}: LeRobot is not installed in this Python; run `pip install "
                 "lerobot`, or run `vlagents-ray env make lerobot` and then this command as "
                 "`.venv-lerobot/bin/vlagents-ray ...`"
             ) from error
@@ -89,27 +92,29 @@ class LeRobotRobot:
 
         try:
             config = importlib.import_module("draccus").decode(
-                package.RobotConfig, {"type": kind, **settings}
+                package.RobotConfig, {"type": robot_type, **settings}
             )
             self._robot = require("lerobot.robots.utils").make_robot_from_config(config)
         except Exception as error:
-            near = did_you_mean(kind, package.RobotConfig.get_known_choices())
+            suggestion = did_you_mean(robot_type, package.RobotConfig.get_known_choices())
             raise ConfigError(
-                f"lerobot:{kind}: LeRobot refuses the settings {settings} ({error}){near}"
+                f"lerobot:{robot_type}: LeRobot refuses the settings {settings} ({error})"
+                f"{suggestion}"
             ) from error
 
         not_positions = [name for name in self._robot.action_features if not name.endswith(".pos")]
         if not_positions:
             raise ConfigError(
-                f"lerobot:{kind}: got actions {not_positions}, want positions of joints, NAME.pos"
+                f"lerobot:{robot_type}: got actions {not_positions}, want positions of joints, "
+                "NAME.pos"
             )
 
         self._robot.connect(calibrate=False)
         if not self._robot.is_calibrated:
             self._robot.disconnect()
             raise ConfigError(
-                f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with "
-                "its id"
+                f"lerobot:{robot_type}: not calibrated; run lerobot-calibrate "
+                f"--robot.type={robot_type} with its id"
             )
 
         self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
@@ -130,12 +135,13 @@ class LeRobotRobot:
 
     @property
     def joint_limits(self) -> np.ndarray:
-        """The limits of the motors by LeRobot's settings and calibration, (D, 2) in their unit;
-        infinite if unknown.
+        """The limits of the motors from LeRobot's settings and calibration, (D, 2) in the unit of
+        the joints; infinite if they are unknown.
         """
         return np.array([self._limits_of(name) for name in self.joint_names])
 
     def _limits_of(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest position of a motor."""
         config = getattr(self._robot, "config", None)
         configured = getattr(config, "joint_limits", None) or {}
         if name in configured:
@@ -156,13 +162,11 @@ class LeRobotRobot:
 
     @property
     def contract(self) -> Contract:
-        """The cameras, the joints and the actions, by LeRobot's features."""
-        features = self._robot.observation_features
-        cameras = {
-            name: CameraSpec(*shape[:2])
-            for name, shape in features.items()
-            if isinstance(shape, tuple)
-        }
+        """The cameras, the joints and the actions, from LeRobot's features."""
+        cameras = {}
+        for name, shape in self._robot.observation_features.items():
+            if isinstance(shape, tuple):  # the feature of a camera
+                cameras[name] = CameraSpec(*shape[:2])
         return Contract(
             cameras=cameras,
             state={"joints": StateSpec(len(self._keys), self._unit)},
@@ -171,7 +175,7 @@ class LeRobotRobot:
         )
 
     def observe(self) -> Obs:
-        """Return what LeRobot reads; the first reading begins now."""
+        """Return LeRobot's observation, whose capture time is the beginning of this call."""
         captured_at = time.time()
         readings = self._robot.get_observation()
 
@@ -192,7 +196,7 @@ class LeRobotRobot:
     def stop(self) -> None:
         """Make the measured positions the goal; torque stays on, so that the arm does not fall.
 
-        No camera is read. Without a bus, or if it cannot be read, the goal is the pose of the last
+        No camera is read. If there is no bus or it cannot be read, the goal is the pose of the last
         observation. The grippers keep their goal.
 
         Raises:
@@ -214,8 +218,8 @@ class LeRobotRobot:
         if self._goal is not None:
             grippers = ["gripper" in name for name in self.joint_names]
             positions[grippers] = self._goal[grippers]
-        goals = dict(zip(self._keys, map(float, positions), strict=True))
 
+        goals = dict(zip(self._keys, map(float, positions), strict=True))
         try:
             self._robot.send_action(goals)
         except Exception:
@@ -223,12 +227,11 @@ class LeRobotRobot:
             if bus is None:
                 raise
             # With max_relative_target, LeRobot reads the positions before it sends a goal.
-            bus.sync_write(
-                "Goal_Position", {key.removesuffix(".pos"): goal for key, goal in goals.items()}
-            )
+            goals_of_motors = {key.removesuffix(".pos"): goal for key, goal in goals.items()}
+            bus.sync_write("Goal_Position", goals_of_motors)
 
     def _present(self) -> np.ndarray:
-        """Return the joints without reading a camera if possible, (D,)."""
+        """Return the present joints, (D,), if possible without reading a camera."""
         bus: Any = getattr(self._robot, "bus", None)
         if hasattr(bus, "sync_read"):
             try:

@@ -20,13 +20,13 @@ from vlagents_ray_robot import DISTRIBUTION
 
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "SpaceMouse"]
 
-_FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
+_FULLY_OPEN = 0.9  # a gripper with a smaller opening may hold something
 
 
 class AxesDevice(ABC):
     """A device with axes; its methods return at once."""
 
-    _presses = 0  # of the gripper's button
+    _presses = 0  # the number of presses of the gripper's button
     _taken = False  # whether the operator has taken over
 
     @abstractmethod
@@ -35,7 +35,7 @@ class AxesDevice(ABC):
 
     @abstractmethod
     def axes(self) -> np.ndarray:
-        """Return x, y, z, roll, pitch and yaw as read last, (6,), each in [-1, 1]."""
+        """Return x, y, z, roll, pitch and yaw from the last reading, (6,), each in [-1, 1]."""
 
     def gripper_presses(self) -> int:
         """Return the number of presses of the gripper's button since the last call."""
@@ -43,8 +43,10 @@ class AxesDevice(ABC):
         return presses
 
     def help(self, *, joints: bool) -> str:
-        """Return a line that explains the device to the operator; `joints`: whether its axes are
-        joints.
+        """Return a line that explains the device to the operator.
+
+        Args:
+            joints: Whether the axes move joints.
         """
         return ""
 
@@ -67,10 +69,10 @@ class AxesDevice(ABC):
 
         Args:
             contract: The contract of the policy or the environment.
-            step: The change of a number of the action at a tick with an axis at its end; None: by
-                the contract.
-            measure: Returns the robot's measured pose, (D,), in an observation; None: the state's
-                part `joints`.
+            step: The change of a number of the action at a tick with an axis at its end; None
+                takes it from the contract.
+            measure: Returns the robot's measured pose, (D,), in an observation; None reads the
+                state's part `joints`.
 
         Yields:
             The leader, an `AxesLeader`.
@@ -83,12 +85,12 @@ class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
     Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the
-    action has them, rotations; else the first six joints. The gripper is that of
-    `ActionSpec.gripper_columns`. At a takeover it stays open if it is fully open; else it is
-    closed, as it may hold something.
+    action has them, rotations; else the first six joints. The gripper is the number of
+    `ActionSpec.gripper_columns`. At a takeover the gripper stays open if it is fully open; else it
+    is closed, as it may hold something.
 
     Args:
-        contract: The policy's contract, which states `action.dim`, and whether actions are
+        contract: The policy's contract, which declares `action.dim` and whether actions are
             relative.
         device: The device.
         step: The change of a number at a tick with the axis at its end, in the action's units;
@@ -99,7 +101,7 @@ class AxesLeader:
 
     Raises:
         ConfigError: The contract is incomplete, or has several grippers, which one button cannot
-            keep; or `step` is missing or not above 0.
+            operate; or `step` is missing or not above 0.
     """
 
     def __init__(
@@ -147,71 +149,84 @@ class AxesLeader:
 
         self._measure = measure
         self._engaged = False
-        self._closed: bool | None = None  # None: as at the takeover
-        self._target: np.ndarray | None = None  # of absolute actions
+        self._closed: bool | None = None  # None before the gripper is read at a takeover
+        self._target: np.ndarray | None = None  # the last target, (D,), if actions are absolute
 
     @property
     def help(self) -> str:
         """A line that explains the device to the operator; "" if it needs none."""
-        return self._device.help(
-            joints=self._spec.space in (None, "joint") and not self._spec.relative
-        )
+        moves_joints = self._spec.space in (None, "joint") and not self._spec.relative
+        return self._device.help(joints=moves_joints)
 
     def engaged(self) -> bool:
         """Read the device, and return whether the operator moves the robot."""
         engaged = self._device.engaged()
-        if engaged and not self._engaged:
-            self._closed = self._target = None
+        if engaged and not self._engaged:  # a takeover
+            self._closed = None
+            self._target = None
         self._engaged = engaged
         return engaged
 
     def rebase(self, last: np.ndarray | None) -> None:
-        """Begin the next absolute target at the last command, (D,), or at the measured pose if
-        `last` is None.
+        """Begin the next absolute target at another pose.
+
+        Args:
+            last: The last command, (D,); None for the measured pose.
         """
         self._target = None if last is None else np.array(last, np.float32)
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the action of the axes as read last, (D,) float32."""
+        """Return the action of the axes at the last reading, (D,) float32.
+
+        Raises:
+            MissingState: The observation has no pose from which an absolute target begins.
+        """
         spec = self._spec
         axes = self._device.axes()
-        moved = np.zeros(self._dim, np.float32)
+        action = np.zeros(self._dim, np.float32)
         n = min(self._dim - len(self._grippers), len(axes))
-        moved[:n] = self._step * axes[:n]
+        action[:n] = self._step * axes[:n]
 
-        command: float | None = None
-        if self._grippers:
-            if self._closed is None:
-                self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
-            if self._device.gripper_presses() % 2:
-                self._closed = not self._closed
-            command = float((spec.gripper_closed if self._closed else spec.gripper_open) or 0.0)
-
+        gripper_command = self._gripper_command(obs) if self._grippers else None
         if not spec.relative:
-            if self._target is None and self._measure is not None:
-                self._target = np.array(self._measure(obs), np.float32)
-            elif self._target is None:
-                if "joints" not in obs.state:
-                    raise MissingState("joints", obs.state)
-                target = [*obs.state["joints"]]
-                if command is not None:
-                    target.append(command)
-                self._target = np.array(target, np.float32)
-
-            moved = self._target + moved
+            if self._target is None:
+                self._target = self._start(obs, gripper_command)
+            action = self._target + action
             if spec.low is not None or spec.high is not None:
-                moved = np.clip(moved, spec.low, spec.high)
-            self._target = moved
+                action = np.clip(action, spec.low, spec.high)
+            self._target = action
 
-        if command is not None:
-            moved[self._grippers] = command
-        return moved.astype(np.float32)
+        if gripper_command is not None:
+            action[self._grippers] = gripper_command
+        return action.astype(np.float32)
+
+    def _gripper_command(self, obs: Obs) -> float:
+        """Return the command of the gripper, which its button opens and closes."""
+        if self._closed is None:
+            self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
+        if self._device.gripper_presses() % 2:
+            self._closed = not self._closed
+        command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
+        return float(command or 0.0)
+
+    def _start(self, obs: Obs, gripper_command: float | None) -> np.ndarray:
+        """Return the pose at which absolute targets begin, (D,) float32."""
+        if self._measure is not None:
+            return np.array(self._measure(obs), np.float32)
+        if "joints" not in obs.state:
+            raise MissingState("joints", obs.state)
+        pose = [*obs.state["joints"]]
+        if gripper_command is not None:
+            pose.append(gripper_command)
+        return np.array(pose, np.float32)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
 
-# How long a key counts as pressed: terminals report no release, and repeat a key that is held.
+# The time for which a key counts as pressed: terminals report no release, and repeat a key that is
+# held down.
 HOLD_S = 0.2
+# By key: the axis and the direction.
 AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
 AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
 GRIPPER, TAKE = " ", "\n"
@@ -233,7 +248,7 @@ class Keyboard(AxesDevice):
 
     Args:
         keys: Further keys, and functions, which the thread of the control loop calls.
-        terminal: The file descriptor of the terminal; default: that of standard input.
+        terminal: The file descriptor of the terminal; default: the one of standard input.
 
     Raises:
         ConfigError: A key is used twice, or there is no terminal.
@@ -243,11 +258,15 @@ class Keyboard(AxesDevice):
         self, keys: Mapping[str, Callable[[], object]] | None = None, *, terminal: int | None = None
     ) -> None:
         self._keys = dict(keys or {})
-        taken = sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE})
-        if taken:
-            raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
+        used_twice = sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE})
+        if used_twice:
+            raise ConfigError(
+                f"keyboard: {used_twice} move the robot, so they cannot do something else"
+            )
+
         self._terminal = Terminal(terminal)
-        # S of `time.monotonic`: until when a key counts, for each axis and direction.
+        # By axis and direction: the time until which its key counts as pressed, s of
+        # `time.monotonic`.
         self._until = np.zeros((6, 2))
         self._open = contextlib.ExitStack()
 
@@ -273,6 +292,7 @@ class Keyboard(AxesDevice):
         return JOINTS_HELP if joints else HELP
 
     def _press(self, key: str) -> bool:
+        """Handle a key; return whether it has a meaning."""
         if key in AXES:
             axis, sign = AXES[key]
             direction = 0 if sign > 0 else 1
@@ -294,8 +314,10 @@ class Keyboard(AxesDevice):
 
 # A SpaceMouse as a device with axes; it needs the extra "spacemouse".
 
-_DEAD = 0.1  # of the range: the cap never rests exactly in the middle
-_REPORTS = 64  # reports read at one tick, as the device sends more reports than a loop has ticks
+# Within this share of its range, an axis counts as 0: the cap never rests exactly in the middle.
+_DEAD = 0.1
+# Most reports that are read at one tick, as the device sends more reports than a loop has ticks.
+_REPORTS = 64
 
 
 class SpaceMouse(AxesDevice):
@@ -314,7 +336,7 @@ class SpaceMouse(AxesDevice):
         try:
             library: Any = require("pyspacemouse", extra="spacemouse", distribution=DISTRIBUTION)
             self._device: Any = library.open(axis_convention=library.AxisConvention.ROS)
-        except (OSError, RuntimeError) as error:  # also of hidapi, which the library loads
+        except (OSError, RuntimeError) as error:  # the library loads hidapi, which may fail
             raise ConfigError(
                 f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), "
                 "and let this user read its /dev/hidraw"
@@ -334,9 +356,9 @@ class SpaceMouse(AxesDevice):
                 break
             last_report = state.t
 
-            before = self._buttons or [0] * len(state.buttons)
+            last_buttons = self._buttons or [0] * len(state.buttons)
             self._buttons = list(state.buttons)
-            pressed = [now > then for now, then in zip(self._buttons, before, strict=True)]
+            pressed = [now > last for now, last in zip(self._buttons, last_buttons, strict=True)]
             if pressed and pressed[0]:
                 self._presses += 1
                 self._taken = True
@@ -352,9 +374,7 @@ class SpaceMouse(AxesDevice):
         return self._axes
 
 
-# The devices by name, `--leader keyboard`; see `vlagents_ray.robot.leaders.OpenLeader`.
-
-
-# The leaders "keyboard" and "spacemouse".
+# The functions that open the leaders "keyboard" and "spacemouse", see
+# `vlagents_ray.robot.leaders.OpenLeader`.
 open_keyboard = Keyboard.open_leader
 open_spacemouse = SpaceMouse.open_leader

@@ -22,7 +22,8 @@ def check_robot(robot: Robot, **options: Any) -> RobotReport:
 
     Args:
         robot: The robot.
-        options: Those of `vlagents_ray_robot.check.examine`. Without an `operator` nothing moves.
+        options: Further arguments of `vlagents_ray_robot.check.examine`. Without an `operator`
+            nothing moves.
 
     Returns:
         The report, with the checks that were not made.
