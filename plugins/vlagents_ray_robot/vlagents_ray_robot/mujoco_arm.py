@@ -26,19 +26,21 @@ from vlagents_ray_robot.check import Operator, arm_part
 # Set this before any import of mujoco, which reads it; packages of models import mujoco.
 if not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")
-_SETTLING_S = 1.0
+_SETTLING_S = 1.0  # the time in which an arm comes to rest at the begin
 _GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
-_PREFIX = "vlagents_ray/"  # of what is added to a model, so that no name of the model is taken
-_KP, _KV = 1000.0, 100.0  # gains of a controller for a model without one, N m/rad and N m s/rad
-_RED = (220, 20, 30)  # the card of `SimulatedOperator`
+# The prefix of the names that are added to a model, so that they differ from the model's names.
+_PREFIX = "vlagents_ray/"
+# Gains of the controller for a model that has none, N m/rad and N m s/rad.
+_KP, _KV = 1000.0, 100.0
+_RED = (220, 20, 30)  # the colour of the card of `SimulatedOperator`, RGB
 
 
 @dataclass(frozen=True)
 class ArmModel:
-    """What a model file does not state of an arm."""
+    """The facts about an arm that its model file does not contain."""
 
-    menagerie: str  # folder of the model in the MuJoCo Menagerie
-    # Of each joint without the gripper, rad; the file's first keyframe if empty.
+    menagerie: str  # the folder of the model in the MuJoCo Menagerie
+    # The rest pose of the joints without the gripper, rad; if empty, the file's first keyframe.
     rest: tuple[float, ...] = ()
     open_high: bool = True  # whether the gripper opens towards the upper end of its range
     arms: tuple[str, ...] = ()  # the names of several arms, in the order of the file
@@ -56,7 +58,7 @@ ARMS = {
 
 
 class SimulatedClock:
-    """The part of the module `time` that robots and their check use, in simulated time."""
+    """The functions of the module `time` that robots and their check use, in simulated time."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
@@ -77,40 +79,43 @@ class SimulatedClock:
 
 @dataclass(slots=True)
 class _Drive:
-    """The actuators that one number of an action moves, and their ends: of a joint, or of a
-    gripper's fingers.
-    """
+    """The actuators that one number of an action moves: of a joint, or of a gripper's fingers."""
 
     name: str
     actuators: list[int] = field(default_factory=list)
-    # Of each actuator: its control at 0; of a joint its lower limit.
+    # For each actuator: the lower limit of a joint, or the control of a closed gripper.
     low: list[float] = field(default_factory=list)
-    # At 1, which is open; of a joint its upper limit.
+    # For each actuator: the upper limit of a joint, or the control of an open gripper.
     high: list[float] = field(default_factory=list)
     gripper: bool = False
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The lowest and the highest number of an action."""
+        return (0.0, 1.0) if self.gripper else (self.low[0], self.high[0])
 
 
 class MujocoArm:
     """A simulated arm with a position controller, cameras, latency and measured joints.
 
-    An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open,
-    for each arm in turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose
-    of the hand in the frame of the arm's base, m and quaternion xyzw; with two arms `left/joints`
-    and so on. `contract`, `joint_names`, `joint_limits` and `operator` describe the arm to the loop
-    and to the check of a robot. Physics advance with `clock` whenever a method is called.
-    `simulated` is True, so that a stop ends by itself.
+    An action has the target of each joint, rad, and after them the gripper's opening in [0, 1],
+    1 = open, for one arm after the other. An observation has the part `joints`, (D,) rad, and
+    `tquat`, (7,), the pose of the hand in the frame of the arm's base, m and quaternion xyzw; with
+    two arms `left/joints` and so on. `contract`, `joint_names`, `joint_limits` and `operator`
+    describe the arm to the loop and to the check of a robot. The physics advance with `clock`
+    whenever a method is called. `simulated` is True, so that a stop ends by itself.
 
     Args:
         model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file.
             Names need the package `mujoco-menagerie`, which downloads a model at its first use, or
             finds it in the folder MENAGERIE_ROOT.
-        like: A name of `ARMS` whose rest pose, gripper and arms a file has.
-        cameras: Names of the cameras. "front" looks at the arm; any other is on the hand of an arm
-            in turn.
+        like: The name of an arm in `ARMS` with the rest pose, gripper and arms of the file.
+        cameras: Names of the cameras. "front" looks at the arm; the others are on the hands of the
+            arms, one after the other.
         size: Height and width of the pictures, px.
         fps: The rate of the cameras, Hz.
         delta: Whether actions are relative to the joints' last targets.
-        latency_s: Time from `apply` until the controller has the command, s.
+        latency_s: The time from `apply` until the controller receives the command, s.
         speed: The largest speed at which the controller moves a joint's target, rad/s.
         clock: The module `time`, or a `SimulatedClock`.
 
@@ -134,23 +139,27 @@ class MujocoArm:
         speed: float = 1.5,
         clock: Any = time,
     ) -> None:
-        self._mujoco = mujoco = require("mujoco", extra="arms", distribution=DISTRIBUTION)
+        mujoco = require("mujoco", extra="arms", distribution=DISTRIBUTION)
+        self._mujoco = mujoco
         arm_model = ARMS.get(like or str(model), ArmModel(str(model)))
         self.clock = clock
         self.delta = delta
         self.speed = speed
         self.arms = arm_model.arms or ("",)
+
         self._latency_s = latency_s
+        # Commands that the controller has not received yet, with the times at which it will.
+        self._queue: deque[tuple[float, np.ndarray]] = deque()
+        # The commanded targets, and the targets on the way to them at `speed`.
+        self._goal = np.zeros(0)
+        self._target = np.zeros(0)
+
         self._size = size
         self._frame_s = 1 / fps
-
-        self._queue: deque[tuple[float, np.ndarray]] = deque()
-        # The commanded targets, and those on the way to them at `speed`.
-        self._goal = self._target = np.zeros(0)
         self._renderer: Any = None
         self._pictures: dict[str, np.ndarray] = {}
+        self._pictures_s = -np.inf  # the time of these pictures
         self._card: str | None = None  # the camera before which the operator holds the red card
-        self._pictures_s = -np.inf
 
         spec = _read(mujoco, arm_model, str(model))
         _add_actuators(mujoco, spec)
@@ -188,7 +197,7 @@ class MujocoArm:
         )
 
     def observe(self) -> Obs:
-        """Return what encoders and cameras measure now."""
+        """Return the present measurements of encoders and cameras."""
         self._advance()
         now_s = self.clock.monotonic()
         if now_s - self._pictures_s >= self._frame_s:
@@ -208,7 +217,7 @@ class MujocoArm:
         return Obs(images, opening, state, {CAPTURED: self.clock.time()})
 
     def apply(self, action: np.ndarray) -> None:
-        """Set the targets, which the controller reads after the latency."""
+        """Command the targets, which the controller receives after the latency."""
         action = np.asarray(action, np.float64)
         if action.shape != (len(self._flat),):
             raise InvalidAction(
@@ -222,11 +231,11 @@ class MujocoArm:
         """Make the measured positions the targets; the gripper keeps its grasp."""
         self._advance()
         self._queue.clear()
-        targets = [
-            self._goal[i] if drive.gripper else self._measured(drive)
-            for i, drive in enumerate(self._flat)
-        ]
-        self._goal = self._target = np.array(targets)
+        targets = []
+        for i, drive in enumerate(self._flat):
+            targets.append(self._goal[i] if drive.gripper else self._measured(drive))
+        self._goal = np.array(targets)
+        self._target = self._goal
 
     def close(self) -> None:
         """Release the renderer of the cameras."""
@@ -246,7 +255,9 @@ class MujocoArm:
         return float(np.mean(openings or [1.0]))
 
     def hand_pose(self, number: int = 0) -> np.ndarray:
-        """Return the pose of an arm's hand in the frame of its base, (7,) m and quaternion xyzw."""
+        """Return the pose of the hand of an arm in the frame of its base, (7,) m and quaternion
+        xyzw.
+        """
         position, rotation = self._pose(self._hands[number])
         base_position, base_rotation = self._pose(self._bases[number])
 
@@ -256,7 +267,7 @@ class MujocoArm:
         return np.array([*position_in_base, *quaternion[1:], quaternion[0]], np.float32)
 
     def hold_card(self, camera: str | None) -> None:
-        """Show something red in the upper left of what a camera sees; None takes it away."""
+        """Show something red in the upper left of the picture of a camera; None takes it away."""
         self._card = camera
         self._pictures_s = -np.inf  # so that the next observation has new pictures
 
@@ -270,17 +281,19 @@ class MujocoArm:
         pictures = {}
         for name, index in self._cameras.items():
             self._renderer.update_scene(self.data, index)
-            pictures[name] = picture = self._renderer.render()
+            picture = self._renderer.render()
+            pictures[name] = picture
             if name == self._card:
                 height, width = np.array(picture.shape[:2]) // 8
                 picture[height : 3 * height, width : 3 * width] = _RED
         return pictures
 
     def _now(self) -> float:
+        """Return the present time of the simulation, s."""
         return float(self.clock.monotonic() - self._begun_s)
 
     def _advance(self) -> None:
-        """Step the physics up to the present."""
+        """Advance the physics to the present time."""
         now_s = self._now()
         step_s = self.model.opt.timestep
         while self.data.time + step_s <= now_s:
@@ -288,11 +301,8 @@ class MujocoArm:
                 _, action = self._queue.popleft()
                 relative = [self.delta and not drive.gripper for drive in self._flat]
                 goal = np.where(relative, self._goal + action, action)
-                limits = [
-                    (0.0, 1.0) if drive.gripper else (drive.low[0], drive.high[0])
-                    for drive in self._flat
-                ]
-                self._goal = np.clip(goal, *np.transpose(limits))
+                low, high = np.transpose([drive.limits for drive in self._flat])
+                self._goal = np.clip(goal, low, high)
 
             max_change = self.speed * step_s
             change = np.clip(self._goal - self._target, -max_change, max_change)
@@ -301,21 +311,25 @@ class MujocoArm:
             self._mujoco.mj_step(self.model, self.data)
 
     def _control(self, targets: np.ndarray) -> None:
+        """Set the controls of the actuators for the targets of an action, (D,)."""
         for drive, target in zip(self._flat, targets, strict=True):
             for actuator, low, high in zip(drive.actuators, drive.low, drive.high, strict=True):
                 self.data.ctrl[actuator] = low + target * (high - low) if drive.gripper else target
 
     def _measured(self, drive: _Drive) -> float:
+        """Return the measured position of a joint, rad, or the opening of a gripper."""
         actuator, low, high = drive.actuators[0], drive.low[0], drive.high[0]
         length = float(self.data.actuator_length[actuator])
         if not drive.gripper:
             return length
-        control = -length * float(
-            self.model.actuator_biasprm[actuator, 1] / self.model.actuator_gainprm[actuator, 0]
-        )
+
+        stiffness = self.model.actuator_biasprm[actuator, 1]
+        gain = self.model.actuator_gainprm[actuator, 0]
+        control = -length * float(stiffness / gain)
         return (control - low) / (high - low)
 
     def _compile(self, spec: Any, arm_model: ArmModel) -> None:
+        """Compile a model, read its actuators, hands and bases, and move it to the rest pose."""
         self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
         self._drives = self._read_drives(arm_model)
@@ -354,12 +368,11 @@ class MujocoArm:
         hand_positions = [position for position, _ in hands]
         base_positions = [self.data.xpos[base] for base in self._bases]
         centre = np.mean(hand_positions + base_positions, axis=0)
-        reach = max(
-            np.linalg.norm(hand - base)
-            for hand, base in zip(hand_positions, base_positions, strict=True)
-        )
+        reach = 0.0
+        for hand_position, base_position in zip(hand_positions, base_positions, strict=True):
+            reach = max(reach, float(np.linalg.norm(hand_position - base_position)))
 
-        number = 0  # of the arm that gets the next camera on its hand
+        arm = 0  # the arm that gets the next camera on its hand
         for name in cameras:
             if name == "front":
                 away = np.array([1.5, 1.0, 1.0]) * reach
@@ -367,8 +380,8 @@ class MujocoArm:
                 world.add_camera(name=_PREFIX + name, fovy=60, **camera)
                 continue
 
-            hand, base = self._hands[number], self._bases[number]
-            number = (number + 1) % len(hands)
+            hand, base = self._hands[arm], self._bases[arm]
+            arm = (arm + 1) % len(hands)
             position, rotation = self._pose(hand)
             out = (position - self.data.xpos[base]) * [1, 1, 0]
             up = np.array([0, 0, 0.12])
@@ -377,8 +390,14 @@ class MujocoArm:
             spec.body(self.model.body(hand).name).add_camera(name=_PREFIX + name, fovy=75, **camera)
 
     def _looking(self, view: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Return the rotation, wxyz in a frame, of a camera that looks into a direction of the
-        world.
+        """Return the rotation of a camera.
+
+        Args:
+            view: The direction into which it looks, in the world, (3,).
+            frame: The rotation of the frame in which it is mounted, (3, 3).
+
+        Returns:
+            The rotation in that frame, a quaternion wxyz, (4,).
         """
         back = -view / np.linalg.norm(view)
         right = np.cross([0.0, 0.0, 1.0], back)
@@ -393,34 +412,37 @@ class MujocoArm:
         """Begin at the rest pose with open grippers, and let the arm settle."""
         if self.model.nkey:
             self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        rest = iter(arm_model.rest)
         self._mujoco.mj_forward(self.model, self.data)
-        goal = [1.0 if drive.gripper else next(rest, self._measured(drive)) for drive in self._flat]
+
+        rest_pose = iter(arm_model.rest)
+        goal = []
+        for drive in self._flat:
+            goal.append(1.0 if drive.gripper else next(rest_pose, self._measured(drive)))
 
         for drive, target in zip(self._flat, goal, strict=True):
             joint = int(self.model.actuator_trnid[drive.actuators[0], 0])
             if not drive.gripper:
                 self.data.qpos[self.model.jnt_qposadr[joint]] = target
 
-        self._goal = self._target = np.array(goal)
+        self._goal = np.array(goal)
+        self._target = self._goal
         self._control(self._goal)
         while self.data.time < _SETTLING_S:
             self._mujoco.mj_step(self.model, self.data)
 
     def _read_drives(self, arm_model: ArmModel) -> list[list[_Drive]]:
-        """Group the actuators by arm and by number of an action."""
-        arms: list[list[_Drive]] = [[] for _ in self.arms]
+        """Return the drives of each arm, in the order of an action: the joints, and the gripper if
+        there is one.
+        """
+        joints_of_arms: list[list[_Drive]] = [[] for _ in self.arms]
         grippers = [_Drive("gripper", gripper=True) for _ in self.arms]
 
         for index in range(self.model.nu):
-            of_joint = self.model.actuator_trntype[index] == self._mujoco.mjtTrn.mjTRN_JOINT
-            joint = (
-                self.model.joint(int(self.model.actuator_trnid[index, 0])).name if of_joint else ""
-            )
+            moves_joint = self.model.actuator_trntype[index] == self._mujoco.mjtTrn.mjTRN_JOINT
+            joint = ""
+            if moves_joint:
+                joint = self.model.joint(int(self.model.actuator_trnid[index, 0])).name
             name = self.model.actuator(index).name or joint
-            number = next(
-                (i for i, arm in enumerate(self.arms) if arm and arm in f"{name} {joint}"), 0
-            )
             if self.model.actuator_biasprm[index, 1] == 0:
                 raise ConfigError(
                     f"{arm_model.menagerie}: actuator {name!r} has no position controller, "
@@ -428,43 +450,56 @@ class MujocoArm:
                 )
 
             low, high = map(float, self.model.actuator_ctrlrange[index])
-            if of_joint and low >= high:  # not limited
+            if moves_joint and low >= high:  # not limited
                 joint_range = self.model.jnt_range[self.model.actuator_trnid[index, 0]]
                 if joint_range[0] >= joint_range[1]:
                     joint_range = (-2 * np.pi, 2 * np.pi)
                 low, high = map(float, joint_range)
 
-            if _GRIPPER.search(name) or _GRIPPER.search(joint) or not of_joint:
-                # Of two fingers that move against each other, one has its open end where its number
-                # is small.
+            arm = self._arm_of(f"{name} {joint}")
+            if _GRIPPER.search(name) or _GRIPPER.search(joint) or not moves_joint:
+                # Of two fingers that move against each other, one is open at its lower limit.
                 rising = arm_model.open_high if abs(high) >= abs(low) else not arm_model.open_high
-                drive = grippers[number]
+                drive = grippers[arm]
                 drive.low.append(low if rising else high)
                 drive.high.append(high if rising else low)
             else:
                 drive = _Drive(name, low=[low], high=[high])
-                arms[number].append(drive)
+                joints_of_arms[arm].append(drive)
             drive.actuators.append(index)
 
-        return [
-            [*drives, *([grip] if grip.actuators else [])]
-            for drives, grip in zip(arms, grippers, strict=True)
-        ]
+        for joints, gripper in zip(joints_of_arms, grippers, strict=True):
+            if gripper.actuators:
+                joints.append(gripper)
+        return joints_of_arms
+
+    def _arm_of(self, names: str) -> int:
+        """Return the index of the arm whose name is in the names of an actuator and its joint."""
+        for i, arm in enumerate(self.arms):
+            if arm and arm in names:
+                return i
+        return 0
 
     def _pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the position, (3,), and the rotation, (3, 3), of a body in the world."""
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
 
 
 def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
-    """Return the specification of a model file, which MuJoCo can compile."""
+    """Return the specification of a model, which MuJoCo can compile.
+
+    Raises:
+        ConfigError: The model is unknown, or its file does not exist.
+    """
     file = Path(model)
     if file.suffix not in (".xml", ".mjcf", ".urdf"):
         menagerie = require("mujoco_menagerie", extra="arms", distribution=DISTRIBUTION)
-        known = menagerie.names()
-        if arm_model.menagerie not in known:
+        menagerie_names = menagerie.names()
+        if arm_model.menagerie not in menagerie_names:
             raise ConfigError(
                 f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, "
-                f"or the path of an MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
+                "or the path of an MJCF or URDF file"
+                f"{did_you_mean(model, [*ARMS, *menagerie_names])}"
             )
 
         robot = menagerie.get(arm_model.menagerie)
@@ -492,8 +527,8 @@ def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
 
 
 def _add_actuators(mujoco: Any, spec: Any) -> None:
-    """Give each joint of a model without actuators, such as a URDF, a position controller that
-    carries its weight.
+    """Add a position controller to each joint of a model without actuators, such as a URDF, and
+    compensate gravity.
     """
     if spec.actuators:
         return
@@ -516,7 +551,12 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
 
 
 class SimulatedOperator(Operator):
-    """A person at a simulated arm, who agrees to every motion and sees what the arm does."""
+    """An operator at a simulated arm, who agrees to every motion, and reads the answers from the
+    simulation.
+
+    Args:
+        arm: The arm.
+    """
 
     def __init__(self, arm: MujocoArm) -> None:
         self._arm = arm
@@ -542,5 +582,7 @@ class SimulatedOperator(Operator):
         """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its
         base.
         """
-        true = self._arm.hand_pose(arm)
-        return bool(np.linalg.norm(true[:3] - pose[:3]) < 0.1 and abs(true[3:] @ pose[3:]) > 0.975)
+        true_pose = self._arm.hand_pose(arm)
+        is_near = np.linalg.norm(true_pose[:3] - pose[:3]) < 0.1
+        is_turned_alike = abs(true_pose[3:] @ pose[3:]) > 0.975
+        return bool(is_near and is_turned_alike)
