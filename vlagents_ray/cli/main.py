@@ -76,7 +76,7 @@ app.command("eval", short_help="Evaluate policies in parallel: success with inte
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
 )
 def robot_command(context: typer.Context) -> None:
-    """Drive a robot or a simulation with a policy, an operator, or both."""
+    """Drive a robot or simulation with a policy, an operator, or both."""
     from vlagents_ray.cli.robot import main
 
     raise typer.Exit(main(context.args))

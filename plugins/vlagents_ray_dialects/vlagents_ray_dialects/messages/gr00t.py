@@ -4,7 +4,7 @@ map.
 Sources: Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and
 newer). A request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True,
 "as_npy": <.npy file>}` or, in newer clients, has the format of `msgpack_numpy`: `{b"nd": True,
-b"type", b"kind", b"shape", b"data"}`; the reply has the format of the request.
+b"type", b"kind", b"shape", b"data"}`. The arrays of a reply have the format of the request's.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ from vlagents_ray.validation import described
 from vlagents_ray_dialects.messages import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
-TEXT_KEY = "task"  # our key in "language", which replaces the client's
+TEXT_KEY = "task"  # our key of the instruction in "language", which replaces the client's
 _FLAT_TEXT_KEY = "annotation.human.task_description"  # the key of most of N1.5's robots
-_ARRAYS = ("video", "state")
-_MODALITIES = (*_ARRAYS, "language")
+_ARRAY_MODALITIES = ("video", "state")
+_MODALITIES = (*_ARRAY_MODALITIES, "language")
 _BATCH = 256  # maximum number of observations in one message
 
 
 @dataclass(frozen=True, slots=True)
 class GR00TRequest:
-    endpoint: str
+    """One message of a client."""
+
+    endpoint: str  # one of ENDPOINTS
     data: dict[str, Any]
     packed: bool  # whether its arrays have the format of msgpack_numpy
 
@@ -57,7 +59,19 @@ _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the field
 
 
 def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None:
-    """Return the API key in a message without decoding the other fields; None if it has none."""
+    """Return the API key in a message without decoding the other fields.
+
+    Args:
+        payload: The message.
+        limits: The limits of its size.
+
+    Returns:
+        The key; None if the message has none.
+
+    Raises:
+        MalformedMessage: The message is not a map, or the key is not a text.
+        MessageTooLarge: The message is too long.
+    """
     if len(payload) > limits.body_bytes:
         raise MessageTooLarge(
             f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}"
@@ -79,7 +93,6 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
             token = reader.unpack()
             if token is not None and not isinstance(token, str):
                 raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
-
             return token
     except (package.exceptions.UnpackException, ValueError, TypeError) as error:
         if isinstance(error, MalformedMessage):
@@ -91,12 +104,20 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
 
 
 def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TRequest:
-    """Return the request in a message; raise `MalformedMessage` or `MessageTooLarge` if it is
-    invalid.
+    """Decode a request.
+
+    Args:
+        payload: The message.
+        limits: The limits of its size and content.
+
+    Raises:
+        MalformedMessage: The message is not a request.
+        MessageTooLarge: The message exceeds a limit.
     """
     packed = False
 
     def array(node: dict[Any, Any]) -> Any:
+        """Return the array in a map, and note whether it has the format of msgpack_numpy."""
         nonlocal packed
         packed = packed or msgpack.is_packed(node)
         return _array(node, limits)
@@ -120,14 +141,21 @@ def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TReq
 
 
 def read_observations(data: Mapping[str, Any]) -> Observations:
-    """Return the observations in the data of a `get_action`; raise `InvalidObservation` for
-    wrong shapes.
+    """Read the observations of a request `get_action`.
+
+    Args:
+        data: The data of the request.
+
+    Raises:
+        InvalidObservation: A shape is wrong, or the arrays have different batch sizes.
     """
     paired = isinstance(data.get("observation"), dict)
     observation = data["observation"] if paired else data
     flat = is_flat(observation)
     by_modality = nested(observation) if flat else observation
-    groups = {kind: _arrays(by_modality.get(kind), kind) for kind in _ARRAYS}
+    groups = {
+        modality: _arrays(by_modality.get(modality), modality) for modality in _ARRAY_MODALITIES
+    }
 
     batch_axes = {array.ndim - 4 for array in groups["video"].values()}
     batch_axes |= {array.ndim - 2 for array in groups["state"].values()}
@@ -139,8 +167,8 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
         )
     batched = batch_axes == {1}
     if not batched:
-        for kind in _ARRAYS:
-            groups[kind] = {name: array[None] for name, array in groups[kind].items()}
+        for modality, group in groups.items():
+            groups[modality] = {name: array[None] for name, array in group.items()}
 
     arrays = [*groups["video"].values(), *groups["state"].values()]
     sizes = {array.shape[0] for array in arrays}
@@ -157,8 +185,8 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     each = []
     for i in range(number):
         single: dict[str, Any] = {}
-        for kind, group in groups.items():
-            single[kind] = {name: array[i] for name, array in group.items()}
+        for modality, group in groups.items():
+            single[modality] = {name: array[i] for name, array in group.items()}
         single["language"] = {} if texts[i] is None else {TEXT_KEY: texts[i]}
         each.append(single)
     return Observations(tuple(each), batched, flat, paired)
@@ -166,18 +194,18 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
 
 def is_flat(observation: Mapping[str, Any]) -> bool:
     """Return whether keys have the form "video.front" instead of "front" in a map "video"."""
-    return not any(isinstance(observation.get(kind), dict) for kind in _MODALITIES)
+    return not any(isinstance(observation.get(modality), dict) for modality in _MODALITIES)
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state
     become language.
     """
-    by_modality: dict[str, Any] = {kind: {} for kind in _MODALITIES}
+    by_modality: dict[str, Any] = {modality: {} for modality in _MODALITIES}
     for key, value in flat.items():
-        kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
-        if kind in _ARRAYS:
-            by_modality[kind][name] = value
+        modality, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
+        if modality in _ARRAY_MODALITIES:
+            by_modality[modality][name] = value
         else:
             by_modality["language"][key] = value
     return by_modality
@@ -188,44 +216,60 @@ def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
     (D,)}, "language": ...}.
     """
     last_step: dict[str, Any] = {}
-    for kind in _ARRAYS:
-        last_step[kind] = {name: array[-1] for name, array in observation[kind].items()}
+    for modality in _ARRAY_MODALITIES:
+        last_step[modality] = {name: array[-1] for name, array in observation[modality].items()}
     last_step["language"] = observation["language"]
     return last_step
 
 
 def write_actions(
-    actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]
+    actions: Sequence[Mapping[str, np.ndarray]],
+    observations: Observations,
+    info: Mapping[str, Any],
 ) -> Any:
-    """Return the reply to `get_action` with the actions of B sessions by name, each (H, D), as (B,
-    H, D) by name.
+    """Return the reply to `get_action`.
 
-    If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6
-    and newer.
+    Args:
+        actions: The actions of the B sessions by name, (H, D) each.
+        observations: The request, whose form the reply has: with or without a batch dimension.
+        info: Further values, which are only sent to N1.6 and newer.
+
+    Returns:
+        The actions by name, (B, H, D), or (H, D) without a batch dimension; for N1.6 and newer a
+        list of these and `info`.
+
+    Raises:
+        InvalidObservation: The actions of the sessions have different lengths.
     """
-    columns = {name: [action[name] for action in actions] for name in actions[0]}
-    shapes = {name: {array.shape for array in arrays} for name, arrays in columns.items()}
+    arrays_by_name: dict[str, list[np.ndarray]] = {}
+    shapes: dict[str, set[tuple[int, ...]]] = {}
+    for name in actions[0]:
+        arrays = [action[name] for action in actions]
+        arrays_by_name[name] = arrays
+        shapes[name] = {array.shape for array in arrays}
     if any(len(shapes_of_name) > 1 for shapes_of_name in shapes.values()):
         raise InvalidObservation(
             f"the batch's actions differ in length ({shapes}); send its observations one by one"
         )
 
-    joined = {name: np.stack(arrays).astype(np.float32) for name, arrays in columns.items()}
-    if not asked.batched:
+    joined = {name: np.stack(arrays).astype(np.float32) for name, arrays in arrays_by_name.items()}
+    if not observations.batched:
         joined = {name: array[0] for name, array in joined.items()}
-    if asked.flat:
+    if observations.flat:
         joined = {_flat("action", name): array for name, array in joined.items()}
-    return [joined, dict(info)] if asked.paired else joined
+    return [joined, dict(info)] if observations.paired else joined
 
 
 def modality_config(
     modalities: Mapping[str, tuple[Sequence[str], Sequence[int]]], *, flat: bool = False
 ) -> dict[str, Any]:
-    """Return the reply to `get_modality_config`: keys and time steps by modality, except for
-    modalities without keys.
+    """Return the reply to `get_modality_config`.
 
-    `flat` is the format of N1.5, in which keys contain their modality and a config is a JSON text.
-    The clients of N1.6 and newer read a map, and the newest refuses a modality without keys.
+    Args:
+        modalities: The keys and time steps of each modality. A modality without keys is omitted, as
+            the newest clients reject it.
+        flat: Whether the reply has the format of N1.5, in which keys contain their modality and a
+            config is a JSON text. The clients of N1.6 and newer read a map.
     """
     answer: dict[str, Any] = {}
     for name, (keys, steps) in modalities.items():
@@ -248,38 +292,46 @@ def modality_config(
 
 
 def _flat(modality: str, key: str) -> str:
-    """Return N1.5's name of a key, "modality.key"; the key of an action without named parts is
-    just "action".
-    """
+    """Return N1.5's name of a key, "modality.key"; an action without named columns is "action"."""
     return key if key == modality else f"{modality}.{key}"
 
 
 def pack(value: Any, *, packed: bool = False) -> bytes:
-    """Return a message with `value`; `packed` writes arrays in the format of `msgpack_numpy`."""
+    """Return the message for a value.
+
+    Args:
+        value: The value: plain values and arrays.
+        packed: Whether arrays have the format of `msgpack_numpy`; otherwise they are .npy files.
+    """
     return msgpack.pack(value, msgpack.write_packed if packed else write_npy)
 
 
-def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:
+def _arrays(group: Any, modality: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a modality by name."""
     if group is None:
         return {}
     if not isinstance(group, dict):
-        raise InvalidObservation(f"{kind}: got {type(group).__name__}, want a map of arrays")
+        raise InvalidObservation(f"{modality}: got {type(group).__name__}, want a map of arrays")
     for name, array in group.items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray):
             raise InvalidObservation(
-                f"{kind}.{shown(name)}: got {type(array).__name__}, want an array"
+                f"{modality}.{shown(name)}: got {type(array).__name__}, want an array"
             )
     return group
 
 
 def _texts(language: Any, number: int) -> list[str | None]:
-    """Return the instruction of each of `number` observations; `language` has one key, with text
-    or lists of it.
+    """Return the instruction of each observation.
+
+    Args:
+        language: The map "language" with one key, whose value is a text or lists of texts.
+        number: The number of observations.
     """
     if not isinstance(language, dict) or not language:
         return [None] * number
     if len(language) > 1:
         raise InvalidObservation(f"language: got {shown(list(language))}, want one instruction")
+
     [(key, value)] = language.items()
     texts = [value] * number if isinstance(value, str) else value
     if isinstance(texts, list) and len(texts) == 1:
@@ -292,7 +344,8 @@ def _texts(language: Any, number: int) -> list[str | None]:
 
 
 def _text(key: Any, value: Any) -> str:
-    while isinstance(value, list) and value:  # in a list over time, the newest text counts
+    """Return an instruction; of a list over time, the newest one."""
+    while isinstance(value, list) and value:
         value = value[-1]
     if not isinstance(value, str):
         raise InvalidObservation(f"{shown(key)}: got {type(value).__name__}, want text")
@@ -301,13 +354,13 @@ def _text(key: Any, value: Any) -> str:
 
 # Arrays in the format of most of GR00T's clients: .npy files.
 #
-# A file's header is matched, not evaluated, and must agree with the size of the content, so that no
-# memory is allocated for a false shape. Arrays of text become lists; arrays of objects and
-# structures are refused.
+# The header of a file is matched, not evaluated, and must agree with the size of the content, so
+# that no memory is allocated for a false shape. Arrays of text become lists; arrays of objects and
+# structures are rejected.
 
 _NPY = b"\x93NUMPY"
-# The header that numpy writes for every plain array; any other (structures, objects) is refused.
-# Each text has only one match, so that matching is fast.
+# The header that numpy writes for every plain array; other headers (structures, objects) are
+# rejected. Each text has only one match, so that matching is fast.
 _HEADER = re.compile(
     rb"\{'descr': '([<|]?[a-zA-Z]\d{1,5})', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \}\s*"
@@ -316,13 +369,23 @@ _TEXT_DTYPE = re.compile(r"<U\d{1,5}")
 
 
 def read_npy(data: Any, limits: MessageLimits) -> Any:
-    """Return the array in the bytes of an .npy file as a read-only view; an array of text as a
-    list.
+    """Read an .npy file.
+
+    Args:
+        data: The bytes of the file.
+        limits: The limits of texts.
+
+    Returns:
+        The array as a read-only view; an array of text as a list.
+
+    Raises:
+        MalformedMessage: The data are not an .npy file of numbers or text.
+        MessageTooLarge: The array has too much text.
     """
     if not isinstance(data, bytes) or not data.startswith(_NPY) or len(data) < 12:
         raise MalformedMessage("gr00t: as_npy: not an .npy file")
 
-    # Version 1 of the format has a header length of two bytes, later versions one of four.
+    # The length of the header has two bytes in version 1 of the format, four in later versions.
     start = 12 if data[6] > 1 else 10
     length = int.from_bytes(data[8:start], "little")
     header = _HEADER.fullmatch(data[start : start + length]) if length < 1000 else None
@@ -330,7 +393,7 @@ def read_npy(data: Any, limits: MessageLimits) -> Any:
         raise MalformedMessage("gr00t: as_npy: want a plain array of numbers or text")
 
     dtype, by_columns = header[1].decode(), header[2] == b"True"
-    shape = [int(n) for n in header[3].replace(b" ", b"").split(b",") if n]
+    shape = [int(size) for size in header[3].replace(b" ", b"").split(b",") if size]
     content = memoryview(data)[start + length :]
 
     if _TEXT_DTYPE.fullmatch(dtype):
@@ -348,7 +411,7 @@ def read_npy(data: Any, limits: MessageLimits) -> Any:
 
 
 def _array(node: dict[Any, Any], limits: MessageLimits) -> Any:
-    """Return the array that a map of either format stands for; any other map unchanged."""
+    """Return the array in a map of either format; any other map is returned unchanged."""
     if "__ndarray_class__" in node:
         return read_npy(node.get("as_npy"), limits)
     return msgpack.read_packed(node) if msgpack.is_packed(node) else node
@@ -363,14 +426,14 @@ def write_npy(value: Any) -> dict[str, Any]:
     raise TypeError(f"gr00t: cannot send {type(value).__name__}")
 
 
-# Mappings of GR00T's clients; the names of an action's columns depend on the robot, so a deployment
-# adds `action`.
+# Mappings for GR00T's clients. The names of an action's columns depend on the robot, so that a
+# deployment adds `action`.
 
 PRESETS: dict[str, dict[str, Any]] = {
     # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task":
     # [[text]]}}
     "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
-    # N1.5 sends the same content with flat keys.
+    # N1.5 sends the same content under flat keys.
     "gr00t-n1.5": {
         "cameras": {"*": "video.*"},
         "state": {"*": "state.*"},
@@ -381,7 +444,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 # The client's side of GR00T's protocol: writing requests, and reading replies within limits.
 #
-# N1.5's clients send flat keys and receive only the action; those of N1.6 and newer send
+# N1.5's clients send flat keys and receive only the action; clients of N1.6 and newer send
 # `{"observation": {...}, "options": None}` and receive `[action, info]`. The observation is nested,
 # or flat for servers that run with `--use-sim-policy-wrapper`. A server that marks its modalities
 # with `__ModalityConfig__` reads arrays of `msgpack_numpy`.
@@ -406,17 +469,18 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
         ValueError: The observations have different keys or shapes, and cannot be one batch.
     """
     first = observations[0]
-    names_by_kind = {kind: list(first.get(kind, {})) for kind in _ARRAYS}
+    names_by_modality = {modality: list(first.get(modality, {})) for modality in _ARRAY_MODALITIES}
     for observation in observations:
-        for kind, names in names_by_kind.items():
-            if list(observation.get(kind, {})) != names:
+        for modality, names in names_by_modality.items():
+            if list(observation.get(modality, {})) != names:
                 raise ValueError("the observations have different keys")
 
-    joined: dict[str, Any] = {kind: {} for kind in names_by_kind}
-    for kind, names in names_by_kind.items():
+    joined: dict[str, Any] = {}
+    for modality, names in names_by_modality.items():
+        joined[modality] = {}
         for name in names:
-            arrays = [observation[kind][name] for observation in observations]
-            joined[kind][name] = np.stack(arrays)[:, None]
+            arrays = [observation[modality][name] for observation in observations]
+            joined[modality][name] = np.stack(arrays)[:, None]
 
     texts = []
     for observation in observations:
@@ -427,13 +491,13 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
 
 
 def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the instruction's own key
+    """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the key of the instruction
     with B texts.
     """
     flat_batch: dict[str, Any] = {}
-    for kind in _ARRAYS:
-        for name, array in batched[kind].items():
-            flat_batch[f"{kind}.{name}"] = array
+    for modality in _ARRAY_MODALITIES:
+        for name, array in batched[modality].items():
+            flat_batch[f"{modality}.{name}"] = array
 
     for key, texts in batched["language"].items():
         flat_batch[key] = [text for [text] in texts]
@@ -441,8 +505,13 @@ def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
-    """Return the message of a request; `data` is omitted if it is None; `packed` is the result
-    of `reads_packed`.
+    """Return the message of a request.
+
+    Args:
+        endpoint: One of ENDPOINTS.
+        data: The data of the request; None omits them.
+        api_token: The API key; None or "" omits it.
+        packed: Whether arrays have the format of `msgpack_numpy`, see `reads_packed`.
     """
     message: dict[str, Any] = {"endpoint": endpoint}
     if data is not None:
@@ -453,15 +522,27 @@ def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = Fal
 
 
 def read(payload: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Any:
-    """Return the value of a reply; raise `MalformedMessage` or `MessageTooLarge` if it is
-    invalid.
+    """Decode a reply.
+
+    Raises:
+        MalformedMessage: The reply is not msgpack, or has an invalid array.
+        MessageTooLarge: The reply exceeds a limit.
     """
     return msgpack.unpack(payload, limits, partial(_array, limits=limits))
 
 
 def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
-    """Return the actions of each of `number` observations by name, (H, D), in a reply to
-    `get_action`.
+    """Read the actions in a reply to `get_action`.
+
+    Args:
+        reply: The reply.
+        number: The number of observations in the request.
+
+    Returns:
+        For each observation, the actions by name, (H, D) each.
+
+    Raises:
+        MalformedMessage: The reply is not a map of arrays, or has another number of actions.
     """
     actions = reply[0] if isinstance(reply, list) and len(reply) == 2 else reply
     if not isinstance(actions, dict) or not actions:
@@ -489,14 +570,19 @@ def reads_packed(reply: Any) -> bool:
     """Return whether the reply to `get_modality_config` is from a server that reads arrays of
     `msgpack_numpy`.
     """
-    return isinstance(reply, dict) and any(
-        isinstance(config, dict) and _PACKED in config for config in reply.values()
-    )
+    if not isinstance(reply, dict):
+        return False
+    return any(isinstance(config, dict) and _PACKED in config for config in reply.values())
 
 
 def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
-    """Return "keys" and "steps" by modality in the reply to `get_modality_config`; keys lack the
-    prefix `video.`.
+    """Read the reply to `get_modality_config`.
+
+    Returns:
+        For each modality, its "keys", without a prefix such as `video.`, and its time "steps".
+
+    Raises:
+        MalformedMessage: The reply is not a map of configurations.
     """
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
@@ -506,6 +592,7 @@ def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
 
 
 def _modality(name: str, value: Any) -> dict[str, list[Any]]:
+    """Return the keys and the time steps of a modality."""
     config = value.get("as_json", value) if isinstance(value, dict) else None
     if isinstance(config, str):
         try:

@@ -1,6 +1,4 @@
-"""Parts of mappings that clients of several systems share: the layouts of LIBERO's and ALOHA's
-vectors.
-"""
+"""Mappings that clients of several systems share: the layouts of LIBERO's and ALOHA's vectors."""
 
 from __future__ import annotations
 
@@ -17,10 +15,13 @@ ALOHA_ACTION = [{"index": 6}, {"index": 13}]
 
 
 def libero_state(key: str) -> dict[str, Any]:
-    """Return the mapping of LIBERO's state, which a client sends under `key`.
+    """Return the mapping of LIBERO's state.
 
     The state contains the end effector's pose in the robot's base frame (position in m, axis-angle
     in rad) and two finger joints, 0.04 m when open.
+
+    Args:
+        key: The key under which the client sends the state.
     """
     return {
         "state": {

@@ -1,7 +1,7 @@
-"""A reader of msgpack with limits, for the messages of other systems; our own messages are frames.
+"""A reader of msgpack with limits, for the messages of other systems.
 
-A short message can need much memory (each byte may be an empty list). Values are therefore counted
-while they are read, and reading stops at the limit.
+A short message can need much memory, as each byte may be an empty list. Values are therefore
+counted while they are read, and reading stops at the limit.
 """
 
 from __future__ import annotations
@@ -23,14 +23,18 @@ Hook = Callable[[dict[Any, Any]], Any]
 def unpack(
     data: bytes | memoryview, limits: MessageLimits, hook: Hook, text: int | None = None
 ) -> Any:
-    """Read the value in `data`; the keys of maps that the hook returns must be text.
+    """Decode a message.
 
     Args:
+        data: The message.
         limits: The limits of its size, its number of values and their nesting.
-        hook: Receives each map, innermost first, and returns the value that replaces it. Values of
-            a list that it returns, such as an array of text, also count; the hook itself limits
-            them to `limits.items`.
+        hook: Receives each map, innermost first, and returns the value that replaces it; the keys
+            of a map that it returns must be text. Values of a list that it returns, such as an
+            array of text, also count; the hook itself limits them to `limits.items`.
         text: Largest size of one text, bytes; None if the limit of the message is enough.
+
+    Returns:
+        The value in the message.
 
     Raises:
         MalformedMessage: The message is not msgpack, or contains extension types.
@@ -44,6 +48,7 @@ def unpack(
     count = 0
 
     def counted(values: Any) -> Any:
+        """Count the values of a container, and return it."""
         nonlocal count
         count += len(values) + 1
         if count > limits.items:
@@ -53,6 +58,7 @@ def unpack(
         return values
 
     def hooked(values: dict[Any, Any]) -> Any:
+        """Count a map, and return the value that replaces it."""
         counted(values)
         replacement = hook(values)
         if isinstance(replacement, list):
@@ -87,14 +93,18 @@ def unpack(
 
 
 def pack(value: Any, default: Callable[[Any], Any]) -> bytes:
-    """Return `value` as msgpack; `default` converts types that msgpack does not support, such as
-    arrays, to maps.
+    """Encode a message.
+
+    Args:
+        value: The value.
+        default: Converts values of types that msgpack does not support, such as arrays, to maps.
     """
     packed: bytes = require("msgpack").packb(value, default=default)
     return packed
 
 
 def _refuse(code: int, _data: bytes) -> Any:
+    """Reject an extension type, which msgpack calls for each of them."""
     raise MalformedMessage(f"message: got an extension type, {code}; want plain values and arrays")
 
 
@@ -102,6 +112,7 @@ def _refuse(code: int, _data: bytes) -> Any:
 
 
 def is_packed(node: Mapping[Any, Any]) -> bool:
+    """Return whether a map contains an array in this format."""
     return b"nd" in node or "nd" in node
 
 
@@ -117,9 +128,11 @@ def read_packed(node: Mapping[Any, Any]) -> np.ndarray:
         raise MalformedMessage("array: nd: want bytes of a plain array")
 
     dtype = dtype.decode(errors="replace") if isinstance(dtype, bytes) else dtype
-    if fields["nd"] is not True:
+    if fields["nd"] is not True:  # a number instead of an array
         shape = []
-    return read_array(data, dtype, list(shape) if isinstance(shape, (list, tuple)) else shape)
+    if isinstance(shape, tuple):
+        shape = list(shape)
+    return read_array(data, dtype, shape)
 
 
 def write_packed(value: Any) -> dict[bytes, Any]:

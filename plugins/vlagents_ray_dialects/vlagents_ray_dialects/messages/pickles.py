@@ -4,12 +4,12 @@ imported.
 A pickle is a program for a stack machine, and its dangerous opcodes import and call any name in it.
 This reader has no such opcode: a pair of module and name is compared, as text, with the closed
 lists of its caller, whose entries represent the caller's own functions. An opcode, a name or a
-shape that is not listed is refused.
+shape that is not listed is rejected.
 
-The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples,
-texts, numbers, numpy's arrays and data classes. `MessageLimits` bounds the number of opcodes
-(`items`), the nesting (`depth`) and the texts. Bytes are not copied, so that arrays take no memory
-beyond that of the message.
+The reader supports the opcodes that Python's own pickler writes in protocol 4 and 5 for dicts,
+lists, tuples, texts, numbers, numpy's arrays and data classes. `MessageLimits` bounds the number of
+opcodes (`items`), the nesting (`depth`) and the texts. Bytes are not copied, so that arrays take no
+memory beyond the message.
 """
 
 from __future__ import annotations
@@ -54,15 +54,17 @@ class Reduced:
 
 
 Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
-"""Returns the value of a call in a pickle, given its arguments; raises `MalformedMessage` for
-invalid ones.
+"""A function that returns the value of a call in a pickle, given its arguments; it raises
+`MalformedMessage` for invalid arguments.
 """
 
 
 class _StackValue(NamedTuple):
+    """A value on the stack."""
+
     value: Any
-    depth: int = 0  # levels of containers in it
-    items: int = 1  # values in it
+    depth: int = 0  # the number of levels of containers in it
+    items: int = 1  # the number of values in it
 
 
 def read_pickle(
@@ -81,6 +83,9 @@ def read_pickle(
         calls: The functions that may occur, with our replacements; None for a class that is only an
             argument.
 
+    Returns:
+        The object, in which an object of a data class is a `Record`.
+
     Raises:
         MalformedMessage: The bytes are not a pickle, or contain an opcode, name or shape that is
             not listed.
@@ -90,18 +95,26 @@ def read_pickle(
 
 
 def fields_of(value: Any, class_name: Name) -> dict[str, Any]:
-    """Return the fields of an object of a data class; raise `MalformedMessage` for anything
-    else.
+    """Return the fields of an object of a data class.
+
+    Args:
+        value: The result of `read_pickle`.
+        class_name: The name of the data class.
+
+    Raises:
+        MalformedMessage: The value is not an object of this class.
     """
     if not isinstance(value, Record) or value.name != class_name or value.fields is None:
         raise MalformedMessage(
-            f"pickle: got {_kind(value)}, want a {class_name.name} with its fields"
+            f"pickle: got {_described(value)}, want a {class_name.name} with its fields"
         )
     return value.fields
 
 
 class _StackMachine:
-    """A stack machine without calls."""
+    """A stack machine for the opcodes of a pickle, without calls; the arguments are those of
+    `read_pickle`.
+    """
 
     def __init__(
         self,
@@ -111,9 +124,12 @@ class _StackMachine:
         calls: Mapping[Name, Call | None],
     ) -> None:
         self._data = memoryview(data)
-        self._at = 0
-        self._limits, self._records, self._calls = limits, records, calls
-        self._items = 0
+        self._offset = 0  # of the next byte
+        self._limits = limits
+        self._records = records
+        self._calls = calls
+
+        self._items = 0  # the number of values so far
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
@@ -135,25 +151,27 @@ class _StackMachine:
             opcode = self.take(1)[0]
 
         root = _finished(self.pop())
-        if self._stack or self._below or self._at != len(self._data):
+        if self._stack or self._below or self._offset != len(self._data):
             raise MalformedMessage("pickle: more than one object in a message")
         return root
 
     def take(self, length: int) -> memoryview:
         """Return the next bytes of the pickle as a view."""
-        end = self._at + length
+        end = self._offset + length
         if end > len(self._data):
             raise MalformedMessage("pickle: a message that ends too early")
-        data = self._data[self._at : end]
-        self._at = end
+        data = self._data[self._offset : end]
+        self._offset = end
         return data
 
     def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
+        """Push a value with the levels of containers and the number of values in it."""
         if depth > self._limits.depth:
             raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
         self._stack.append(_StackValue(value, depth, items))
 
     def pop(self) -> Any:
+        """Pop the last value."""
         return self._entry().value
 
     def text(self, length: int) -> None:
@@ -168,30 +186,34 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
 
     def integer(self) -> None:
+        """Push a long integer."""
         length = self.take(1)[0]
         if length > _INTEGER:
             raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 
     def mark(self) -> None:
+        """Begin a group of values."""
         self._below.append(self._stack)
         self._stack = []
 
     def remember(self) -> None:
+        """Store the last value in the memo."""
         self._memo.append(self._top())
 
     def recall(self, index: int) -> None:
-        """Push a value of the memo; one that can still change is refused, so that no value
+        """Push a value of the memo. A value that can still change is rejected, so that no value
         contains itself.
         """
         if index >= len(self._memo):
             raise MalformedMessage("pickle: a reference to nothing")
         entry = self._memo[index]
         value = entry.value
-        if isinstance(value, (list, dict, Record)) or (
-            isinstance(value, Reduced) and value.value is None
-        ):
-            raise MalformedMessage(f"pickle: a second reference to {_kind(value)}; send a copy")
+        is_unfinished = isinstance(value, Reduced) and value.value is None
+        if is_unfinished or isinstance(value, (list, dict, Record)):
+            raise MalformedMessage(
+                f"pickle: a second reference to {_described(value)}; send a copy"
+            )
         self._count(entry.items)
         self._stack.append(entry)
 
@@ -202,6 +224,7 @@ class _StackMachine:
         self.push(values, _above(entries), items)
 
     def extend(self, entries: Sequence[_StackValue]) -> None:
+        """Append the values of entries to the list below them."""
         self._into(list, entries).extend(_finished(entry.value) for entry in entries)
 
     def update(self, entries: Sequence[_StackValue]) -> None:
@@ -240,7 +263,7 @@ class _StackMachine:
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
             raise MalformedMessage(
-                f"pickle: got a call of {_kind(name)}, want a numpy array of numbers"
+                f"pickle: got a call of {_described(name)}, want a numpy array of numbers"
             )
         self.push(read(arguments))
 
@@ -249,7 +272,7 @@ class _StackMachine:
         arguments, name = self.pop(), self.pop()
         if arguments != () or not isinstance(name, Name) or name not in self._records:
             raise MalformedMessage(
-                f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages"
+                f"pickle: got an object of {_described(name)}, want one of LeRobot's messages"
             )
         self.push(Record(name))
 
@@ -269,39 +292,45 @@ class _StackMachine:
         elif isinstance(target, Reduced) and target.value is None and target.read_state is not None:
             target.value = target.read_state(state.value)
         else:
-            raise MalformedMessage(f"pickle: got the state of {_kind(target)}, which has none")
+            raise MalformedMessage(f"pickle: got the state of {_described(target)}, which has none")
 
     def _count(self, items: int) -> None:
+        """Count values; raise `MessageTooLarge` beyond the limit."""
         self._items += items
         if self._items > self._limits.items:
             raise MessageTooLarge(f"pickle: more than {self._limits.items} values in a message")
 
     def _top(self) -> _StackValue:
+        """Return the last entry of the stack."""
         if not self._stack:
             raise MalformedMessage("pickle: an opcode without its value")
         return self._stack[-1]
 
     def _entry(self) -> _StackValue:
+        """Pop the last entry of the stack."""
         entry = self._top()
         self._stack.pop()
         return entry
 
-    def _into(self, kind: type, entries: Sequence[_StackValue]) -> Any:
+    def _into(self, container_type: type, entries: Sequence[_StackValue]) -> Any:
         """Return the container below `entries`, to which they are added."""
         container = self._entry()
-        if type(container.value) is not kind:
-            raise MalformedMessage(f"pickle: got {_kind(container.value)}, want a {kind.__name__}")
+        if type(container.value) is not container_type:
+            raise MalformedMessage(
+                f"pickle: got {_described(container.value)}, want a {container_type.__name__}"
+            )
         items = container.items + sum(entry.items for entry in entries)
         self.push(container.value, max(container.depth, _above(entries)), items)
         return container.value
 
 
 def _above(entries: Sequence[_StackValue]) -> int:
+    """Return the number of levels of a container with these entries."""
     return 1 + max((entry.depth for entry in entries), default=0)
 
 
 def _finished(value: Any) -> Any:
-    """Return the value to store in a container for one on the stack."""
+    """Return the value that a container stores for a value on the stack."""
     if not isinstance(value, Reduced):
         return value
     if value.value is None:
@@ -309,7 +338,8 @@ def _finished(value: Any) -> Any:
     return value.value
 
 
-def _kind(value: Any) -> str:
+def _described(value: Any) -> str:
+    """Describe a value on the stack, for errors."""
     if isinstance(value, Record):
         return value.name.name
     if isinstance(value, Name):
@@ -318,22 +348,29 @@ def _kind(value: Any) -> str:
 
 
 _PROTO, _STOP = 0x80, ord(".")
-_U1, _U2, _U4, _U8 = (struct.Struct(f"<{kind}") for kind in "BHIQ")
-_I4, _F8 = struct.Struct("<i"), struct.Struct(">d")
+_U1 = struct.Struct("<B")
+_U2 = struct.Struct("<H")
+_U4 = struct.Struct("<I")
+_U8 = struct.Struct("<Q")
+_I4 = struct.Struct("<i")
+_F8 = struct.Struct(">d")
 
 
 def _number(
     form: struct.Struct, then: Callable[[_StackMachine, Any], None]
 ) -> Callable[[_StackMachine], None]:
-    return lambda reader: then(reader, form.unpack(reader.take(form.size))[0])
+    """Return a function that executes an opcode: it reads a number, and passes it to `then`."""
+    return lambda machine: then(machine, form.unpack(machine.take(form.size))[0])
 
 
-def _bytes(reader: _StackMachine, length: int) -> None:
-    reader.push(reader.take(length))
+def _bytes(machine: _StackMachine, length: int) -> None:
+    """Push the next bytes."""
+    machine.push(machine.take(length))
 
 
 def _fixed(value: Any) -> Callable[[_StackMachine], None]:
-    return lambda reader: reader.push(value)
+    """Return a function that executes an opcode: it pushes a fixed value."""
+    return lambda machine: machine.push(value)
 
 
 _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
@@ -376,7 +413,7 @@ _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
 # numpy's arrays, types and numbers in a pickle: the calls in numpy's own pickles.
 #
 # Based on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
-# structures, and big-endian ones, are refused.
+# structures, and big-endian arrays, are rejected.
 
 
 class _Dtype(str):
@@ -388,15 +425,16 @@ class _Dtype(str):
 def _dtype(arguments: tuple[Any, ...]) -> Reduced:
     """Read `numpy.dtype`: ("f4", False, True), then (3, "<", None, None, None, -1, -1, 0)."""
     match arguments:
-        case (str(kind), bool() | int(), bool() | int()):
-            return Reduced(lambda state: _ordered_dtype(kind, state))
+        case (str(code), bool() | int(), bool() | int()):
+            return Reduced(lambda state: _ordered_dtype(code, state))
     raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers")
 
 
-def _ordered_dtype(kind: str, state: Any) -> _Dtype:
+def _ordered_dtype(code: str, state: Any) -> _Dtype:
+    """Return a type with the byte order in its state."""
     match state:
         case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
-            return _Dtype(order + kind)
+            return _Dtype(order + code)
     raise MalformedMessage(
         "pickle: numpy.dtype: want the type of plain numbers in little-endian order"
     )
@@ -407,12 +445,13 @@ def _array(arguments: tuple[Any, ...]) -> Reduced:
     columns, data).
     """
     match arguments:
-        case (Name("numpy", "ndarray"), (int(0),), memoryview() as kind) if bytes(kind[:2]) == b"b":
+        case (Name("numpy", "ndarray"), (int(0),), memoryview() as code) if bytes(code[:2]) == b"b":
             return Reduced(_content)
     raise MalformedMessage("pickle: numpy: want a plain array")
 
 
 def _content(state: Any) -> np.ndarray:
+    """Return the array with the shape, type and data in its state."""
     match state:
         case (int(1), tuple(shape), _Dtype() as dtype, bool(by_columns), memoryview() as data):
             return _ordered(data, dtype, shape, by_columns)
@@ -441,23 +480,17 @@ def _scalar(arguments: tuple[Any, ...]) -> int | float:
 
 
 def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:
-    return (
-        read_array(data, str(dtype), shape[::-1]).T
-        if by_columns
-        else read_array(data, str(dtype), shape)
-    )
+    """Return the array whose numbers are stored by rows or by columns."""
+    if by_columns:
+        return read_array(data, str(dtype), shape[::-1]).T
+    return read_array(data, str(dtype), shape)
 
 
-# numpy renamed its modules in 2.0.
 NUMPY_CALLS: dict[Name, Call | None] = {
     Name("numpy", "dtype"): _dtype,
     Name("numpy", "ndarray"): None,
-} | {
-    Name(f"numpy.{core}.{module}", name): read
-    for core in ("core", "_core")
-    for module, name, read in (
-        ("multiarray", "_reconstruct", _array),
-        ("multiarray", "scalar", _scalar),
-        ("numeric", "_frombuffer", _frombuffer),
-    )
 }
+for _core in ("core", "_core"):  # numpy 2.0 renamed the module
+    NUMPY_CALLS[Name(f"numpy.{_core}.multiarray", "_reconstruct")] = _array
+    NUMPY_CALLS[Name(f"numpy.{_core}.multiarray", "scalar")] = _scalar
+    NUMPY_CALLS[Name(f"numpy.{_core}.numeric", "_frombuffer")] = _frombuffer

@@ -1,7 +1,7 @@
 """vla-eval's messages: msgpack maps of type, payload, seq and timestamp, protocol version 1.
 
 Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or
-JPEG. The format is that of `vla_eval.protocol`, 0.8.0.
+JPEG. The module `vla_eval.protocol` of version 0.8.0 defines the format.
 """
 
 from __future__ import annotations
@@ -36,16 +36,27 @@ class _File(bytes):
 
 
 def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> VlaEvalMessage:
-    """Return the message in `data`, with its JPEG and PNG images still encoded, see
-    `decode_images`.
+    """Decode a message.
+
+    Args:
+        data: The message.
+        limits: The limits of its size and content.
+
+    Returns:
+        The message. Its JPEG and PNG images are still encoded, see `decode_images`.
+
+    Raises:
+        MalformedMessage: The message is invalid.
+        MessageTooLarge: The message exceeds a limit.
     """
-    taken = 0
+    image_count = 0
 
     def array(node: dict[Any, Any]) -> Any:
-        nonlocal taken
+        """Return the array or the image in a map."""
+        nonlocal image_count
         if "__image__" in node:
-            taken += 1
-            if taken > limits.cameras:
+            image_count += 1
+            if image_count > limits.cameras:
                 raise MessageTooLarge(f"message: more than {limits.cameras} images")
             return _image(node)
         if "__ndarray__" in node:
@@ -55,6 +66,7 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> VlaEvalMessag
     raw = unpack(data, limits, array)
     if not isinstance(raw, dict) or not raw.keys() >= {"type", "payload", "seq"}:
         raise MalformedMessage("message: want a map with type, payload and seq")
+
     kind, payload, seq = raw["type"], raw["payload"], raw["seq"]
     if not isinstance(kind, str) or kind not in get_args(Kind):
         raise MalformedMessage(f"type: got {shown(kind)}, want one of {list(get_args(Kind))}")
@@ -66,13 +78,20 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> VlaEvalMessag
 
 
 def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
-    """Return an observation with its images decoded; raise the errors of `budget` and of invalid
-    images.
+    """Decode the images of an observation.
+
+    Args:
+        payload: The payload of a message from `decode`.
+        budget: Counts the decoded images; raises an error beyond its limits.
+
+    Returns:
+        The payload with images, (H, W, 3) uint8 RGB.
     """
     files: dict[int, _File] = {}
     names: dict[int, str] = {}
 
     def find(node: Any, path: str) -> None:
+        """Add the files within a node, with their paths."""
         if isinstance(node, _File):
             files[id(node)] = node
             names.setdefault(id(node), path)
@@ -81,11 +100,11 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
                 find(item, f"{path}/{key}" if path else str(key))
 
     find(payload, "")
-    images = dict(
-        zip(files, decode_files(list(files.values()), budget, list(names.values())), strict=True)
-    )
+    decoded = decode_files(list(files.values()), budget, list(names.values()))
+    images = dict(zip(files, decoded, strict=True))
 
     def filled(node: Any) -> Any:
+        """Return a node with images in place of its files."""
         if isinstance(node, _File):
             return images[id(node)]
         if isinstance(node, dict):
@@ -96,6 +115,7 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: VlaEvalMessage) -> bytes:
+    """Encode a message, with the present time."""
     fields = {
         "type": message.kind,
         "payload": message.payload,
@@ -106,6 +126,7 @@ def encode(message: VlaEvalMessage) -> bytes:
 
 
 def _image(node: dict[Any, Any]) -> np.ndarray | _File:
+    """Return the image in a map, which is still encoded unless it is raw."""
     data, form = node.get("data"), node.get("format")
     if form == "raw":
         return read_array(data, node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]  # it checks
@@ -117,6 +138,7 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
 
 
 def _node(value: Any) -> Any:
+    """Return the map with an array, or the number in a scalar of numpy, for msgpack."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         return {
             "__ndarray__": True,
@@ -132,9 +154,9 @@ def _node(value: Any) -> Any:
 # The mapping of vla-eval's benchmarks.
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some
-    # `state`, as recommended in vla-eval's types.py; its own servers prefer the former. RoboTwin's
-    # is `joint_state`.
+    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, which
+    # vla-eval's own servers prefer; some call it `state`, as its types.py recommends. RoboTwin
+    # calls it `joint_state`.
     "vla-eval": {
         "cameras": {"*": "images/*"},
         "state": {"state": {"key": "states|state|joint_state", "optional": True}},

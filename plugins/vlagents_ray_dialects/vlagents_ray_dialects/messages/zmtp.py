@@ -1,10 +1,10 @@
 """The part of ZMTP 3, the protocol of ZeroMQ over TCP, that a ROUTER needs for REQ and DEALER
 sockets.
 
-A peer sends a greeting of 64 bytes, the command READY, and then messages: frames of a head and a
-body, all but the last of which announce another one. ZeroMQ's own library buffers a message until
-it is complete, however many frames it has, and an empty frame costs its sender 2 bytes and its
-reader 64; here the reader sees each head before the body arrives.
+A peer sends a greeting of 64 bytes, the command READY, and then messages. A message consists of
+frames of a head and a body; all frames but the last one announce another one. ZeroMQ's own library
+buffers a message until it is complete, however many frames it has, and an empty frame costs its
+sender 2 bytes and its reader 64. Here the reader checks each head before the body arrives.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from dataclasses import dataclass
 from vlagents_ray.errors import MalformedMessage
 
 GREETING_BYTES = 64
-HEAD_BYTES = 1  # bytes of a frame's flags, which its size follows
+HEAD_BYTES = 1  # the number of bytes of a frame's flags, which its size follows
 COMMAND_BYTES = 512  # maximum size of a command
 _SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
 _MECHANISM = b"NULL".ljust(20, b"\0")  # no encryption and no password
 _MAJOR_VERSION = 3
 _MORE, _LONG, _COMMAND = 1, 2, 4  # flags of a frame
 _SHORT_SIZE, _LONG_SIZE = struct.Struct(">B"), struct.Struct(">Q")
-_VALUE_SIZE = struct.Struct(">I")  # of a property of READY
-_TTL_BYTES = 2  # of a PING, before the context that its answer repeats
-_SOCKET_TYPES = (b"REQ", b"DEALER")  # that may connect to a ROUTER here
+_VALUE_SIZE = struct.Struct(">I")  # the size of the value of a property of READY
+_TTL_BYTES = 2  # the time to live of a PING, before the context that the answer repeats
+_SOCKET_TYPES = (b"REQ", b"DEALER")  # the sockets that may connect
 GREETING = _SIGNATURE + bytes([_MAJOR_VERSION, 0]) + _MECHANISM + bytes(32)
 
 
@@ -62,8 +62,10 @@ def check_greeting(greeting: bytes | bytearray) -> None:
 
 
 def read_flags(first: int) -> FrameFlags:
-    """Return the flags in the first byte of a frame; raise `MalformedMessage` if they are
-    invalid.
+    """Return the flags in the first byte of a frame.
+
+    Raises:
+        MalformedMessage: The flags are invalid.
     """
     flags = FrameFlags(bool(first & _MORE), bool(first & _LONG), bool(first & _COMMAND))
     if first > (_MORE | _LONG | _COMMAND) or (flags.is_command and flags.has_more):
@@ -73,13 +75,19 @@ def read_flags(first: int) -> FrameFlags:
 
 def read_size(data: bytes | memoryview) -> int:
     """Return the size in the one or eight bytes after a frame's flags, bytes."""
-    size: int = (_SHORT_SIZE if len(data) == _SHORT_SIZE.size else _LONG_SIZE).unpack(data)[0]
+    form = _SHORT_SIZE if len(data) == _SHORT_SIZE.size else _LONG_SIZE
+    size: int = form.unpack(data)[0]
     return size
 
 
 def read_command(body: bytes | memoryview) -> tuple[bytes, bytes]:
-    """Return the name of a command and what follows it; raise `MalformedMessage` if it is
-    invalid.
+    """Return the name and the content of a command.
+
+    Args:
+        body: The body of the command's frame.
+
+    Raises:
+        MalformedMessage: The command has no name.
     """
     length = body[0] if body else 0
     name = bytes(body[1 : 1 + length])
@@ -89,24 +97,29 @@ def read_command(body: bytes | memoryview) -> tuple[bytes, bytes]:
 
 
 def check_ready(properties: bytes) -> None:
-    """Raise `MalformedMessage` unless the READY of a peer contains the type of a socket that may
-    connect.
+    """Raise `MalformedMessage` unless the type of a peer's socket may connect.
+
+    Args:
+        properties: The content of the command READY.
     """
     values: dict[bytes, bytes] = {}
-    rest = properties
-    while rest:
-        name_end = 1 + rest[0]
+    unread = properties
+    while unread:
+        name_end = 1 + unread[0]
         value_start = name_end + _VALUE_SIZE.size
-        if len(rest) < value_start:
+        if len(unread) < value_start:
             raise MalformedMessage("zmtp: expected a property of READY, got a part of one")
-        (size,) = _VALUE_SIZE.unpack(rest[name_end:value_start])
-        if len(rest) < value_start + size:
+        (size,) = _VALUE_SIZE.unpack(unread[name_end:value_start])
+        value_end = value_start + size
+        if len(unread) < value_end:
             raise MalformedMessage(
                 "zmtp: expected the value of a property of READY, got a part of it"
             )
-        values[rest[1:name_end].lower()] = rest[value_start : value_start + size]
-        rest = rest[value_start + size :]
-    if (socket_type := values.get(b"socket-type")) not in _SOCKET_TYPES:
+        values[unread[1:name_end].lower()] = unread[value_start:value_end]
+        unread = unread[value_end:]
+
+    socket_type = values.get(b"socket-type")
+    if socket_type not in _SOCKET_TYPES:
         raise MalformedMessage(
             f"zmtp: expected a REQ or DEALER socket, got {socket_type!r}; use one of these"
         )
@@ -114,29 +127,39 @@ def check_ready(properties: bytes) -> None:
 
 def write_ready() -> bytes:
     """Return the frame of the command READY of a ROUTER."""
-    properties = b"".join(
-        bytes([len(name)]) + name + _VALUE_SIZE.pack(len(value)) + value
-        for name, value in ((b"Socket-Type", b"ROUTER"), (b"Identity", b""))
-    )
+    properties = b""
+    for name, value in ((b"Socket-Type", b"ROUTER"), (b"Identity", b"")):
+        properties += bytes([len(name)]) + name + _VALUE_SIZE.pack(len(value)) + value
     return _command(b"READY", properties)
 
 
 def write_pong(ping: bytes) -> bytes:
-    """Return the frame that answers a PING, from what follows the PING's name."""
+    """Return the frame that answers a PING.
+
+    Args:
+        ping: The content of the PING.
+    """
     return _command(b"PONG", ping[_TTL_BYTES:])
 
 
-def write_message(parts: Sequence[bytes]) -> bytes:
-    """Return the frames of a message."""
-    last = len(parts) - 1
-    return b"".join(_frame(part, _MORE if index < last else 0) for index, part in enumerate(parts))
+def write_message(bodies: Sequence[bytes]) -> bytes:
+    """Return the frames of a message.
+
+    Args:
+        bodies: The bodies of the frames, at least one.
+    """
+    *first_bodies, last_body = bodies
+    frames = [_frame(body, _MORE) for body in first_bodies]
+    return b"".join([*frames, _frame(last_body, 0)])
 
 
 def _command(name: bytes, content: bytes) -> bytes:
+    """Return the frame of a command."""
     return _frame(bytes([len(name)]) + name + content, _COMMAND)
 
 
 def _frame(body: bytes, flags: int) -> bytes:
+    """Return a frame with these flags, besides the one for a long size."""
     if len(body) < 256:
         return bytes([flags]) + _SHORT_SIZE.pack(len(body)) + body
     return bytes([flags | _LONG]) + _LONG_SIZE.pack(len(body)) + body
