@@ -2,8 +2,8 @@
 chunks of actions.
 
 Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent
-in 0.6.1. A client pickles its data classes. They are read as data, see `pickles`, and the chunk is
-written as a pickle that refers to the client's own `TimedAction` and `torch.tensor`.
+in 0.6.1. A client pickles its data classes. Here they are read as data, see `pickles`, and the
+chunk is written as a pickle that refers to the client's own `TimedAction` and `torch.tensor`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from vlagents_ray_dialects.messages.pickles import NUMPY_CALLS, Name, fields_of,
 
 HELPERS = "lerobot.async_inference.helpers"
 SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
+# The fields of the data classes that a client pickles.
 _REQUESTS: Mapping[Name, Sequence[str]] = {
     SETUP: (
         "policy_type",
@@ -42,8 +43,8 @@ _REQUESTS: Mapping[Name, Sequence[str]] = {
     ),
     OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
 }
-_STEPS = 2**31  # time steps fit into a pickle's plain integers
-_SHOWN = 40  # largest number of a client's keys in an error, and of characters of each
+_STEPS = 2**31  # time steps are below this, so that they fit into a pickle's plain integers
+_SHOWN = 40  # largest number of a client's keys in an error, and of the characters of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,22 +53,32 @@ class PolicyInstructions:
 
     policy_type: str
     checkpoint: str  # the checkpoint that LeRobot's own server would load
-    state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
+    state: tuple[str, ...]  # the names of the numbers of `observation.state`, in order
     cameras: tuple[str, ...]
     actions_per_chunk: int
 
 
 @dataclass(frozen=True, slots=True)
 class RobotObservation:
+    """An observation with the robot's names."""
+
     timestamp: float  # the client's clock, s since 1970
-    timestep: int  # number of the last action that the client executed
+    timestep: int  # the number of the last action that the client executed
     values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
     must_go: bool  # whether the client has no actions left
 
 
 def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions:
-    """Return the policy instructions in a pickle; raises `InvalidObservation` for features that
-    are not served.
+    """Read policy instructions.
+
+    Args:
+        data: The pickle.
+        limits: The limits of its size and content.
+
+    Raises:
+        InvalidObservation: The client has features that are not supported.
+        MalformedMessage: The pickle is something else.
+        MessageTooLarge: The pickle exceeds a limit.
     """
     fields = _pickled_fields(data, limits, SETUP)
     policy_type = _text(fields, "policy_type")
@@ -95,12 +106,12 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
             raise MalformedMessage(
                 f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict"
             )
-        kind = _text(feature, "dtype")
-        if name == STATE and kind == "float32":
+        dtype = _text(feature, "dtype")
+        if name == STATE and dtype == "float32":
             state = _names(feature)
-        elif not (name.startswith(IMAGES) and kind in ("image", "video")):
+        elif not (name.startswith(IMAGES) and dtype in ("image", "video")):
             raise InvalidObservation(
-                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of "
+                f"lerobot_features: got {name[:_SHOWN]!r} of {dtype[:_SHOWN]!r}, want {STATE!r} of "
                 f"float32, and images {IMAGES + 'NAME'!r}"
             )
 
@@ -114,8 +125,15 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
 
 
 def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
-    """Return the observation in a pickle; its arrays are views of the pickle, and count in
-    `budget`.
+    """Read an observation.
+
+    Args:
+        data: The pickle. Arrays of the result are views of its memory.
+        budget: Counts the sizes of the arrays.
+
+    Raises:
+        MalformedMessage: The pickle is something else.
+        MessageTooLarge: The pickle exceeds a limit.
     """
     fields = _pickled_fields(data, budget.limits, OBSERVATION)
     timestamp, timestep, values, must_go = (fields[name] for name in _REQUESTS[OBSERVATION])
@@ -141,16 +159,20 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
 
 
 def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
-    """Convert an observation to LeRobot's names, as LeRobot's own server does before it calls a
-    policy.
+    """Convert an observation to the names of LeRobot's datasets, as LeRobot's own server does
+    before it calls a policy.
+
+    Args:
+        observation: The observation.
+        robot: The policy instructions of its client.
 
     Returns:
         `observation.state`, (D,) float32, in the order of the robot's features,
         `observation.images.NAME`, and `task`.
 
     Raises:
-        MissingState, MissingCamera: The observation lacks a feature that the policy instructions
-        state.
+        MissingState: The observation lacks a number of the robot's features.
+        MissingCamera: The observation lacks an image of the robot's features.
         InvalidObservation: A value of the state is not a number.
     """
     values = observation.values
@@ -168,7 +190,7 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
             if not is_number(value):
                 raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
             numbers.append(value)
-        with np.errstate(over="ignore"):  # becomes infinite, as in LeRobot's own server
+        with np.errstate(over="ignore"):  # too large numbers become infinite, as in LeRobot
             frame_values[STATE] = np.array(numbers, np.float64).astype(np.float32)
 
     for name in robot.cameras:
@@ -185,34 +207,43 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
     """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
 
     The pickle has the form that LeRobot's server writes, except that each tensor is a call of
-    `torch.tensor` with its float32 numbers, which needs neither torch here nor an archive within
-    the pickle.
+    `torch.tensor` with its float32 numbers. So this process needs no torch, and the pickle contains
+    no archive.
 
     Args:
         rows: The chunk, (H, D) float32.
-        timestamp: Time of the observation and of the first action, s.
-        timestep: Number of the observation and of the first action.
-        period_s: Time between two actions, s.
+        timestamp: The time of the observation and of the first action, s.
+        timestep: The number of the observation and of the first action.
+        period_s: The time between two actions, s.
+
+    Raises:
+        InvalidObservation: The numbers of the actions would be too large.
     """
     if timestep + len(rows) > _STEPS:
         raise InvalidObservation(
             f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions"
         )
 
-    parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
+    opcodes = [
+        b"\x80\x02",
+        _global(0, HELPERS, "TimedAction"),
+        _global(1, "torch", "tensor"),
+        b"](",
+    ]
     for number, row in enumerate(rows):
         values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
-        parts += [
+        opcodes += [
             b"h\0)\x81}(",
             _text_opcodes("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
             _text_opcodes("timestep"), b"J", struct.pack("<i", timestep + number),
             _text_opcodes("action"), b"h\1](", values, b"e\x85R",
             b"ub",
         ]  # fmt: skip
-    return b"".join([*parts, b"e."])
+    return b"".join([*opcodes, b"e."])
 
 
 def _text_opcodes(value: str) -> bytes:
+    """Return the opcodes that push a text."""
     data = value.encode()
     return b"X" + struct.pack("<I", len(data)) + data
 
@@ -223,10 +254,12 @@ def _global(memo: int, module: str, name: str) -> bytes:
 
 
 def _pickled_fields(data: Buffer, limits: MessageLimits, class_name: Name) -> dict[str, Any]:
+    """Return the fields of the object of a data class in a pickle."""
     return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), class_name)
 
 
 def _text(fields: Mapping[str, Any], name: str) -> str:
+    """Return the text in a field."""
     value = fields.get(name)
     if not isinstance(value, str):
         raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
@@ -234,32 +267,32 @@ def _text(fields: Mapping[str, Any], name: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a client's value for an error message: a number, or the type of anything else,
-    whatever its size.
-    """
+    """Return a client's value for an error: a number itself, the type of any other value."""
     return repr(value) if is_number(value) else type(value).__name__
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the numbers of a feature."""
     names = feature.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InvalidObservation(f"lerobot_features: {STATE!r}: want `names`, a list of texts")
     return tuple(names)
 
 
-# The protobuf messages of LeRobot's `AsyncInference` service, read and written by hand.
+# The protobuf messages of LeRobot's `AsyncInference` service, which are read and written without
+# protobuf's library.
 #
 # Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1,
 # `transfer_state`, and the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`;
-# `Empty` has none.
+# `Empty` has no field.
 
 SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
-_VARINT_BYTES = 10  # largest length of a number
+_VARINT_BYTES = 10  # largest length of a number, bytes
 
 
 class TransferState(enum.IntEnum):
-    """The position of a part in its message."""
+    """The position of a piece in its message."""
 
     BEGIN = 1
     MIDDLE = 2
@@ -267,10 +300,19 @@ class TransferState(enum.IntEnum):
 
 
 def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
-    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for
-    anything else.
+    """Read an `Observation`.
+
+    Args:
+        message: The message.
+
+    Returns:
+        The position of this piece, and the piece of a pickle.
+
+    Raises:
+        MalformedMessage: The message is something else.
     """
-    number, data = 0, memoryview(b"")
+    number = 0
+    data = memoryview(b"")
     for field, value in _protobuf_fields(message):
         if field == 1 and isinstance(value, int):
             number = value
@@ -286,19 +328,20 @@ def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
 
 def read_data(message: bytes) -> memoryview | None:
     """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
-    fields = _protobuf_fields(message)
-    return next(
-        (value for field, value in fields if field == 1 and isinstance(value, memoryview)), None
-    )
+    for field, value in _protobuf_fields(message):
+        if field == 1 and isinstance(value, memoryview):
+            return value
+    return None
 
 
 def write_data(data: bytes) -> bytes:
     """Return a `PolicySetup` or an `Actions` with a pickle."""
-    size, length = bytearray(), len(data)
-    while length > 0x7F:
-        size.append(length & 0x7F | 0x80)
-        length >>= 7
-    return bytes([1 << 3 | _BYTES, *size, length]) + data
+    varint = bytearray()
+    remaining = len(data)
+    while remaining > 0x7F:
+        varint.append(remaining & 0x7F | 0x80)
+        remaining >>= 7
+    return bytes([1 << 3 | _BYTES, *varint, remaining]) + data
 
 
 EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
@@ -308,36 +351,38 @@ def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
     """Yield the number and the value of each field that is a number or bytes; other fields are
     skipped.
     """
-    view, at = memoryview(message), 0
-    while at < len(view):
-        key, at = _varint(view, at)
-        kind = key & 7
-        if kind == _VARINT:
-            value, at = _varint(view, at)
-            yield key >> 3, value
+    view = memoryview(message)
+    offset = 0
+    while offset < len(view):
+        key, offset = _varint(view, offset)
+        field, field_type = key >> 3, key & 7
+        if field_type == _VARINT:
+            number, offset = _varint(view, offset)
+            yield field, number
             continue
-        length = {_FIXED64: 8, _FIXED32: 4}.get(kind)
-        if kind == _BYTES:
-            length, at = _varint(view, at)
-        if length is None or at + length > len(view):
+
+        length = {_FIXED64: 8, _FIXED32: 4}.get(field_type)
+        if field_type == _BYTES:
+            length, offset = _varint(view, offset)
+        if length is None or offset + length > len(view):
             raise MalformedMessage("protobuf: a field of an unknown type, or that ends too early")
-        if kind == _BYTES:
-            yield key >> 3, view[at : at + length]
-        at += length
+        if field_type == _BYTES:
+            yield field, view[offset : offset + length]
+        offset += length
 
 
-def _varint(view: memoryview, at: int) -> tuple[int, int]:
-    """Return the number at `at`, and the index of the byte after it."""
+def _varint(view: memoryview, offset: int) -> tuple[int, int]:
+    """Return the number that begins at an offset, and the offset of the byte after it."""
     number = 0
-    for index, byte in enumerate(view[at : at + _VARINT_BYTES]):
+    for index, byte in enumerate(view[offset : offset + _VARINT_BYTES]):
         number |= (byte & 0x7F) << (7 * index)
         if byte < 0x80:
-            return number, at + index + 1
+            return number, offset + index + 1
     raise MalformedMessage("protobuf: a number that ends too early")
 
 
-# The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a
-# robot's names.
+# The mapping of LeRobot's robots: the names of LeRobot's datasets, to which its own server converts
+# the names of a robot.
 
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 

@@ -1,6 +1,7 @@
 """The messages of `openpi-client`: msgpack, in which a map with the key b"__ndarray__" is an array.
 
-The format is that of `openpi_client.msgpack_numpy`, 0.1.2; RoboArena's client has a copy of it.
+The module `openpi_client.msgpack_numpy` of version 0.1.2 defines the format; RoboArena's client has
+a copy of it.
 """
 
 from __future__ import annotations
@@ -18,8 +19,18 @@ from vlagents_ray_dialects.messages.msgpack import pack, unpack
 
 
 def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, Any]:
-    """Return the map in a message; arrays are read-only views, and an array of text becomes a
-    list.
+    """Decode a message that is a map.
+
+    Args:
+        data: The message.
+        limits: The limits of its size and content.
+
+    Returns:
+        The map. Arrays are read-only views, and an array of text becomes a list.
+
+    Raises:
+        MalformedMessage: The message is something else.
+        MessageTooLarge: The message exceeds a limit.
     """
     value = decode_any(data, limits)
     if not isinstance(value, dict):
@@ -28,21 +39,23 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, Any
 
 
 def decode_any(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> Any:
-    """Return the value in a message, which may be of any type; otherwise like `decode`."""
+    """Decode a message that may be of any type; otherwise like `decode`."""
     return unpack(data, limits, lambda node: _array(node, limits.items))
 
 
 def encode(value: Any) -> bytes:
-    """Return the message for `value`, plain values and arrays, in the client's format."""
+    """Return the message for a value that consists of plain values and arrays."""
     return pack(value, _node)
 
 
 def _array(node: dict[Any, Any], most: int) -> Any:
+    """Return the array or number in a map, or the map itself; an array has at most `most` texts."""
     if b"__ndarray__" in node:
         data, dtype, shape = node.get(b"data"), node.get(b"dtype"), node.get(b"shape")
         if isinstance(dtype, str) and dtype.startswith("<U") and isinstance(data, bytes):
             return _texts(data, dtype, most)
         return read_array(data, dtype, shape)  # type: ignore[arg-type]  # it checks
+
     if b"__npgeneric__" in node:
         value = node.get(b"data")
         if not isinstance(value, (bool, int, float)):
@@ -67,16 +80,19 @@ def _texts(data: bytes, dtype: str, most: int) -> list[str]:
         raise MalformedMessage(f"array: got {len(data)} bytes, want texts of {dtype[:20]!r}")
     if len(data) // size > most:
         raise MessageTooLarge(f"array: got {len(data) // size} texts, want {most} more at most")
+
+    texts = []
     try:
-        return [
-            data[at : at + size].decode("utf-32-le").rstrip("\0")
-            for at in range(0, len(data), size)
-        ]
+        for begin in range(0, len(data), size):
+            text = data[begin : begin + size].decode("utf-32-le")
+            texts.append(text.rstrip("\0"))
     except UnicodeDecodeError as error:
         raise MalformedMessage(f"array: no text ({error.reason})") from error
+    return texts
 
 
 def _node(value: Any) -> Any:
+    """Return the map with an array, or the number in a scalar of numpy, for msgpack."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         return {
             b"__ndarray__": True,
@@ -108,7 +124,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "instruction": "prompt",
         "action_gripper": {"index": 6, "open": -1.0, "closed": 1.0},
     },
-    # openpi, examples/droid/main.py; DROID's observed gripper is 0 when open
+    # openpi, examples/droid/main.py; DROID's observed gripper is 0 when it is open
     "openpi-droid": {
         "cameras": {
             "front": {"key": "observation/exterior_image_1_left", "layout": "any"},

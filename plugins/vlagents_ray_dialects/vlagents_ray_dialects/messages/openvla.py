@@ -1,8 +1,8 @@
-"""OpenVLA's REST bodies: JSON with arrays in the format of `json-numpy`, encoded once or twice.
+"""The bodies of OpenVLA's REST interface: JSON with arrays in the format of `json-numpy`.
 
 `{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch
-their json module encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string
-that contains the JSON.
+their json module encode twice: a request is `{"encoded": "<the JSON>"}`, and its reply is a JSON
+string that contains the JSON.
 """
 
 from __future__ import annotations
@@ -20,26 +20,46 @@ from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, li
 
 
 def decode(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
-    """Return the observation in a request's body, and whether it was encoded twice."""
+    """Decode a request.
+
+    Args:
+        body: The body.
+        limits: The limits of its size and content.
+
+    Returns:
+        The observation, and whether it was encoded twice.
+
+    Raises:
+        MalformedMessage: The body is not such a request.
+        MessageTooLarge: The body exceeds a limit.
+    """
     if len(body) > limits.body_bytes:
         raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
+
     payload = _load(body, limits)
-    if twice := "encoded" in payload:
+    is_encoded_twice = "encoded" in payload
+    if is_encoded_twice:
         if len(payload) != 1 or not isinstance(payload["encoded"], str):
             raise MalformedMessage("body: want 'encoded' alone, and text in it")
         payload = _load(payload["encoded"].encode("utf-8", "replace"), limits)
-    return payload, twice
+    return payload, is_encoded_twice
 
 
 def encode(
     value: np.ndarray | Sequence[np.ndarray] | Mapping[str, Any], twice: bool = False
 ) -> bytes:
-    """Return the body with an action or an observation."""
+    """Return the body with an action or an observation.
+
+    Args:
+        value: The action, as an array or a list of rows, or the observation.
+        twice: Whether it is encoded twice.
+    """
     text = json_numpy.dumps(value)
     return (json.dumps(text) if twice else text).encode()
 
 
 def _load(text: bytes, limits: MessageLimits) -> dict[str, Any]:
+    """Return the object in a JSON text."""
     payload = json_numpy.loads(text, limits)
     if not isinstance(payload, dict):
         raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
@@ -47,8 +67,18 @@ def _load(text: bytes, limits: MessageLimits) -> dict[str, Any]:
 
 
 def decode_action(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> np.ndarray | None:
-    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", the error of
-    OpenVLA's own server.
+    """Decode a reply.
+
+    Args:
+        body: The body.
+        limits: The limits of its size and content.
+
+    Returns:
+        The action, (D,) or (H, D); None if the reply is "error", the error of OpenVLA's own server.
+
+    Raises:
+        MalformedMessage: The body is something else.
+        MessageTooLarge: The body exceeds a limit.
     """
     value = json_numpy.loads(body, limits)
     if isinstance(value, str) and value != "error":  # encoded twice
@@ -74,9 +104,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "info": {"unnorm_key": "unnorm_key"},
         "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
     },
-    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py replies with
-    # the model's output, 1 = open, which its clients convert to LIBERO's -1 themselves
-    # (normalize_gripper_action, invert_gripper_action)
+    # openvla-oft: observations as in experiments/robot/libero. vla-scripts/deploy.py replies with
+    # the output of the model, 1 = open, which its clients convert to LIBERO's -1 themselves
+    # (normalize_gripper_action, invert_gripper_action).
     "openvla-oft": {
         "cameras": {"front": "full_image", "wrist": {"key": "wrist_image", "optional": True}},
         **libero_state("state"),

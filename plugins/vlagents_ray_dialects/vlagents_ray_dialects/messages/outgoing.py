@@ -1,9 +1,8 @@
-"""Conversion of our observation to another system's, and of its actions to ours: a `KeyMapping` in
-reverse.
+"""Converts our observation to another system's, and its actions to ours: a `KeyMapping` in reverse.
 
-Each entry of a mapping is then the destination of a value. The vectors of several entries with one
-key are joined by their `start` and `stop`; of `a|b` the first key is used; the `*` of a name
-matches all cameras or states that no other entry names.
+Each entry of a mapping is then the destination of a value. The vectors of several entries with the
+same key are joined according to their `start` and `stop`. Of alternatives `a|b` the first key is
+used. The `*` of a name matches all cameras or states that no other entry names.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ class Outgoing:
     """
 
     mapping: KeyMapping
-    # Whether a key `a/b` means `b` within `a`; else a single key.
+    # Returns whether a key `a/b` means `b` within `a`; otherwise it is a single key.
     is_nested: Callable[[str], bool] = lambda _key: True
-    text_key: str = "task"  # the replacement of `*` in the instruction's key
+    text_key: str = "task"  # replaces `*` in the key of the instruction
 
     def __post_init__(self) -> None:
         for name, state_keys in self.mapping.state.items():
@@ -51,8 +50,19 @@ class Outgoing:
                 )
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
-        """Convert an observation to the other system's; its arrays may be views of those of
-        `obs`.
+        """Convert an observation to the other system's.
+
+        Args:
+            obs: The observation.
+            instruction: The task in words, or None.
+
+        Returns:
+            The other system's observation, whose arrays may be views of the arrays of `obs`.
+
+        Raises:
+            MissingCamera: The observation lacks a camera of the mapping.
+            MissingState: The observation lacks a part of the state or the gripper.
+            InvalidObservation: The numbers of a state do not fit the mapping.
         """
         theirs: dict[str, Any] = {}
         for name, camera in self.mapping.cameras.items():
@@ -76,8 +86,16 @@ class Outgoing:
         return theirs
 
     def rows(self, theirs: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
-        """Convert their actions, (D,) or (H, D), or several such by name, to one (D,) or (H, D)
-        float32.
+        """Convert the other system's actions to ours.
+
+        Args:
+            theirs: The actions, (D,) or (H, D), or several such arrays by name.
+
+        Returns:
+            The actions, (D,) or (H, D) float32.
+
+        Raises:
+            InvalidAction: The arrays do not fit `action` of the mapping.
         """
         if not isinstance(theirs, Mapping):
             return _numbers("action", theirs)
@@ -114,8 +132,8 @@ class Outgoing:
         return _joined("action", pieces, InvalidAction)
 
     def contract(self) -> Contract:
-        """Return the contract that follows from the mapping: the policy's inputs and the
-        commands of its gripper.
+        """Return the contract that follows from the mapping: the inputs of the policy, and the
+        commands of the gripper.
         """
         mapping = self.mapping
 
@@ -140,7 +158,9 @@ class Outgoing:
         opened, closed = commands.pop() if len(commands) == 1 else (None, None)
         stops = [columns.stop for columns in mapping.action.values()]
         known_stops = [stop for stop in stops if stop is not None]
-        action_dim = max(known_stops, default=None) if len(known_stops) == len(stops) else None
+        action_dim = None
+        if len(known_stops) == len(stops):
+            action_dim = max(known_stops, default=None)
 
         return Contract(
             cameras=cameras,
@@ -151,8 +171,8 @@ class Outgoing:
         )
 
     def _has_separate_gripper(self) -> bool:
-        """Return whether the gripper has its own number; if not, the number is part of a state,
-        which then sets it.
+        """Return whether the gripper has a number of its own; otherwise its number is part of a
+        state, which sets it.
         """
         gripper = self.mapping.gripper
         if gripper is None:
@@ -187,9 +207,8 @@ class Outgoing:
         if gripper is not None and self._has_separate_gripper():
             if obs.gripper is not None:
                 reading = gripper.closed + obs.gripper * (gripper.open - gripper.closed)
-                pieces.setdefault(_first(gripper.key), []).append(
-                    (gripper.index, np.array([reading], np.float32))
-                )
+                values = np.array([reading], np.float32)
+                pieces.setdefault(_first(gripper.key), []).append((gripper.index, values))
             elif not gripper.optional:
                 raise MissingState("gripper", have=obs.state)
 
@@ -204,7 +223,8 @@ class Outgoing:
 
     def _put(self, theirs: dict[str, Any], key: str, value: Any) -> None:
         """Set a value in `theirs`, or in its map that a nested key names."""
-        key, target = _first(key), theirs
+        key = _first(key)
+        target = theirs
         if self.is_nested(key):
             *folders, key = key.split("/")
             for folder in folders:
@@ -213,18 +233,25 @@ class Outgoing:
 
 
 def _first(key: str) -> str:
+    """Return the first of the alternatives of a key."""
     return key.partition("|")[0]
 
 
 def _rest(name: str, pattern: str) -> str:
+    """Return the part of a name that the `*` of a pattern matches."""
     return name.removeprefix(pattern.partition("*")[0])
 
 
 def _matching(
     name: str, key: str, values: Mapping[str, np.ndarray], entries: Mapping[str, Any]
 ) -> list[tuple[str, np.ndarray]]:
-    """Return the keys and values of one entry: of its name, or of all matches of its `*` without
-    an entry.
+    """Return the keys and values of one entry.
+
+    Args:
+        name: The name of the entry; a `*` matches all values without an entry of their own.
+        key: The key of the entry, in which `*` is replaced.
+        values: The values of the observation by name.
+        entries: All entries of the mapping by name.
     """
     if "*" not in name:
         return [(key, values[name])] if name in values else []
@@ -237,7 +264,7 @@ def _matching(
 
 
 def _width(state_keys: tuple[StateKey, ...]) -> int | None:
-    """Return the length of a state; None if the mapping does not contain it."""
+    """Return the length of a state; None if the mapping does not declare it."""
     width = 0
     for state_key in state_keys:
         if state_key.stop is None:
@@ -249,21 +276,25 @@ def _width(state_keys: tuple[StateKey, ...]) -> int | None:
 def _split(
     name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]
 ) -> list[tuple[str, StateKey, np.ndarray]]:
-    """Split a state's vector into its parts; the part without `stop` receives the rest."""
+    """Split the vector of a state for its keys; the key without `stop` receives the remaining
+    numbers.
+    """
     widths = [_width((state_key,)) for _, state_key in keys]
-    known = sum(width for width in widths if width is not None)
-    is_mismatch = vector.size < known if None in widths else vector.size != known
+    known_width = sum(width for width in widths if width is not None)
+    remaining = vector.size - known_width
+    is_mismatch = remaining < 0 if None in widths else remaining != 0
     if is_mismatch:
         raise InvalidObservation(
-            f"state {name!r}: got {vector.size} numbers, the mapping says {known}; change one of "
-            "them"
+            f"state {name!r}: got {vector.size} numbers, the mapping says {known_width}; change "
+            "one of them"
         )
 
-    pieces, at = [], 0
+    pieces = []
+    begin = 0
     for (key, state_key), width in zip(keys, widths, strict=True):
-        end = at + (vector.size - known if width is None else width)
-        pieces.append((key, state_key, vector[at:end]))
-        at = end
+        end = begin + (remaining if width is None else width)
+        pieces.append((key, state_key, vector[begin:end]))
+        begin = end
     return pieces
 
 
@@ -292,10 +323,9 @@ def _joined(
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:
-    if (
-        not isinstance(value, np.ndarray)
-        or value.dtype.kind not in "fiu"
-        or not 0 < value.ndim <= 2
-    ):
+    """Return an array of actions as float32; raise `InvalidAction` if it is none."""
+    is_numeric = isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
+    if not is_numeric or not 0 < value.ndim <= 2:
         raise InvalidAction(f"{name!r}: got {described(value)}, want (D,) or (H, D) numbers")
-    return value.astype(np.float32)
+    actions: np.ndarray = value.astype(np.float32)
+    return actions
