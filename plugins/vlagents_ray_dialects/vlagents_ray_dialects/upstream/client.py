@@ -23,9 +23,9 @@ from vlagents_ray_dialects.messages.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)
 
-# (D,) or (H, D), or several of them by the upstream's names.
+# The actions in an answer, (D,) or (H, D), or several such arrays by the upstream's names.
 Answer = np.ndarray | Mapping[str, np.ndarray]
-_LOGGED = 8000  # characters of an upstream's error that are logged
+_LOGGED = 8000  # most characters of an upstream's error that are logged
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class ClientOptions:
     """The address and the settings of an upstream."""
 
     url: str
-    timeout_s: float  # s; after this time the answer counts as lost
+    timeout_s: float  # after this time without an answer, the connection counts as lost, s
     key: str | None = field(default=None, repr=False)  # the upstream's API key
     limits: MessageLimits = DEFAULT_LIMITS
 
@@ -45,7 +45,7 @@ class UpstreamClient(abc.ABC):
     # Whether the upstream keeps a session for each connection, by default.
     keeps_sessions: ClassVar[bool] = False
     mapping: ClassVar[str | None] = None
-    """The preset that is used if the deployment states no mapping."""
+    """The preset that is used if the deployment has no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()  # the schemes that a URL may have, the usual one first
     takes_key: ClassVar[bool] = True  # whether the protocol has a place for an API key
     text_key: ClassVar[str] = "task"  # the replacement of `*` in the key of the instruction
@@ -103,14 +103,14 @@ class UpstreamClient(abc.ABC):
         if not isinstance(keys, list):
             return []
 
-        known: set[str] = set()
+        read_keys: set[str] = set()
         for key in keys:
-            known |= {f"{key}", f"images/{key}", f"observation.images.{key}"}
+            read_keys |= {f"{key}", f"images/{key}", f"observation.images.{key}"}
 
         wrong = []
         for camera in outgoing.mapping.cameras.values():
             sent_key = camera.key.partition("|")[0]
-            if not any(matches(known_key, sent_key) for known_key in known):
+            if not any(matches(read_key, sent_key) for read_key in read_keys):
                 wrong.append(sent_key)
 
         if not wrong:
@@ -120,30 +120,39 @@ class UpstreamClient(abc.ABC):
         ]
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        """Return the number of rows of the upstream's actions, if its metadata states it, in
-        SGLang's `output`.
+        """Return the number of rows of the upstream's actions; None if the metadata do not contain
+        it. SGLang has it in `output`.
         """
         output = metadata.get("output")
         rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
         return rows if type(rows) is int and rows > 0 else None
 
     def actions(self, reply: Any) -> np.ndarray:
-        """Return the actions of a reply that is a map; raises `MalformedMessage` if there is no
-        such array.
+        """Return the actions in a reply that is a map.
+
+        Raises:
+            MalformedMessage: The reply has no array `actions`.
         """
         actions = reply.get("actions") if isinstance(reply, dict) else None
         if not isinstance(actions, np.ndarray):
-            got = sorted(map(str, reply))[:8] if isinstance(reply, dict) else type(reply).__name__
-            raise self.unreadable(got, "a map with an array `actions`")
+            content: object = type(reply).__name__
+            if isinstance(reply, dict):
+                content = sorted(map(str, reply))[:8]
+            raise self.unreadable(content, "a map with an array `actions`")
         return actions
 
-    def failed(self, text: object, got: str = "an error") -> PolicyFailed:
-        """Log an error that the upstream sent, and return ours, without the upstream's details."""
+    def failed(self, text: object, noun: str = "an error") -> PolicyFailed:
+        """Log an error that the upstream sent, and return ours, without the upstream's details.
+
+        Args:
+            text: The text of the upstream's error.
+            noun: What the upstream sent, for messages.
+        """
         logger.error(
-            "upstream %s answered with %s: %s", self.options.url, got, shown(text, _LOGGED)
+            "upstream %s answered with %s: %s", self.options.url, noun, shown(text, _LOGGED)
         )
         return PolicyFailed(
-            f"upstream {self.options.url}: it answered with {got}, whose text the server's log has"
+            f"upstream {self.options.url}: it answered with {noun}, whose text the server's log has"
         )
 
     def closed(self) -> ConnectionLost:
@@ -159,13 +168,13 @@ class UpstreamClient(abc.ABC):
     def lost(self, reason: object) -> ConnectionLost:
         """Close the connection, and return the error of its loss."""
         self.close()
-        late = isinstance(reason, TimeoutError)
-        text = f"no answer within {self.options.timeout_s:g} s" if late else reason
-        return ConnectionLost(f"upstream {self.options.url}: {text}")
+        if isinstance(reason, TimeoutError):
+            reason = f"no answer within {self.options.timeout_s:g} s"
+        return ConnectionLost(f"upstream {self.options.url}: {reason}")
 
-    def unreadable(self, got: object, want: str) -> MalformedMessage:
+    def unreadable(self, content: object, expected: str) -> MalformedMessage:
         """Return the error for an answer that violates the protocol."""
         return MalformedMessage(
-            f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of "
-            "the deployment?"
+            f"upstream {self.options.url}: got {content}, want {expected}; does it speak the "
+            "protocol of the deployment?"
         )

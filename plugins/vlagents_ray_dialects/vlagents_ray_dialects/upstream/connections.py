@@ -25,9 +25,10 @@ from vlagents_ray_dialects.upstream.client import Answer, UpstreamClient
 
 logger = logging.getLogger(__name__)
 
-_CONNECT_S = 5.0  # s for one attempt to connect
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0
-# Connections that one row may lose, so that a row that crashes an upstream does not end them all.
+_CONNECT_S = 5.0  # the time limit of one attempt to connect, s
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0  # pauses between two attempts to connect
+# The number of connections that one row may lose, so that a row that crashes an upstream does not
+# end all connections.
 _ATTEMPTS = 3
 
 Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
@@ -38,7 +39,7 @@ class _Share:
     """Rows of a batch that are sent together."""
 
     rows: range
-    attempts: int = 0
+    attempts: int = 0  # the number of connections that were lost with them
 
 
 class Lanes:
@@ -47,21 +48,31 @@ class Lanes:
     Args:
         clients: The clients, not connected yet.
         check: Raises an error if the metadata shows that an upstream is the wrong one.
-        retry_s: How long a batch waits for a lost upstream if there is no other, s.
+        retry_s: The time for which a batch waits for a lost upstream if there is no other, s.
     """
 
     def __init__(self, clients: Sequence[UpstreamClient], check: Check, retry_s: float) -> None:
-        self._clients, self._check, self._retry_s = clients, check, retry_s
-        self._ready: list[UpstreamClient] = []
+        self._clients = clients
+        self._check = check
+        self._retry_s = retry_s
+        self._ready: list[UpstreamClient] = []  # the connected clients
         self._changed = threading.Condition()
-        # Why the last attempt failed.
+        # The error of the last attempt to connect.
         self._reason: VLAgentsError = NoReplica("upstream: not connected yet")
         self._connecting: list[threading.Thread] = []
         self._closed = False
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Wait until one upstream answers; raises `ContractMismatch` if it is the wrong one."""
+        """Wait until one upstream answers.
+
+        Args:
+            timeout_s: The time limit, s.
+
+        Raises:
+            ContractMismatch: The upstream is the wrong one.
+            PolicyUnavailable: No upstream answers in time.
+        """
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
@@ -75,10 +86,16 @@ class Lanes:
             raise failed
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
-        """Return the answer to each observation, or the error in its place.
+        """Send observations to the upstreams.
 
-        If a connection is lost, its rows are sent again over another one, or over the same one once
-        it is reopened: an upstream without sessions keeps no state of them.
+        If a connection is lost, its rows are sent again over another connection, or over the same
+        one after it is reopened: an upstream without sessions keeps no state of them.
+
+        Args:
+            observations: The observations, in the upstream's format.
+
+        Returns:
+            The answer to each observation, or the error in its place.
         """
         results: list[Answer | Exception] = [NoReplica("upstream: not asked")] * len(observations)
         deadline = time.monotonic() + self._retry_s
@@ -89,24 +106,21 @@ class Lanes:
                     lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic())
                 )
                 ready = list(self._ready)
-            # Single rows, or as many parts as there are connections if the protocol has batches.
+
             if not work:
-                rows = len(observations)
-                parts = min(rows, max(1, len(ready))) if self._clients[0].batches else rows
-                work.extend(
-                    _Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts)
-                )
+                work.extend(self._shares(len(observations), len(ready)))
             if not ready:
                 break
-            others = [
-                self._pool.submit(self._work, client, work, observations, results)
-                for client in ready[1 : len(work)]
-            ]
+
+            futures = []
+            for client in ready[1 : len(work)]:
+                futures.append(self._pool.submit(self._work, client, work, observations, results))
             self._work(ready[0], work, observations, results)
-            for other in others:
-                other.result()
+            for future in futures:
+                future.result()
             if not work:
                 return results
+
         for share in work:
             for row in share.rows:
                 results[row] = NoReplica(
@@ -114,7 +128,15 @@ class Lanes:
                 )
         return results
 
+    def _shares(self, rows: int, connections: int) -> list[_Share]:
+        """Divide the rows of a batch: as many shares as there are connections if the protocol has
+        batches, otherwise single rows.
+        """
+        count = min(rows, max(1, connections)) if self._clients[0].batches else rows
+        return [_Share(range(rows * i // count, rows * (i + 1) // count)) for i in range(count)]
+
     def close(self) -> None:
+        """Close all connections."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -132,8 +154,8 @@ class Lanes:
         observations: Sequence[Mapping[str, Any]],
         results: list[Answer | Exception],
     ) -> None:
-        """Send shares over one connection until none is left or it is lost; an ended connection
-        consumes no share.
+        """Send shares over one connection until there are no more or it is lost; a connection that
+        has ended takes no share.
         """
         while True:
             if not client.is_open:
@@ -143,10 +165,10 @@ class Lanes:
                 share = work.popleft()
             except IndexError:
                 return
+
+            share_observations = [observations[row] for row in share.rows]
             try:
-                answers: Sequence[Answer | Exception] = client.ask(
-                    [observations[row] for row in share.rows]
-                )
+                answers: Sequence[Answer | Exception] = client.ask(share_observations)
             except ConnectionLost as error:
                 share.attempts += 1
                 if share.attempts < _ATTEMPTS:
@@ -164,6 +186,7 @@ class Lanes:
                 results[row] = answer
 
     def _lose(self, client: UpstreamClient, reason: VLAgentsError | None) -> None:
+        """Close a connection that is lost, and open it again in the background."""
         client.close()
         with self._changed:
             if reason is not None:
@@ -176,14 +199,18 @@ class Lanes:
         self._connect_in_background(client)
 
     def _connect_in_background(self, client: UpstreamClient) -> None:
+        """Connect a client on a new thread."""
         thread = threading.Thread(
             target=self._connect, args=(client,), name="upstream-connect", daemon=True
         )
-        self._connecting = [one for one in self._connecting if one.is_alive()] + [thread]
+        running = [earlier for earlier in self._connecting if earlier.is_alive()]
+        self._connecting = [*running, thread]
         thread.start()
 
     def _connect(self, client: UpstreamClient) -> None:
-        pause_s, logged = _FIRST_PAUSE_S, ""
+        """Try to connect a client until it succeeds; runs on its own thread."""
+        pause_s = _FIRST_PAUSE_S
+        logged_reason = ""
         while not self._closed:
             try:
                 self._check(client, client.connect(_CONNECT_S))
@@ -199,13 +226,16 @@ class Lanes:
                 client.close()
             else:
                 break
+
             with self._changed:
-                if str(reason) != logged:
-                    logger.warning("%s", logged := str(reason))
+                if str(reason) != logged_reason:
+                    logged_reason = str(reason)
+                    logger.warning("%s", logged_reason)
                 self._reason = reason
                 self._changed.notify_all()
                 self._changed.wait_for(lambda: self._closed, pause_s)
             pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s)
+
         with self._changed:
             if self._closed:
                 client.close()
@@ -227,7 +257,7 @@ class SessionConnections:
         urls: The addresses of the upstreams.
         make: Returns a client of an address.
         check: Raises an error if the metadata shows that an upstream is the wrong one.
-        retry_s: How long the start of an episode waits for an upstream, s.
+        retry_s: The time for which the begin of an episode waits for an upstream, s.
     """
 
     def __init__(
@@ -237,20 +267,23 @@ class SessionConnections:
         check: Check,
         retry_s: float,
     ) -> None:
-        self._urls, self._make, self._check, self._retry_s = urls, make, check, retry_s
+        self._urls = urls
+        self._make = make
+        self._check = check
+        self._retry_s = retry_s
         self._clients: dict[str, UpstreamClient] = {}
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Return when one upstream answers and its metadata fits the mapping; raises the errors
-        of `Lanes.start`.
-        """
+        """Wait until one upstream answers; raises errors as `Lanes.start`."""
         self._connected(timeout_s).close()
 
     def begin(self, session: str) -> None:
-        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within
-        `retry_s`.
+        """Connect for an episode of a session.
+
+        Raises:
+            NoReplica: No upstream answers within `retry_s`.
         """
         client = self._connected(self._retry_s)
         try:
@@ -265,21 +298,24 @@ class SessionConnections:
         self, sessions: Sequence[str], observations: Sequence[Mapping[str, Any]]
     ) -> list[Answer | Exception]:
         """Return the answer to the observation of each session, or the error in its place."""
-        others = [
-            self._pool.submit(self._ask, session, observation)
-            for session, observation in zip(sessions[1:], observations[1:], strict=True)
-        ]
-        first = self._ask(sessions[0], observations[0]) if sessions else None
-        return [] if first is None else [first, *(other.result() for other in others)]
+        if not sessions:
+            return []
+        futures = []
+        for session, observation in zip(sessions[1:], observations[1:], strict=True):
+            futures.append(self._pool.submit(self._ask, session, observation))
+        first_answer = self._ask(sessions[0], observations[0])
+        return [first_answer, *(future.result() for future in futures)]
 
     def drop(self, session: str) -> None:
+        """Close the connection of a session."""
         with self._lock:
             client = self._clients.pop(session, None)
         if client is not None:
-            # It may wait for a reply.
+            # Closing may wait for a reply.
             threading.Thread(target=client.close, name="upstream-close", daemon=True).start()
 
     def close(self) -> None:
+        """Close all connections."""
         self._pool.shutdown()
         with self._lock:
             clients, self._clients = self._clients, {}
@@ -287,6 +323,7 @@ class SessionConnections:
             client.close()
 
     def _ask(self, session: str, observation: Mapping[str, Any]) -> Answer | Exception:
+        """Return the answer to the observation of one session, or the error."""
         with self._lock:
             client = self._clients.get(session)
         if client is None:
@@ -307,7 +344,8 @@ class SessionConnections:
         """Return a client connected to the upstream with the fewest sessions among those that
         answer.
         """
-        deadline, pause_s = time.monotonic() + timeout_s, _FIRST_PAUSE_S
+        deadline = time.monotonic() + timeout_s
+        pause_s = _FIRST_PAUSE_S
         while True:
             with self._lock:
                 load = Counter(client.options.url for client in self._clients.values())

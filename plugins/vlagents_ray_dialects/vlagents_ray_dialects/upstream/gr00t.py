@@ -16,10 +16,10 @@ from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, Upstrea
 
 
 class GR00TClient(UpstreamClient):
-    """A client of servers from N1.6 on, or of N1.5, recognised by modality keys such as
+    """A client of servers of N1.6 and newer, and of N1.5, whose modality keys have the form
     `video.front`.
 
-    If the mapping has such keys, the observation has them also, as `Gr00tSimPolicyWrapper` expects.
+    If the mapping has such keys, the observation also has them, as `Gr00tSimPolicyWrapper` expects.
     """
 
     batches: ClassVar[bool] = True
@@ -33,14 +33,15 @@ class GR00TClient(UpstreamClient):
         self._socket: Any = None
         self._monitor: Any = None
         self._text_key = TEXT_KEY
-        self._flat = False
-        self._packed = False
+        self._flat = False  # whether the server is of N1.5
+        self._packed = False  # whether it reads arrays of `msgpack_numpy`
 
     @property
     def is_open(self) -> bool:
         return self._socket is not None and not self._monitor.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Connect, and return the upstream's modalities."""
         zmq = self._zmq
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.REQ)
@@ -49,10 +50,12 @@ class GR00TClient(UpstreamClient):
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.MAXMSGSIZE, self.options.limits.body_bytes)
         self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+
         try:
             self._socket.connect(self.options.url)
             reply = self._call("get_modality_config", None, timeout_s)
-            self._flat, self._packed = _is_flat(reply), wire.reads_packed(reply)
+            self._flat = _is_flat(reply)
+            self._packed = wire.reads_packed(reply)
             modalities = wire.read_modalities(reply)
         except (zmq.ZMQError, VLAgentsError) as error:
             self.close()
@@ -64,6 +67,7 @@ class GR00TClient(UpstreamClient):
         return modalities
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        """Send a batch of observations, and return the actions of each."""
         flat = is_flat(observations[0])
         if flat:
             observations = [nested(observation) for observation in observations]
@@ -94,7 +98,7 @@ class GR00TClient(UpstreamClient):
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         """Compare the upstream's modalities with the mapping: the keys of videos, states and
-        actions, and the number of moments.
+        actions, and the number of time steps.
         """
         differences = []
         mapping = outgoing.mapping
@@ -103,29 +107,30 @@ class GR00TClient(UpstreamClient):
         for state_entries in mapping.state.values():
             state_keys += [entry.key for entry in state_entries]
 
-        for kind, field, keys in (
+        for modality, field, keys in (
             ("video", "cameras", camera_keys),
             ("state", "state", state_keys),
         ):
-            modality = metadata.get(kind, {"keys": [], "steps": []})
-            sent = []
+            needed = metadata.get(modality, {"keys": [], "steps": []})
+            sent_keys = []
             for key in keys:
                 for alternative in key.split("|"):
-                    sent.append(alternative.removeprefix(f"{kind}/").removeprefix(f"{kind}."))
+                    name = alternative.removeprefix(f"{modality}/").removeprefix(f"{modality}.")
+                    sent_keys.append(name)
 
-            lacks = []
-            for key in modality["keys"]:
-                if not any(matches(key, sent_key) for sent_key in sent):
-                    lacks.append(key)
+            missing = []
+            for key in needed["keys"]:
+                if not any(matches(key, sent_key) for sent_key in sent_keys):
+                    missing.append(key)
 
-            if lacks:
+            if missing:
                 differences.append(
-                    f"{kind}: the upstream needs {lacks}, the mapping gives {sent}; add them to "
-                    f"mapping.{field}"
+                    f"{modality}: the upstream needs {missing}, the mapping gives {sent_keys}; add "
+                    f"them to mapping.{field}"
                 )
-            if len(modality["steps"]) > 1:
+            if len(needed["steps"]) > 1:
                 differences.append(
-                    f"{kind}: the upstream needs the moments {modality['steps']}, and only the "
+                    f"{modality}: the upstream needs the moments {needed['steps']}, and only the "
                     "newest is sent; serve a model that needs one"
                 )
 
@@ -146,18 +151,20 @@ class GR00TClient(UpstreamClient):
         return len(metadata.get("action", {}).get("steps", ())) or None
 
     def _call(self, endpoint: str, data: Any, timeout_s: float) -> Any:
+        """Send a request, and return the value of its reply."""
         if self._socket is None:
             raise self.closed()
+
         deadline = time.monotonic() + timeout_s
+        message = wire.write(endpoint, data, self.options.key, packed=self._packed)
         try:
             self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
-            self._socket.send(
-                wire.write(endpoint, data, self.options.key, packed=self._packed), self._zmq.NOBLOCK
-            )
+            self._socket.send(message, self._zmq.NOBLOCK)
             self._wait(self._zmq.POLLIN, deadline, "no answer")
             payload = self._socket.recv(self._zmq.NOBLOCK)
         except self._zmq.ZMQError as error:
             raise self.lost(error) from error
+
         reply = wire.read(payload, self.options.limits)
         if isinstance(reply, dict) and "error" in reply:
             raise self.failed(reply["error"])
@@ -174,17 +181,17 @@ class GR00TClient(UpstreamClient):
         ready = dict(poller.poll(max(0.0, deadline - begun) * 1e3))
         if self._socket in ready:
             return
-        ended = self._monitor in ready
-        raise self.lost(
-            "the connection ended" if ended else f"{failure} within {deadline - begun:.3g} s"
-        )
+        if self._monitor in ready:
+            raise self.lost("the connection ended")
+        raise self.lost(f"{failure} within {deadline - begun:.3g} s")
 
 
 def _is_flat(reply: Any) -> bool:
     """Return whether modalities have N1.5's keys, which begin with the name of the modality."""
     video = reply.get("video") if isinstance(reply, dict) else None
     config = video.get("as_json", video) if isinstance(video, dict) else None
-    return isinstance(config, str) or (
-        isinstance(config, dict)
-        and any(str(key).startswith("video.") for key in config.get("modality_keys", []))
-    )
+    if isinstance(config, str):
+        return True
+    if not isinstance(config, dict):
+        return False
+    return any(str(key).startswith("video.") for key in config.get("modality_keys", []))

@@ -30,14 +30,14 @@ from vlagents_ray_dialects.messages import openpi, openvla
 from vlagents_ray_dialects.messages.outgoing import Outgoing
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
 
-_BUSY = (408, 429, 502, 503, 504)
+_BUSY = (408, 429, 502, 503, 504)  # statuses of an upstream that is busy or unavailable
 
 
 class HttpClient(UpstreamClient):
     """A client that posts one observation per request, over a connection that stays open."""
 
     schemes: ClassVar[tuple[str, ...]] = ("http", "https")
-    path: ClassVar[str]  # of a URL that has none
+    path: ClassVar[str]  # the path of the requests, for a URL without a path
     about: ClassVar[str | None] = None  # path of the upstream's metadata, a JSON object
     media_type: ClassVar[str] = "application/json"
 
@@ -60,6 +60,7 @@ class HttpClient(UpstreamClient):
 
     @property
     def is_open(self) -> bool:
+        """Whether the connection is open, as far as this process knows."""
         if self._connection is None:
             return False
         connection, _ = self._connection
@@ -67,11 +68,13 @@ class HttpClient(UpstreamClient):
             return False
         if isinstance(connection, http.client.HTTPSConnection):
             return True  # readable data may be a TLS session ticket
-        ended = select.poll()  # uvicorn closes a connection that is idle for 5 s
-        ended.register(connection.sock, select.POLLIN)
-        return not ended.poll(0)
+        # uvicorn closes a connection that is idle for 5 s, which makes it readable.
+        poller = select.poll()
+        poller.register(connection.sock, select.POLLIN)
+        return not poller.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Connect, and return the upstream's metadata, if the protocol has some."""
         metadata: Any = {}
         if self.about is not None:
             self._open(timeout_s)
@@ -86,14 +89,16 @@ class HttpClient(UpstreamClient):
         return metadata if isinstance(metadata, dict) else {}
 
     def _open(self, timeout_s: float) -> None:
-        secure = self._url.scheme == "https"
-        kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-        connection = kind(self._url.hostname or "", self._url.port, timeout=timeout_s)
+        """Open a connection."""
+        is_secure = self._url.scheme == "https"
+        cls = http.client.HTTPSConnection if is_secure else http.client.HTTPConnection
+        connection = cls(self._url.hostname or "", self._url.port, timeout=timeout_s)
         try:
             connection.connect()
         except OSError as error:
             connection.close()
             raise self.unreachable(error) from error
+
         connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.auto_open = 0
         self._connection = connection, DeadlineSocket.install(connection)
@@ -103,21 +108,24 @@ class HttpClient(UpstreamClient):
         return [self.decode(self._request("POST", self._path, self.encode(observation)))]
 
     def _request(self, method: str, path: str, content: bytes | None) -> bytes:
+        """Send a request, and return the body of the answer."""
         if self._connection is None:
             raise self.closed()
-        most = self.options.limits.body_bytes
+
+        max_bytes = self.options.limits.body_bytes
         connection, deadline_socket = self._connection
         deadline_socket.begin_exchange(self.options.timeout_s)
         try:
             connection.request(method, path, content, self._headers)
             response = connection.getresponse()
-            body = response.read(most + 1)
+            body = response.read(max_bytes + 1)
         except (http.client.HTTPException, OSError) as error:
             raise self.lost(error) from error
-        if len(body) > most:
+
+        if len(body) > max_bytes:
             self.close()
             raise MessageTooLarge(
-                f"upstream {self.options.url}: an answer of more than {most} bytes"
+                f"upstream {self.options.url}: an answer of more than {max_bytes} bytes"
             )
         if response.will_close:
             self.close()
@@ -150,7 +158,8 @@ class OpenVLAClient(HttpClient):
         return openvla.encode(observation)
 
     def decode(self, body: bytes) -> np.ndarray:
-        if (action := openvla.decode_action(body, self.options.limits)) is None:
+        action = openvla.decode_action(body, self.options.limits)
+        if action is None:
             raise self.failed("error")
         return action
 
@@ -174,12 +183,12 @@ class SGLangClient(HttpClient):
 
 
 class FlashRTClient(HttpClient):
-    """A client of FlashRT's `/predict`: images without names in base64, in the order of the
-    mapping.
+    """A client of FlashRT's `/predict`, which reads images without names in base64, in the order of
+    the mapping.
 
-    Without images the server draws random ones, without a prompt it uses the last one of any
-    client, and if an image is missing, the next one takes its place. So a mapping of which one may
-    be missing is refused.
+    Without images the server draws random ones, without a prompt it uses the last prompt of any
+    client, and if an image is missing, it uses the next one instead. So a mapping in which an image
+    or the prompt is optional is rejected.
     """
 
     path: ClassVar[str] = "/predict"
@@ -215,10 +224,10 @@ class FlashRTClient(HttpClient):
                 f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images "
                 "of one shape and a prompt; resize them, and reset with an instruction"
             )
-        body = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in observation.items()
-        }
+
+        body: dict[str, Any] = {}
+        for name, value in observation.items():
+            body[name] = value.tolist() if isinstance(value, np.ndarray) else value
         body["images"] = [base64.b64encode(image.tobytes()).decode() for image in images]
         return json.dumps(body | {"image_shape": shapes[0]}).encode()
 

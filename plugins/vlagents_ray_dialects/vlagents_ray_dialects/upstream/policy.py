@@ -63,44 +63,49 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     urls: list[str] = Field(
         min_length=1,
         max_length=64,
-        description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 "
-        "(gr00t), "
-        "http://gpu-box:8000 (openvla, sglang, flashrt); a batch is spread over them",
+        description="addresses of servers with the same model, e.g. ws://gpu-box:8000, "
+        "tcp://gpu-box:5555 (gr00t), http://gpu-box:8000 (openvla, sglang, flashrt); a batch is "
+        "spread over them",
     )
     mapping: str | dict[str, Any] | None = Field(
         default=None,
-        description="our names of the upstream's keys: a preset's name, or an object, as for "
-        "dialects; default: the "
-        "protocol's own, except for openpi, whose robots have different keys",
+        description="our names of the upstream's keys: the name of a preset, or an object, as for "
+        "dialects; default: the preset of the protocol, except for openpi, whose robots have "
+        "different keys",
     )
     contract: dict[str, Any] = Field(
         default_factory=dict,
-        description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, "
-        "chunk",
+        description="the contract of the model, as far as it does not follow from the mapping, "
+        "e.g. action: {dim: 7}, chunk",
     )
     sessions: Literal["none", "connection"] | None = Field(
         default=None,
         description="none: the model keeps nothing between two observations, and connections are "
-        "shared; connection: a "
-        "session has a connection of its own, and is reset; default: connection for roboarena and "
-        "vla_eval",
+        "shared; connection: each session has its own connection, and is reset; default: "
+        "connection for roboarena and vla_eval",
     )
     connections: int = Field(
         default=1,
         ge=1,
         le=64,
-        description="to each URL, over which a batch is spread too; for `sessions: none`",
+        description="number of connections to each URL, over which a batch is spread; for "
+        "`sessions: none`",
     )
     timeout_s: float = Field(
-        default=30.0, gt=0, description="for an answer; then the connection counts as lost, s"
+        default=30.0,
+        gt=0,
+        description="time limit for an answer, after which the connection counts as lost, s",
     )
     retry_s: float = Field(
         default=2.0,
         ge=0,
-        description="for a lost upstream to return, before a request is answered with 503, s",
+        description="time for which a request waits for a lost upstream, before the answer is 503, "
+        "s",
     )
     connect_timeout_s: float = Field(
-        default=600.0, gt=0, description="for the first upstream to answer at the start, s"
+        default=600.0,
+        gt=0,
+        description="time limit for the first answer of an upstream at the start, s",
     )
     key_env: str | None = Field(
         default=None, description="name of the environment variable with the upstream's API key"
@@ -109,6 +114,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     @field_validator("contract")
     @classmethod
     def _readable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        """Reject a contract that cannot be read."""
         try:
             Contract.from_json(value)
         except VLAgentsError as error:
@@ -117,12 +123,13 @@ class UpstreamConfig(BaseModel, extra="forbid"):
 
     @model_validator(mode="after")
     def _fit(self) -> Self:
+        """Reject settings that do not fit the protocol."""
         for url in self.urls:
-            parts = urlsplit(url)
-            if parts.scheme not in self.client.schemes or not parts.hostname:
-                want = " or ".join(f"{scheme}://HOST:PORT" for scheme in self.client.schemes)
-                raise ValueError(f"urls: got {url!r}, want {want} for {self.protocol}")
-            if parts.username is not None or parts.password is not None:
+            address = urlsplit(url)
+            if address.scheme not in self.client.schemes or not address.hostname:
+                forms = " or ".join(f"{scheme}://HOST:PORT" for scheme in self.client.schemes)
+                raise ValueError(f"urls: got {url!r}, want {forms} for {self.protocol}")
+            if address.username is not None or address.password is not None:
                 raise ValueError(
                     "urls: got a name or a password in one; put the key into a variable, and name "
                     "it in key_env"
@@ -139,27 +146,33 @@ class UpstreamConfig(BaseModel, extra="forbid"):
 
     @property
     def client(self) -> type[UpstreamClient]:
+        """The class of the protocol's clients."""
         return PROTOCOLS[self.protocol]
 
     @property
     def keeps_sessions(self) -> bool:
         """Whether each session has its own connection."""
-        return (
-            self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
-        )
+        if self.sessions is None:
+            return self.client.keeps_sessions
+        return self.sessions == "connection"
 
     def keys(self) -> KeyMapping:
+        """Return the mapping, by default the one of the protocol."""
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
 
 
-UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed for the batch, ms
+# The key in `Act.info` of the time that the upstreams needed for the batch, ms.
+UPSTREAM_MS = "upstream_ms"
 
 
 class Upstream(Agent):
     """Requests the actions of each batch from the servers of another system.
 
     The mapping converts the observation to the upstream's own keys. The upstream's actions are
-    returned unchanged; the contract states the range of their gripper commands.
+    returned unchanged; the contract declares the range of their gripper commands.
+
+    Args:
+        config: The settings.
     """
 
     Config: ClassVar[type] = UpstreamConfig
@@ -178,15 +191,20 @@ class Upstream(Agent):
     @property
     def contract(self) -> Contract:
         """The contract from the mapping and the settings, with the length of a chunk if the
-        upstream states it.
+        upstream's metadata contain it.
         """
         return self._state["contract"]
 
     def initialize(self) -> None:
-        """Connect to the upstreams; raises `ContractMismatch` if their metadata contradicts the
-        mapping.
+        """Connect to the upstreams.
+
+        Raises:
+            ConfigError: The variable with the API key is not set.
+            ContractMismatch: The metadata of an upstream contradict the mapping.
+            PolicyUnavailable: No upstream answers in time.
         """
-        config, key = self.config, None
+        config = self.config
+        key = None
         if config.key_env is not None:
             key = os.environ.get(config.key_env)
             if not key:
@@ -196,68 +214,75 @@ class Upstream(Agent):
                 )
 
         def make(url: str) -> UpstreamClient:
+            """Make a client of an address."""
             return config.client(ClientOptions(url, config.timeout_s, key))
 
         if config.keeps_sessions:
             self._sessions = SessionConnections(config.urls, make, self._check, config.retry_s)
             self._sessions.start(config.connect_timeout_s)
         else:
-            clients = [make(url) for _ in range(config.connections) for url in config.urls]
+            clients = [make(url) for url in config.urls * config.connections]
             self._lanes = Lanes(clients, self._check, config.retry_s)
             self._lanes.start(config.connect_timeout_s)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, also at the upstream if that keeps sessions."""
+        """Begin an episode, also at the upstream if it keeps sessions."""
         self._instruction = instruction
         if self._sessions is not None:
             self._session = uuid.uuid4().hex
             self._sessions.begin(self._session)
-            # The copy ends with its session.
+            # This copy of the agent is deleted when its session ends.
             ended = weakref.finalize(self, self._sessions.drop, self._session)
             ended.atexit = False
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Request the actions of all sessions from the upstreams at once; an error only fails
-        its own session.
+        """Request the actions of all sessions from the upstreams at the same time; an error fails
+        only its own session.
         """
 
-        def converted(one: Obs, session: Any) -> tuple[Any, dict[str, Any]]:
-            return session, self._outgoing.observation(one, session._instruction)
+        def convert(session_obs: Obs, session: Any) -> tuple[Any, dict[str, Any]]:
+            """Return a session, and its observation in the upstream's format."""
+            return session, self._outgoing.observation(session_obs, session._instruction)
 
-        def ask(good: list[tuple[Any, dict[str, Any]]]) -> list[Any]:
+        def request(valid: list[tuple[Any, dict[str, Any]]]) -> list[Any]:
+            """Return the action of each session, or the error in its place."""
             begun = time.perf_counter()
-            answers = self._ask(*zip(*good, strict=True))
+            answers = self._ask(*zip(*valid, strict=True))
             info = {UPSTREAM_MS: (time.perf_counter() - begun) * 1e3}
 
             def act(answer: Any) -> Any:
-                return (
-                    answer
-                    if isinstance(answer, Exception)
-                    else Act(self._outgoing.rows(answer), info=info)
-                )
+                """Return the action in an answer."""
+                if isinstance(answer, Exception):
+                    return answer
+                return Act(self._outgoing.rows(answer), info=info)
 
             return [attempt(act, answer) for answer in answers]
 
-        return compute_valid(
-            [attempt(converted, *each) for each in zip(obs, sessions, strict=True)], ask
-        )
+        inputs = []
+        for session_obs, session in zip(obs, sessions, strict=True):
+            inputs.append(attempt(convert, session_obs, session))
+        return compute_valid(inputs, request)
 
     def close(self) -> None:
+        """Close all connections."""
         for connections in (self._lanes, self._sessions):
             if connections is not None:
                 connections.close()
 
     def _ask(self, sessions: Sequence[Any], observations: Sequence[Mapping[str, Any]]) -> list[Any]:
+        """Send the observations of sessions, and return the answer to each, or the error."""
         if self._sessions is not None:
-            return list(
-                self._sessions.ask([session._session or "" for session in sessions], observations)
-            )
+            ids = [session._session or "" for session in sessions]
+            return list(self._sessions.ask(ids, observations))
         if self._lanes is None:
             raise NotReset("upstream: act before initialize; there is no connection")
         return list(self._lanes.ask(observations))
 
     def _check(self, client: UpstreamClient, metadata: Mapping[str, Any]) -> None:
+        """Raise `ContractMismatch` if an upstream's metadata contradict the mapping or the
+        settings; otherwise set the length of a chunk.
+        """
         differences = client.differences(metadata, self._outgoing)
         chunk = client.chunk(metadata)
         configured = self.config.contract.get("chunk")

@@ -13,7 +13,7 @@ from vlagents_ray_dialects.messages import rpyc
 from vlagents_ray_dialects.messages import vlagents as wire
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
 
-_PAUSE_S = 0.2  # s, between two checks whether the upstream's model is loaded
+_PAUSE_S = 0.2  # the pause between two checks whether the upstream's model is loaded, s
 
 
 class VlagentsClient(UpstreamClient):
@@ -35,11 +35,12 @@ class VlagentsClient(UpstreamClient):
         return self._socket is not None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        url, deadline = urlsplit(self.options.url), time.monotonic() + timeout_s
+        """Connect, wait until the upstream's model is loaded, and return its name."""
+        url = urlsplit(self.options.url)
+        address = url.hostname or "", url.port or 8080
+        deadline = time.monotonic() + timeout_s
         try:
-            self._socket = socket.create_connection(
-                (url.hostname or "", url.port or 8080), timeout_s
-            )
+            self._socket = socket.create_connection(address, timeout_s)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             root = self._call(wire.get_root(self._next()), deadline)
             if not isinstance(root, tuple):
@@ -70,29 +71,31 @@ class VlagentsClient(UpstreamClient):
             self._socket = None
 
     def _next(self) -> int:
+        """Return the sequence number of the next request."""
         self._sequence += 1
         return self._sequence
 
     def _method(self, name: str, deadline: float, *args: str) -> Any:
+        """Call a method of the upstream's root, and return its result."""
         value = self._call(wire.call(self._next(), self._root, name, *args), deadline)
         if isinstance(value, wire.RemoteError):
             raise self.failed(value.text)
         return value
 
     def _call(self, frame: bytes, deadline: float) -> Any:
+        """Send a request, and return the value of its reply; other replies are skipped."""
         connection = self._socket
         if connection is None:
             raise self.closed()
+        limit = self.options.limits.body_bytes
         try:
-            connection.settimeout(_left(deadline))
+            connection.settimeout(_remaining_s(deadline))
             connection.sendall(frame)
             while True:
-                length, compressed = rpyc.read_header(
-                    self._receive(connection, rpyc.HEADER.size, deadline),
-                    self.options.limits.body_bytes,
-                )
+                header = self._receive(connection, rpyc.HEADER.size, deadline)
+                length, compressed = rpyc.read_header(header, limit)
                 body = self._receive(connection, length, deadline)
-                result = wire.read_result(body, compressed, self.options.limits.body_bytes)
+                result = wire.read_result(body, compressed, limit)
                 if result is None:
                     continue
                 sequence, value = result
@@ -105,19 +108,22 @@ class VlagentsClient(UpstreamClient):
             raise
 
     def _receive(self, connection: socket.socket, count: int, deadline: float) -> bytearray:
+        """Return the next bytes of a connection."""
         data = bytearray(count)
-        view, at = memoryview(data), 0
-        while at < count:
-            connection.settimeout(_left(deadline))
-            received = connection.recv_into(view[at:])
-            if not received:
+        view = memoryview(data)
+        received = 0
+        while received < count:
+            connection.settimeout(_remaining_s(deadline))
+            length = connection.recv_into(view[received:])
+            if not length:
                 raise ConnectionResetError("the connection ended")
-            at += received
+            received += length
         return data
 
 
-def _left(deadline: float) -> float:
-    left_s = deadline - time.monotonic()
-    if left_s <= 0:
+def _remaining_s(deadline: float) -> float:
+    """Return the time until a deadline, s; raise `TimeoutError` if it is over."""
+    remaining_s = deadline - time.monotonic()
+    if remaining_s <= 0:
         raise TimeoutError
-    return left_s
+    return remaining_s

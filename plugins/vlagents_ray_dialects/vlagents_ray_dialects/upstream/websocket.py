@@ -24,11 +24,12 @@ from vlagents_ray_dialects.messages.outgoing import Outgoing
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
 
 _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
-_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is also raised
-_CLOSE_S = 1
-_REFUSED = (401, 403)
-# An upstream that computes on its event loop answers no pings meanwhile. Older versions of
-# `websockets` send none.
+# `websockets` logs each lost connection as an error, which is also raised.
+_LOG.setLevel(logging.CRITICAL)
+_CLOSE_S = 1  # the time limit for the closing handshake, s
+_REFUSED = (401, 403)  # statuses of an upstream that rejects the API key
+# No pings are sent, as an upstream that computes on its event loop does not answer them meanwhile.
+# Older versions of `websockets` never send pings.
 _NO_PINGS: dict[str, Any] = (
     {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 )
@@ -47,9 +48,9 @@ class WebSocketClient(UpstreamClient):
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        self._headers = (
-            {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
-        )
+        self._headers: dict[str, str] = {}
+        if options.key is not None:
+            self._headers["Authorization"] = f"{self.key_scheme} {options.key}"
         self._connection: ClientConnection | None = None
         self._open = contextlib.ExitStack()
 
@@ -58,8 +59,11 @@ class WebSocketClient(UpstreamClient):
         return self._connection is not None and self._connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
-        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if
-        it rejects the key.
+        """Connect.
+
+        Raises:
+            PolicyUnavailable: The upstream cannot be reached.
+            Unauthorized: It rejects the API key.
         """
         url = self.options.url
         try:
@@ -93,7 +97,11 @@ class WebSocketClient(UpstreamClient):
             raise self.lost(error) from error
 
     def recv(self, timeout_s: float | None = None) -> bytes | str:
-        """Return the next message; raises `ConnectionLost` if the connection broke or timed out."""
+        """Return the next message.
+
+        Raises:
+            ConnectionLost: The connection is lost, or no message arrives in time.
+        """
         wait_s = self.options.timeout_s if timeout_s is None else timeout_s
         try:
             return self._opened().recv(timeout=wait_s)
@@ -107,6 +115,7 @@ class WebSocketClient(UpstreamClient):
         self._open.close()
 
     def _opened(self) -> ClientConnection:
+        """Return the connection; raise `ConnectionLost` if it is closed."""
         if self._connection is None:
             raise self.closed()
         return self._connection
@@ -119,7 +128,7 @@ class OpenPiClient(WebSocketClient):
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key is a path: `images/cam_high` is one, openpi's keys under
+        """Return whether a key is a path, as `images/cam_high` is; openpi's keys under
         `observation/` are not.
         """
         return not key.startswith("observation/")
@@ -137,24 +146,25 @@ class OpenPiClient(WebSocketClient):
         return [self.actions(self._call(observation))]
 
     def _call(self, message: Mapping[str, Any]) -> Any:
+        """Send a message, and return the value of its reply."""
         self.send(openpi.encode(message))
         return self._read(self.recv())
 
     def _read(self, data: bytes | str) -> Any:
+        """Return the value of a reply."""
         return self._map(data)
 
     def _map(self, data: bytes | str) -> dict[str, Any]:
         """Return the map in a message; an error that is a text, or has the key `error`, ends the
         connection.
         """
-        reply: dict[str, Any] = self._good(
-            data if isinstance(data, str) else openpi.decode(data, self.options.limits)
-        )
-        return reply
+        reply = data if isinstance(data, str) else openpi.decode(data, self.options.limits)
+        value: dict[str, Any] = self._without_error(reply)
+        return value
 
-    def _good(self, reply: Any) -> Any:
-        """Return a reply that is no error: openpi's is a text, SGLang's and vLLM-Omni's are
-        maps.
+    def _without_error(self, reply: Any) -> Any:
+        """Return a reply; raise `PolicyFailed` if it is an error. openpi's errors are texts,
+        SGLang's and vLLM-Omni's are maps.
         """
         if isinstance(reply, str):
             self.close()
@@ -234,12 +244,12 @@ class RoboArenaClient(OpenPiClient):
 
     def _read(self, data: bytes | str) -> Any:
         """Return a map, or the array that older servers and vLLM-Omni send."""
-        return self._good(
-            data if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
-        )
+        reply = data if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
+        return self._without_error(reply)
 
 
-_STATED = (
+# The keys of a server's `hello` that are its metadata.
+_METADATA_KEYS = (
     "model_server",
     "harness_version",
     "protocol_version",
@@ -256,20 +266,19 @@ class VlaEvalClient(WebSocketClient):
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        self._seq = 0
+        self._seq = 0  # the number of the last message
         self._begun = -1  # the number of the last message that began an episode
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Connect, and return the upstream's metadata."""
         self.open(timeout_s)
         version = importlib.metadata.version("vlagents-ray")
+        payload = {
+            "harness_version": f"vlagents-ray {version}",
+            "protocol_version": vla_eval.PROTOCOL_VERSION,
+        }
         try:
-            self._send(
-                "hello",
-                {
-                    "harness_version": f"vlagents-ray {version}",
-                    "protocol_version": vla_eval.PROTOCOL_VERSION,
-                },
-            )
+            self._send("hello", payload)
             hello = self._answer("hello", timeout_s)
         except VLAgentsError as error:
             self.close()
@@ -282,13 +291,14 @@ class VlaEvalClient(WebSocketClient):
                 f"upstream {self.options.url}: got protocol version {shown(theirs, 20)}, "
                 f"want {vla_eval.PROTOCOL_VERSION}"
             )
-        return {name: hello[name] for name in _STATED if name in hello}
+        return {key: hello[key] for key in _METADATA_KEYS if key in hello}
 
     def begin(self) -> None:
         self._send("episode_start", {})
         self._begun = self._seq
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        """Send one observation, and return its action."""
         [observation] = observations
         self._send("observation", dict(observation))
         payload = self._answer("action", self.options.timeout_s)
@@ -303,23 +313,26 @@ class VlaEvalClient(WebSocketClient):
         return [actions]
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        """Return the state, with its cure, if the upstream needs it and the mapping lacks it."""
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
-            return [
-                (
-                    "state: the upstream needs it (send_state), the mapping has none; add it to "
-                    "mapping.state"
-                )
-            ]
+            sentence = (
+                "state: the upstream needs it (send_state), the mapping has none; add it to "
+                "mapping.state"
+            )
+            return [sentence]
         return []
 
-    def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:
+    def _send(self, message_type: vla_eval.Kind, payload: dict[str, Any]) -> None:
+        """Send a message with the next number."""
         self._seq += 1
-        self.send(vla_eval.encode(vla_eval.VlaEvalMessage(kind, payload, self._seq)))
+        self.send(vla_eval.encode(vla_eval.VlaEvalMessage(message_type, payload, self._seq)))
 
-    def _answer(self, kind: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
-        """Return the payload of the answer to the last message; older answers are skipped."""
+    def _answer(self, message_type: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
+        """Return the payload of the answer of a type to the last message; older answers are
+        skipped.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
             data = self.recv(max(0.0, deadline - time.monotonic()))
@@ -329,5 +342,5 @@ class VlaEvalClient(WebSocketClient):
             message = vla_eval.decode(data, self.options.limits)
             if message.kind == "error" and message.seq in (self._seq, self._begun):
                 raise self.failed(message.payload)
-            if message.seq == self._seq and message.kind == kind:
+            if message.seq == self._seq and message.kind == message_type:
                 return message.payload
