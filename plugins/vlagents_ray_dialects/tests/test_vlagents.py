@@ -137,8 +137,8 @@ def test_a_reset_of_0_2_brings_instruction_and_options() -> None:
 
 def test_rows_become_steps_and_the_gripper_has_a_place_of_its_own() -> None:
     rows = np.array([[1, 2, -1], [3, 4, 1]], np.float32)
-    parts = {"arm": vlagents.Part(gripper=-1, gripper_open=-1.0, gripper_closed=1.0)}
-    acts = json.loads(vlagents.write_act(Act(rows, True, {"a": 1}), ["arm"], parts))["acts"]
+    columns = {"arm": vlagents.RobotColumns(gripper=-1, gripper_open=-1.0, gripper_closed=1.0)}
+    acts = json.loads(vlagents.write_act(Act(rows, True, {"a": 1}), ["arm"], columns))["acts"]
     assert [step["arm"]["gripper"] for step in acts] == [1.0, 0.0]
     assert [step["arm"]["done"] for step in acts] == [False, True]
     assert [step["arm"]["info"] for step in acts] == [{"a": 1}, {}]
@@ -146,8 +146,8 @@ def test_rows_become_steps_and_the_gripper_has_a_place_of_its_own() -> None:
 
 
 def test_columns_are_shared_out_among_robots() -> None:
-    parts = {"left": vlagents.Part(0, 2, 1), "right": vlagents.Part(2, 4)}
-    [step] = json.loads(vlagents.write_act(Act(np.arange(4.0)), ["left", "right"], parts))["acts"]
+    columns = {"left": vlagents.RobotColumns(0, 2, 1), "right": vlagents.RobotColumns(2, 4)}
+    [step] = json.loads(vlagents.write_act(Act(np.arange(4.0)), ["left", "right"], columns))["acts"]
     assert step["left"]["action"]["shape"] == [1]
     assert step["left"]["gripper"] == 1.0
     assert step["right"]["action"]["shape"] == [2]

@@ -14,16 +14,23 @@ from vlagents_ray_dialects.client_reader import shut_down
 
 logger = logging.getLogger(__name__)
 
-TICK_S = 0.5  # period at which a dialect checks its clients
+TICK_S = 0.5  # the period at which a dialect checks its clients
 # Maximum number of connections in a second; each takes a thread and about a millisecond.
 _ACCEPTED_PER_S = 50.0
-_END_S = 3.0
+_END_S = 3.0  # the time limit for the end of the thread
 
 
 class Acceptor:
-    """Accepts connections until it is closed; those above the rate wait in the listener's backlog.
+    """Accepts connections until it is closed; connections above the rate wait in the listener's
+    backlog.
 
     Connections that their clients have ended are closed, and do not count.
+
+    Args:
+        name: The name of the dialect.
+        listener: A bound socket, which the acceptor closes.
+        add: Serves a connection, or closes it; it must not block.
+        check_clients: Called on the acceptor's thread every `TICK_S`.
     """
 
     def __init__(
@@ -33,17 +40,12 @@ class Acceptor:
         add: Callable[[socket.socket], None],
         check_clients: Callable[[], None] = lambda: None,
     ) -> None:
-        """Begin to accept.
-
-        Args:
-            name: Name of the dialect.
-            listener: A bound socket, which the acceptor closes.
-            add: Serves a connection, or closes it; it must not block.
-            check_clients: Called on the same thread every `TICK_S`.
-        """
-        self._name, self._listener = name, listener
-        self._add, self._check_clients = add, check_clients
+        self._name = name
+        self._listener = listener
+        self._add = add
+        self._check_clients = check_clients
         self._closing = threading.Event()
+
         listener.listen(BACKLOG)
         listener.settimeout(TICK_S)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -60,7 +62,8 @@ class Acceptor:
         self._thread.join(_END_S)
 
     def _run(self) -> None:
-        accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
+        """Accept connections; runs on its own thread."""
+        rate = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
         checked_at = float("-inf")
         with self._listener:
             while not self._closing.is_set():
@@ -69,7 +72,7 @@ class Acceptor:
                     checked_at = now
                     self._check_clients()
 
-                wait_s = accepting.take(now)
+                wait_s = rate.take(now)
                 if wait_s > 0:
                     time.sleep(wait_s)
                     continue
@@ -77,10 +80,10 @@ class Acceptor:
                 try:
                     connection = accept_open(self._listener)
                 except TimeoutError:
-                    accepting.give_back()
+                    rate.give_back()
                     continue
                 except OSError as error:
-                    accepting.give_back()
+                    rate.give_back()
                     if not self._closing.is_set():
                         logger.warning("%s: cannot accept a client: %s", self._name, error)
                         # Other connections must end first if descriptors are exhausted.
@@ -88,6 +91,6 @@ class Acceptor:
                     continue
 
                 if connection is None:
-                    accepting.give_back()
+                    rate.give_back()
                 else:
                     self._add(connection)

@@ -1,5 +1,5 @@
-"""Reading from the connections of a gateway's clients: the bytes of incomplete messages count as
-in flight.
+"""Reads from the connections of a gateway's clients. The bytes of incomplete messages count as
+bytes in flight.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from vlagents_ray.errors import MessageTooLarge, Overloaded
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes
 
 _READ_BYTES = 256 * 1024  # maximum size of a read
-# Above this size a message is in a mapping, whose pages are taken when they are written, and are
-# returned when it is freed. The heaps of as many threads as there are clients would keep them.
+# Above this size a message is in an anonymous mapping, whose pages are allocated when they are
+# written, and returned when it is freed. The heaps of the clients' threads would keep them.
 _MAPPED_BYTES = 256 * 1024
+# Options of TCP: probes begin after 20 s of silence, and a connection ends after 35 s.
 _KEEP_ALIVE = (
     ("TCP_KEEPIDLE", 20),
     ("TCP_KEEPINTVL", 5),
@@ -26,12 +27,12 @@ _KEEP_ALIVE = (
 
 
 def share_of(connection: socket.socket) -> str:
-    """Return the name under which a client without a key has a share of the bytes in flight:
-    that of its address.
+    """Return the name under which a client without a key has a share of the bytes in flight: the
+    name of its address.
     """
     try:
         peer = connection.getpeername()
-    except OSError:  # the client is already gone
+    except OSError:  # the client has disconnected
         return "address unknown"
     return "this machine" if connection.family == socket.AF_UNIX else f"address {peer[0]}"
 
@@ -43,7 +44,7 @@ def shut_down(connection: socket.socket, how: int = socket.SHUT_RDWR) -> None:
 
 
 def set_keep_alive(connection: socket.socket) -> None:
-    """Let the kernel end a TCP connection whose client's machine no longer answers, after 35 s."""
+    """Let the kernel end a TCP connection if the client's machine does not answer for 35 s."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in _KEEP_ALIVE:
         if hasattr(socket, name):
@@ -51,65 +52,72 @@ def set_keep_alive(connection: socket.socket) -> None:
 
 
 class ClientReader:
-    """Reads from one connection; one thread at a time reads."""
+    """Reads from one connection, on one thread at a time.
+
+    Args:
+        connection: The connection.
+        admission: Counts the bytes in flight.
+        robot: Whether incomplete messages may use the bytes in flight that are reserved for robots.
+    """
 
     def __init__(self, connection: socket.socket, admission: Admission, *, robot: bool) -> None:
-        """Prepare to read.
-
-        Args:
-            robot: Whether incomplete messages may use the bytes in flight that are reserved for
-                robots.
-        """
         self._connection = connection
         # Guards the fields below, which `_give_up` changes on other threads.
         self._lock = threading.Lock()
         self._data = memoryview(b"")
-        self._received = 0  # number of bytes of `_data` that have been received
-        # Whether the rest of the message is discarded, as there is no memory for it.
+        self._received = 0  # the number of bytes of `_data` that have been received
+        # Whether the remaining bytes of the message are discarded, as there is no memory for them.
         self._is_given_up = False
         self._arriving = ArrivingBytes(admission, share_of(connection), robot, self._give_up)
 
     def set_sender(self, admission: Admission, key: str, *, robot: bool) -> None:
-        """Count later messages for another share of the bytes in flight, that of a key."""
+        """Count later messages for another share of the bytes in flight.
+
+        Args:
+            admission: Counts the bytes in flight.
+            key: The name of the share, such as the name of the client's API key.
+            robot: Whether messages may use the bytes that are reserved for robots.
+        """
         self._arriving = ArrivingBytes(admission, key, robot, self._give_up)
 
     def read(self, length: int, silent_s: float, deadline: float) -> memoryview | None:
-        """Read `length` bytes; memory is taken as they arrive, and counts as in flight until they
-        are complete.
+        """Read bytes. Memory is allocated as they arrive, and counts as in flight until they are
+        complete.
 
         Args:
-            silent_s: Maximum time between two parts, s.
-            deadline: Time of the last part at the latest, s, of `time.monotonic()`.
+            length: The number of bytes.
+            silent_s: Maximum time between two pieces, s.
+            deadline: The time until which the last piece must arrive, s, of `time.monotonic()`.
 
         Returns:
-            The bytes; None if the client disconnected before the first.
+            The bytes; None if the client disconnected before the first byte.
 
         Raises:
             Overloaded: There was no memory for the bytes, which were read and discarded.
             MessageTooLarge: The bytes took too long.
-            ConnectionResetError: The client disconnected among them.
+            ConnectionResetError: The client disconnected before the last byte.
         """
+        memory = mmap.mmap(-1, length) if length > _MAPPED_BYTES else bytearray(length)
         with self._lock:
-            self._data = memoryview(
-                mmap.mmap(-1, length) if length > _MAPPED_BYTES else bytearray(length)
-            )
-            self._received, self._is_given_up = 0, False
+            self._data = memoryview(memory)
+            self._received = 0
+            self._is_given_up = False
 
-        left = length
+        missing = length
         try:
-            while left:
+            while missing:
                 wait_s = min(silent_s, deadline - time.monotonic())
                 if wait_s <= 0:
                     raise MessageTooLarge("a message took longer than a client may take")
 
                 self._connection.settimeout(wait_s)
-                received = self._connection.recv(min(left, _READ_BYTES))
+                received = self._connection.recv(min(missing, _READ_BYTES))
                 if not received:
-                    if left < length:
+                    if missing < length:
                         raise ConnectionResetError("the client disconnected within a message")
                     return None
 
-                left -= len(received)
+                missing -= len(received)
                 self._keep(received)
         finally:
             self._arriving.release()
@@ -124,6 +132,7 @@ class ClientReader:
         return data
 
     def _keep(self, received: bytes) -> None:
+        """Store received bytes, or discard the message if there is no memory."""
         with self._lock:
             if self._is_given_up:
                 return
@@ -137,12 +146,13 @@ class ClientReader:
                 self._received = end
 
     def _give_up(self) -> None:
-        """Free the memory of an incomplete message, as a complete one needs it; called on any
+        """Free the memory of the incomplete message, as a complete one needs it; called on any
         thread.
         """
         with self._lock:
             self._discard()
 
     def _discard(self) -> None:
+        """Free the memory of the message; the caller holds the lock."""
         self._data = memoryview(b"")
         self._is_given_up = True

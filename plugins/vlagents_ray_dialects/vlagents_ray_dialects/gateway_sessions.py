@@ -25,23 +25,29 @@ from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEp
 
 logger = logging.getLogger(__name__)
 
-_QUIET_S = 30.0  # time without a request after which a client without a session is removed
+_QUIET_S = 30.0  # the time without a request after which a client without a session is removed
 
 
 class GatewaySessions:
-    """The sessions of one client, all over one connection; not thread-safe."""
+    """The sessions of one client, all over one connection; not thread-safe.
+
+    `show` must be called before any other method, with the client.
+
+    Args:
+        connect: Opens a connection to the policy.
+        contract: The contract of the policy.
+    """
 
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
-        """Prepare the sessions; `show` must be called first, with the client. `contract` is the
-        policy's.
-        """
-        self._connect, self._contract = connect, contract
+        self._connect = connect
+        self._contract = contract
         self._caller: Identity | None = None
         self._key: str | None = None
         self._priority: PriorityName | None = None
-        # Number of requests of the current message that were counted before it was read.
+
+        # The number of requests of the current message that were counted before it was read.
         self._counted = 0
-        self._counted_sessions = 0  # number of sessions that are counted for the key
+        self._counted_sessions = 0  # the number of sessions that are counted for the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
 
@@ -56,7 +62,16 @@ class GatewaySessions:
         return bool(self._agents)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the next episode of the client's only session; return the reply's info."""
+        """Begin the next episode of the client's only session.
+
+        Args:
+            obs: The observation.
+            instruction: The task in words.
+            kwargs: Further options of the reset.
+
+        Returns:
+            The info of the reply.
+        """
         agent = self._sessions(1)[0]
         self._admit(1)
         self.restart()
@@ -71,31 +86,46 @@ class GatewaySessions:
         return self.act_batch([obs], [instruction])[0]
 
     def act_on(self, obs: Obs) -> Act:
-        """Return the next action of the client's only session, without a reset; raise `NotReset`
-        before the first.
+        """Return the next action of the client's only session, without a reset.
+
+        Raises:
+            NotReset: The session was not reset before.
         """
         agent = self._sessions(1)[0]
         self._admit(1)
         return agent.act(obs)
 
     def act_batch(self, obs: Sequence[Obs], instructions: Sequence[str | None]) -> list[Act]:
-        """Return the next action of each session, one per observation; raise the first error
-        among them.
+        """Return the next action of each session, and reset sessions with a new instruction first.
+
+        Args:
+            obs: The observation of each session.
+            instructions: The task of each session in words.
+
+        Returns:
+            The action of each session.
+
+        Raises:
+            VLAgentsError: The first error of a session.
         """
         agents = self._sessions(len(obs))
         self._admit(len(obs))
 
         texts = [episode.instruction for episode in self._episodes]
-        fresh = [i for i, text in enumerate(instructions) if self._episodes[i].begins(text)]
-        for i in fresh:
-            texts[i] = self._episodes[i].opening(instructions[i], self._contract)
+        beginning = []  # the indices of the sessions whose episode begins
+        for i, instruction in enumerate(instructions):
+            if self._episodes[i].begins(instruction):
+                beginning.append(i)
+                texts[i] = self._episodes[i].opening(instruction, self._contract)
 
-        self.restart()  # undone below, once all sessions have replied
-        if fresh:
+        self.restart()  # undone below, when all sessions have replied
+        if beginning:
             if isinstance(self._caller, Caller):
-                self._caller.note("reset sessions by a gateway:", str(len(fresh)))
+                self._caller.note("reset sessions by a gateway:", str(len(beginning)))
             infos = agents[0].reset_batch(
-                [obs[i] for i in fresh], [texts[i] for i in fresh], [agents[i] for i in fresh]
+                [obs[i] for i in beginning],
+                [texts[i] for i in beginning],
+                [agents[i] for i in beginning],
             )
             raise_first(infos)
 
@@ -106,11 +136,18 @@ class GatewaySessions:
         return [act for act in acts if isinstance(act, Act)]
 
     def show(self, caller: Identity, key: str | None) -> None:
-        """Set the client and its API key; end the sessions of another client or class."""
+        """Set the client; end the sessions of another client, or of another priority.
+
+        Args:
+            caller: The client.
+            key: Its API key, or None.
+        """
         priority = caller.priority if isinstance(caller, Caller) else None
         if caller != self._caller or priority != self._priority:
             self.close()
-            self._caller, self._key, self._priority = caller, key, priority
+            self._caller = caller
+            self._key = key
+            self._priority = priority
             if isinstance(caller, Caller):
                 caller.note("let in by", "a gateway")
 
@@ -121,15 +158,13 @@ class GatewaySessions:
         return self._caller.refusal() if isinstance(self._caller, Caller) else None
 
     def begin(self) -> None:
-        """Count a message for the key before it is read, which includes the first of its
-        requests.
-        """
+        """Count a message for the key before it is read; this counts the first of its requests."""
         self._counted = 0
         self._admit(1)
         self._counted = 1
 
     def throttled_s(self) -> float:
-        """Return the time for which not to read from the client, s; 0 unless its key is over its
+        """Return the time for which the client must not be read, s; 0 unless its key is over its
         rate.
         """
         return self._caller.throttled_s() if isinstance(self._caller, Caller) else 0.0
@@ -147,9 +182,10 @@ class GatewaySessions:
             agent.close()
 
     def _sessions(self, number: int) -> list[RemoteAgent]:
+        """Return this number of sessions; begin missing ones, and end surplus ones."""
         if self._caller is None:
             raise TypeError("a session without a client: call show() first")
-        # Counts sessions before they exist, and until they have ended.
+        # Sessions are counted before they exist, and until they have ended.
         self._hold(max(number, self._counted_sessions))
         if not self._agents:
             self._agents = [self._connect(self._key, self._priority)]
@@ -161,14 +197,13 @@ class GatewaySessions:
         missing = number - len(self._agents)
         if missing:
             self._agents += self._agents[0].sessions(missing)
-        self._episodes = [
-            *self._episodes[:number],
-            *(ImplicitEpisode() for _ in range(number - len(self._episodes))),
-        ]
+        del self._episodes[number:]
+        while len(self._episodes) < number:
+            self._episodes.append(ImplicitEpisode())
         return self._agents
 
     def _hold(self, number: int) -> None:
-        """Set the number of sessions that count for the key; raise `TooManyRequests` over its
+        """Set the number of sessions that count for the key; raise `TooManyRequests` beyond its
         limit.
         """
         if isinstance(self._caller, Caller) and number != self._counted_sessions:
@@ -176,8 +211,8 @@ class GatewaySessions:
         self._counted_sessions = number
 
     def _admit(self, number: int) -> None:
-        """Count requests for the key; raise `TooManyRequests` over its rate, before any of them
-        is sent.
+        """Count requests for the key before any of them is sent; raise `TooManyRequests` beyond
+        its rate.
         """
         counted, self._counted = self._counted, 0
         if isinstance(self._caller, Caller):
@@ -186,23 +221,31 @@ class GatewaySessions:
 
 
 def internal_error(dialect: str) -> str:
-    """Log the current exception under a new id, and return the text about it for the client."""
-    name = uuid.uuid4().hex
-    logger.exception("%s: request %s failed", dialect, name)
-    return f"internal error; the server's log has the details under {name}"
+    """Log the current exception under a new id, and return the text for the client.
+
+    Args:
+        dialect: The name of the dialect.
+    """
+    error_id = uuid.uuid4().hex
+    logger.exception("%s: request %s failed", dialect, error_id)
+    return f"internal error; the server's log has the details under {error_id}"
 
 
 # Clients of a dialect whose protocol has no message for their end.
 
 
 class GatewayClient(abc.ABC):
-    """One client, with its sessions."""
+    """One client, with its sessions.
+
+    Args:
+        context: The context of the gateway.
+    """
 
     def __init__(self, context: GatewayContext) -> None:
         self.sessions = GatewaySessions(context.connect, context.contract)
         self._context = context
-        self._unanswered = 0  # number of requests without a reply
-        self._used = time.monotonic()  # time of the last reply, s
+        self._unanswered = 0  # the number of requests without a reply
+        self._used = time.monotonic()  # the time of the last reply, s
 
     def quiet_s(self, now: float) -> float:
         """Return the time since the client's last request, s; 0 while a request is unanswered."""
@@ -213,29 +256,39 @@ class GatewayClient(abc.ABC):
         """End the client's sessions after the current request."""
 
 
-K = TypeVar("K", bound=Hashable)
-C = TypeVar("C", bound=GatewayClient)
+Key = TypeVar("Key", bound=Hashable)
+Client = TypeVar("Client", bound=GatewayClient)
 
 
-class GatewayClients(Generic[K, C]):
-    """The clients by their identity in the protocol, at most `sessions` of the context.
+class GatewayClients(Generic[Key, Client]):
+    """The clients by their identity in the protocol, at most as many as the context has sessions.
     Thread-safe.
+
+    Args:
+        context: The context of the gateway.
     """
 
     def __init__(self, context: GatewayContext) -> None:
         self._context = context
-        self._clients: dict[K, C] = {}
+        self._clients: dict[Key, Client] = {}
         self._lock = threading.Lock()
 
-    def get(self, key: K) -> C | None:
+    def get(self, key: Key) -> Client | None:
         """Return a client; None if it is unknown or was removed."""
         return self._clients.get(key)
 
-    def add(self, key: K, make: Callable[[], C]) -> C:
+    def add(self, key: Key, make: Callable[[], Client]) -> Client:
         """Add a client, in place of one with the same key.
 
-        If there are too many clients, the one without a session that has been idle for the longest
-        is removed.
+        If there are too many clients, the client without a session that has been idle for the
+        longest time is removed.
+
+        Args:
+            key: The identity of the client.
+            make: Makes the client.
+
+        Returns:
+            The new client.
 
         Raises:
             PolicyUnavailable: There are too many clients, and each has a session or an unanswered
@@ -244,47 +297,50 @@ class GatewayClients(Generic[K, C]):
         removed = []
         try:
             with self._lock:
-                earlier = self._clients.pop(key, None)
-                if earlier is not None:
-                    removed.append(earlier)
+                replaced = self._clients.pop(key, None)
+                if replaced is not None:
+                    removed.append(replaced)
                 if len(self._clients) >= self._context.sessions:
                     removed.append(self._clients.pop(self._idlest()))
-                client = self._clients[key] = make()
+                client = make()
+                self._clients[key] = client
                 return client
         finally:
             _end(removed)
 
-    def remove(self, key: K) -> None:
-        """Remove a client that has ended, if it is known."""
+    def remove(self, key: Key) -> None:
+        """Remove a client that has ended, unless it was removed already."""
         with self._lock:
             self._clients.pop(key, None)
 
     def forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid."""
         with self._lock:
-            removed = [key for key, client in self._clients.items() if self.is_gone(client)]
-            ended = [self._clients.pop(key) for key in removed]
-        _end(ended)
+            gone_keys = [key for key, client in self._clients.items() if self.is_gone(client)]
+            gone = [self._clients.pop(key) for key in gone_keys]
+        _end(gone)
 
-    def end_all(self) -> list[C]:
+    def end_all(self) -> list[Client]:
         """End the sessions of all clients, and return the clients."""
         with self._lock:
             clients = list(self._clients.values())
         return _end(clients)
 
-    def is_gone(self, client: C) -> bool:
+    def is_gone(self, client: Client) -> bool:
         """Return whether a client is idle, or its key is no longer valid."""
-        now = time.monotonic()
-        patience_s = (
-            self._context.idle_s if client.sessions.begun else min(_QUIET_S, self._context.idle_s)
-        )
-        return client.quiet_s(now) > patience_s or client.sessions.refusal() is not None
+        limit_s = self._context.idle_s
+        if not client.sessions.begun:
+            limit_s = min(_QUIET_S, limit_s)
+        is_idle = client.quiet_s(time.monotonic()) > limit_s
+        return is_idle or client.sessions.refusal() is not None
 
-    def _idlest(self) -> K:
-        """Return the key of the client without a session that has been idle for the longest."""
+    def _idlest(self) -> Key:
+        """Return the key of the client without a session that has been idle for the longest time;
+        raise `PolicyUnavailable` if there is none.
+        """
         now = time.monotonic()
         longest_s = 0.0
-        idlest: K | None = None
+        idlest: Key | None = None
         for key, client in self._clients.items():
             quiet_s = client.quiet_s(now)
             if not client.sessions.begun and quiet_s > longest_s:
@@ -297,7 +353,8 @@ class GatewayClients(Generic[K, C]):
         return idlest
 
 
-def _end(clients: list[C]) -> list[C]:
+def _end(clients: list[Client]) -> list[Client]:
+    """End the sessions of clients, and return the clients."""
     for client in clients:
         client.end()
     return clients

@@ -41,21 +41,21 @@ from vlagents_ray_dialects.messages.gr00t import PRESETS, GR00TRequest, Observat
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-# The parts of a message before its payload. A REQ socket adds an empty part, and a DEALER socket
-# adds the parts of its program.
+# The frames of a message before its payload. A REQ socket adds an empty frame, and a DEALER socket
+# adds the frames of its program.
 Envelope = tuple[bytes, ...]
 _ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # the envelopes of directly connected clients
 # An envelope up to these sizes is answered with an error; a larger one ends the connection.
 _MOST_PARTS, _MOST_PART_BYTES = 4, 256
-_HANDSHAKE_S = 5.0
+_HANDSHAKE_S = 5.0  # maximum time of the handshake
 _MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
 _SEND_S = 10.0  # maximum time for a client to accept an answer
 _END_S = 3.0  # maximum time for the answers to requests when the dialect ends
-_LINGER_S = 1.0  # and for refusing those that have arrived by then
+_LINGER_S = 1.0  # maximum time for rejecting the requests that have arrived by then
 _STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
-_STRANGER_S = 30.0  # time within which a connection must send a valid key
-_REFUSALS = 64  # messages without a valid key after which a connection is closed
-# Time for which a connection is not read after such a message, as reading a key takes time.
+_STRANGER_S = 30.0  # the time within which a connection must send a valid key
+_REFUSALS = 64  # the number of messages without a valid key after which a connection is closed
+# The time for which a connection is not read after such a message, as reading a key takes time.
 _REFUSAL_S = 0.1
 
 
@@ -64,31 +64,38 @@ class GR00TConnection(GatewayClient):
     in order.
 
     It is a stranger until one of its messages has a valid key, or needs none; then it is one of the
-    dialect's clients. An idle client is a stranger again and has no session, but its connection
-    stays open: a client whose request crosses the end of its connection would wait for an answer
-    for ever.
+    dialect's clients. An idle client becomes a stranger again and has no session, but its
+    connection stays open: a client that sends a request while its connection is being closed would
+    wait for an answer forever.
+
+    Args:
+        dialect: The dialect.
+        connection: The connection.
     """
 
     def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
         super().__init__(dialect.context)
-        self._dialect, self._connection = dialect, connection
-        # `_flat` is whether the client's last keys were N1.5's.
+        self._dialect = dialect
+        self._connection = connection
+        # `_flat` is whether the last keys of the client had the form of N1.5.
         self._mapping, self._flat = nested_mapping(dialect.mapping)
+
         self._is_robot = dialect.config.priority == "robot"
-        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._share = share_of(connection)  # the name of its share of the bytes in flight
         self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
         self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
-        # Time at which a stranger is disconnected, s.
+        # The time at which a stranger is disconnected, s.
         self._valid_until = time.monotonic() + _STRANGER_S
-        self._refused = 0  # number of messages without a valid key
+        self._refused = 0  # the number of messages without a valid key
+
         self._sending = threading.Lock()  # guards sending, and the next field
         self._waiting: Envelope | None = None  # the envelope of the request without an answer
         self._answered = threading.Condition()
-        self.is_client = False  # whether it counts among the dialect's clients
+        self.is_client = False  # whether it is one of the dialect's clients
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
 
     def end(self) -> None:
-        """Give the client's place to another one; it is a stranger until its next message."""
+        """Make the client a stranger until its next message, so that there is room for another."""
         self.is_client = False
         self._valid_until = float("inf")
         self._dialect.add_stranger(self)
@@ -103,28 +110,35 @@ class GR00TConnection(GatewayClient):
         shut_down(self._connection)
 
     def wait_answered(self, until: float) -> None:
-        """Wait until no request is unanswered, or until a time of `time.monotonic()`, s."""
+        """Wait until no request is unanswered.
+
+        Args:
+            until: The time at which this method gives up, s, of `time.monotonic()`.
+        """
+        timeout_s = max(0.0, until - time.monotonic())
         with self._answered:
-            self._answered.wait_for(
-                lambda: not self._unanswered, max(0.0, until - time.monotonic())
-            )
+            self._answered.wait_for(lambda: not self._unanswered, timeout_s)
 
     def refuse_waiting(self, error: VLAgentsError) -> None:
-        """Answer a request that is still unanswered with an error, and end the connection; on any
-        thread.
+        """Answer a request that is still unanswered with an error, and end the connection; called
+        on any thread.
 
-        The connection's thread waits for the policy and would not read the client's next request:
-        after the end, ZeroMQ keeps that request for the server's successor.
+        The connection's thread waits for the policy and would not read the client's next request.
+        If the connection has ended, ZeroMQ keeps that request for the server's successor.
         """
         if self._unanswered and self._send(_error(error)):
             self.cut_off("the server is stopping")
 
     def _run(self) -> None:
+        """Process the client's requests until the connection ends; runs on its own thread."""
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             set_keep_alive(self._connection)
             self._greet()
-            while (head := self._receive_head()) is not None:
+            while True:
+                head = self._receive_head()
+                if head is None:
+                    break
                 self._process(*head)
         except (VLAgentsError, OSError) as error:
             logger.info("gr00t: disconnected a client: %s", error)
@@ -140,13 +154,16 @@ class GR00TConnection(GatewayClient):
     # ZeroMQ's protocol.
 
     def _greet(self) -> None:
+        """Exchange the greeting and the command READY with the client."""
         deadline = time.monotonic() + _HANDSHAKE_S
         self._connection.settimeout(_HANDSHAKE_S)
         self._connection.sendall(zmtp.GREETING)
+
         greeting = bytearray()
         for size in (1, 10, zmtp.GREETING_BYTES - 11):  # old peers send less, and then wait
             greeting += self._read(size, _HANDSHAKE_S, deadline)
             zmtp.check_greeting(greeting)
+
         self._connection.sendall(zmtp.write_ready())
         flags = zmtp.read_flags(self._read(1, _HANDSHAKE_S, deadline)[0])
         name, properties = self._read_command(flags, deadline)
@@ -155,12 +172,14 @@ class GR00TConnection(GatewayClient):
         zmtp.check_ready(properties)
 
     def _read(self, length: int, silent_s: float, deadline: float) -> memoryview:
+        """Read bytes; raise `ConnectionResetError` if the client has disconnected."""
         data = self._reader.read(length, silent_s, deadline)
         if data is None:
             raise ConnectionResetError("the client disconnected")
         return data
 
     def _read_command(self, flags: zmtp.FrameFlags, deadline: float) -> tuple[bytes, bytes]:
+        """Read a command whose flags have arrived; return its name and its content."""
         size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
         if not flags.is_command or size > zmtp.COMMAND_BYTES:
             raise MalformedMessage(
@@ -209,11 +228,12 @@ class GR00TConnection(GatewayClient):
                     f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and "
                     f"{_MOST_PART_BYTES} bytes"
                 )
+
             envelope.append(bytes(self._read(size, _MESSAGE_S, deadline)))
 
     def _check_idle(self) -> None:
-        """End the sessions of an idle client or one whose key is no longer valid; raise if a
-        stranger stays one.
+        """End the sessions of a client that is idle or whose key is no longer valid; raise an error
+        if a stranger has sent no valid key in time.
         """
         if not self.is_client:
             self.sessions.close()
@@ -230,6 +250,7 @@ class GR00TConnection(GatewayClient):
                 self._valid_until = time.monotonic() + _STRANGER_S
 
     def _process_command(self, name: bytes, content: bytes) -> None:
+        """Answer a PING; ignore other commands, at a bounded rate."""
         if self._commands.take(time.monotonic()) > 0:
             raise MalformedMessage(f"zmtp: more than {CONTROL_FRAMES} commands at once")
         if name == b"PING":
@@ -243,6 +264,7 @@ class GR00TConnection(GatewayClient):
             self._waiting = envelope
         with self._answered:
             self._unanswered = 1
+
         try:
             try:
                 payload = self._read(size, _MESSAGE_S, deadline)
@@ -250,7 +272,7 @@ class GR00TConnection(GatewayClient):
                 answer = _error(error)
             else:
                 answer = self._answer(envelope, payload)
-        finally:  # before the client has the answer, since another may then have its place
+        finally:  # before the answer is sent, as the client may be replaced afterwards
             with self._answered:
                 self._unanswered = 0
                 self._used = time.monotonic()
@@ -271,6 +293,7 @@ class GR00TConnection(GatewayClient):
     # The messages.
 
     def _answer(self, envelope: Envelope, payload: memoryview) -> bytes:
+        """Return the answer to a message, which may be an error."""
         try:
             if self._dialect.is_stopping:
                 raise _stopping()
@@ -280,6 +303,7 @@ class GR00TConnection(GatewayClient):
                     f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; "
                     "connect each client directly, without a ZeroMQ proxy"
                 )
+
             self._identify(payload)
             admission = self._context.admission
             admission.hold(len(payload), self._is_robot, 0, self._share)
@@ -295,8 +319,8 @@ class GR00TConnection(GatewayClient):
             return gr00t.pack({"error": internal_error("gr00t")})
 
     def _identify(self, payload: memoryview) -> None:
-        """Set the sessions' caller by the key of a message; raise an error unless it is valid,
-        or none is needed.
+        """Set the caller of the sessions from the key of a message; raise an error if a key is
+        needed and the message has no valid one.
         """
         check = self._context.check
         if isinstance(check, NoKey):
@@ -311,9 +335,9 @@ class GR00TConnection(GatewayClient):
             self.sessions.show(caller, key)
             if isinstance(caller, Caller):
                 self._share = caller.name
-                self._is_robot = (
-                    self._dialect.config.priority == "robot" and caller.priority != "simulation"
-                )
+                is_robot_port = self._dialect.config.priority == "robot"
+                self._is_robot = is_robot_port and caller.priority != "simulation"
+
         if not self.is_client:
             self._dialect.admit(self)
         self._reader.set_sender(self._context.admission, self._share, robot=self._is_robot)
@@ -327,6 +351,7 @@ class GR00TConnection(GatewayClient):
             time.sleep(_REFUSAL_S)
 
     def _value(self, request: GR00TRequest) -> Any:
+        """Return the value of the reply to a request."""
         if request.endpoint == "ping":
             return {"status": "ok", "message": "Server is running"}
         if request.endpoint == "get_modality_config":
@@ -336,29 +361,29 @@ class GR00TConnection(GatewayClient):
             return {}
         return self._act(gr00t.read_observations(request.data))
 
-    def _act(self, asked: Observations) -> Any:
+    def _act(self, batch: Observations) -> Any:
+        """Return the reply to a request `get_action`."""
         mapping, contract = self._mapping, self._context.contract
-        self._flat = asked.flat
+        self._flat = batch.flat
 
         observations = []
         instructions = []
-        for observation in asked.each:
-            obs, instruction = mapping.obs(
-                gr00t.newest(observation), self._context.limits, contract
-            )
+        for theirs in batch.each:
+            obs, instruction = mapping.obs(gr00t.newest(theirs), self._context.limits, contract)
             observations.append(obs)
             instructions.append(instruction)
 
         if not self.sessions.begun:
-            mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
+            mapping.warn_of_unread_cameras(gr00t.newest(batch.each[0]), "gr00t")
         acts = self.sessions.act_batch(observations, instructions)
 
         spec = None if contract is None else contract.action
         info = {"done": [act.done for act in acts], "timing": acts[0].info.get("timing", {})}
         actions = [mapping.actions(act.action, spec) for act in acts]
-        return gr00t.write_actions(actions, asked, info)
+        return gr00t.write_actions(actions, batch, info)
 
     def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
+        """Return the keys and the time steps of each modality, with the client's names."""
         mapping, contract = self._mapping, self._context.contract
         contract = contract or Contract()
 
@@ -369,40 +394,53 @@ class GR00TConnection(GatewayClient):
 
         chunk = contract.chunk or 1
         return {
-            "video": (_theirs(cameras, contract.cameras or {}), [0]),
-            "state": (_theirs(state, contract.state or {}), [0]),
+            "video": (_client_names(cameras, contract.cameras or {}), [0]),
+            "state": (_client_names(state, contract.state or {}), [0]),
             "action": (list(mapping.action) or ["action"], list(range(chunk))),
             "language": ([gr00t.TEXT_KEY], [0]),
         }
 
 
 def _error(error: VLAgentsError) -> bytes:
+    """Return the answer with an error."""
     return gr00t.pack({"error": f"{error.code}: {error}"})
 
 
 def _stopping() -> PolicyUnavailable:
+    """Return the error of a request that arrives while the server stops."""
     return PolicyUnavailable("the server is stopping; send the request again to its successor")
 
 
-def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
-    """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the
-    policy's names.
+def _client_names(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
+    """Return the client's names of the policy's cameras or states.
+
+    Args:
+        entries: The names and keys in the mapping; `*` in a key keeps the policy's names.
+        needed: The names of the policy.
     """
     client_names: dict[str, None] = {}  # an ordered set
-    for ours, key in entries:
-        if "*" in key:
-            client_names |= dict.fromkeys(name for name in needed if matches(name, ours))
-        else:
+    for pattern, key in entries:
+        if "*" not in key:
             client_names[key.rpartition("/")[2]] = None
+            continue
+        for name in needed:
+            if matches(name, pattern):
+                client_names[name] = None
     return list(client_names)
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
-    """Return a mapping with the keys of `gr00t.newest`, and whether it had N1.5's flat keys,
-    such as `video.front`.
+    """Convert a mapping to the keys of `gr00t.newest`.
+
+    Args:
+        mapping: The mapping, whose keys may be flat as in N1.5, such as `video.front`.
+
+    Returns:
+        The mapping with nested keys, and whether its keys were flat.
     """
 
     def folders(key: str) -> str:
+        """Return the nested form of a key."""
         return "|".join(_FOLDER.sub(r"\1/", alternative) for alternative in key.split("|"))
 
     cameras = {}
@@ -411,9 +449,8 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
 
     state = {}
     for name, state_keys in mapping.state.items():
-        state[name] = tuple(
-            replace(state_key, key=folders(state_key.key)) for state_key in state_keys
-        )
+        nested_keys = [replace(state_key, key=folders(state_key.key)) for state_key in state_keys]
+        state[name] = tuple(nested_keys)
 
     action = {name.removeprefix("action."): columns for name, columns in mapping.action.items()}
     nested = replace(
@@ -428,7 +465,7 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
 
 
 class GR00TDialectConfig(PortConfig):
-    """The settings of GR00T's ZeroMQ protocol, that of its `PolicyServer`."""
+    """The settings of GR00T's protocol over ZeroMQ, which its `PolicyServer` also serves."""
 
     mapping: MappingSetting = "gr00t"
     port: int = Field(default=5555, ge=1, le=65535)
@@ -454,15 +491,15 @@ class GR00TDialect(PortDialect):
         self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
         self._lock = threading.Lock()  # guards the next two fields
         self._connections: set[GR00TConnection] = set()
-        # The connections that are no clients, the oldest first.
+        # The connections that are not clients, the oldest first.
         self._strangers: dict[GR00TConnection, None] = {}
-        self._stopping = threading.Event()  # whether new requests are refused
+        self._stopping = threading.Event()  # whether new requests are rejected
         self._key_reader = ThreadPoolExecutor(1, "gr00t-keys")
         self._acceptor: Acceptor | None = None
 
     @property
     def is_stopping(self) -> bool:
-        """Whether requests are refused, since the server is stopping."""
+        """Whether requests are rejected, since the server is stopping."""
         return self._stopping.is_set()
 
     def serve(self, listener: socket.socket) -> None:
@@ -475,8 +512,7 @@ class GR00TDialect(PortDialect):
     def close(self) -> None:
         """Answer the requests that have arrived, reject later ones, and end all connections.
 
-        Each request needs an answer: a client of this protocol waits for ever for an answer that
-        does not come.
+        Each request needs an answer, as a client of this protocol has no timeout.
         """
         self._stopping.set()
 
@@ -507,14 +543,20 @@ class GR00TDialect(PortDialect):
 
         The keys of strangers are read on one thread, since each thread's heap would keep the memory
         of the largest message.
+
+        Args:
+            payload: The message.
+            of_client: Whether the message is from one of the dialect's clients.
         """
         if of_client:
             return gr00t.read_token(payload, self.context.limits)
         return self._key_reader.submit(gr00t.read_token, payload, self.context.limits).result()
 
     def admit(self, connection: GR00TConnection) -> None:
-        """Count a connection with a valid key among the clients; raise `PolicyUnavailable` if
-        there are too many.
+        """Make a connection with a valid key a client.
+
+        Raises:
+            PolicyUnavailable: There are too many clients.
         """
         self._clients.add(id(connection), lambda: connection)
         connection.is_client = True
@@ -526,7 +568,7 @@ class GR00TDialect(PortDialect):
         return self._clients.is_gone(client)
 
     def remove_client(self, client: GR00TConnection) -> None:
-        """Give the place of a client to another one."""
+        """Remove a client, so that another one can be added."""
         self._clients.remove(id(client))
 
     def remove(self, connection: GR00TConnection) -> None:
@@ -537,9 +579,7 @@ class GR00TDialect(PortDialect):
             self._connections.discard(connection)
 
     def add_stranger(self, connection: GR00TConnection) -> None:
-        """Count an open connection among those without a valid key; if there are too many, end
-        the oldest.
-        """
+        """Add an open connection without a valid key; if there are too many, end the oldest."""
         with self._lock:
             if connection not in self._connections:
                 return
@@ -551,6 +591,7 @@ class GR00TDialect(PortDialect):
             oldest.cut_off(f"{_STRANGERS} connections are without a valid key")
 
     def _add(self, connection: socket.socket) -> None:
+        """Serve a new connection."""
         client = GR00TConnection(self, connection)
         with self._lock:
             self._connections.add(client)

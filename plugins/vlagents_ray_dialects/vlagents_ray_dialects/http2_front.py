@@ -2,9 +2,9 @@
 the frames.
 
 gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers
-that connect and send pings take both cores of a small machine. The front accepts at a bounded rate,
-forwards no connection before its HTTP/2 preface, and reads no further from one that sends more
-small frames than a robot needs.
+that connect and send pings use both cores of a small machine. The front accepts at a bounded rate,
+forwards a connection only after its HTTP/2 preface, and stops reading from a connection that sends
+more small frames than a robot needs.
 """
 
 from __future__ import annotations
@@ -27,40 +27,42 @@ from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
 
 logger = logging.getLogger(__name__)
 
-# The name of a socket has at most 107 bytes. Only this user can read the folder that is made in it.
+# The path of a socket has at most 107 bytes. Only this user can read the folder that is made here.
 _SHORT_FOLDER = "/tmp"  # noqa: S108
-_HANDSHAKE_S = 5.0
-_SEND_S = 10.0  # maximum time for a client to accept a part of an answer
-_END_S = 3.0
+_HANDSHAKE_S = 5.0  # maximum time until the preface of a client
+_SEND_S = 10.0  # maximum time for a client to accept a piece of an answer
+_END_S = 3.0  # maximum time for the last answers when the front is closed
 _READ_BYTES = 64 * 1024
 # A robot sends about four small frames with each request, and at most 7 at once. At 30 Hz, with two
 # requests for each observation, it sends 270 in a second.
 _FRAMES_PER_S = 300.0
 _FRAMES_AT_ONCE = 150
-# Time for which a connection with more frames stays open, unread, s. If it ended at once, its
-# client would connect again, which costs the server more than the frames.
+# A connection with more frames stays open for this time, unread, s. If it ended at once, its client
+# would connect again, which costs the server more than the frames.
 _UNREAD_S = 1.0
-_STRANGERS = 64  # maximum number of connections that are no clients; a further one ends the oldest
+# Maximum number of connections that are not clients; a further one ends the oldest.
+_STRANGERS = 64
 
 
 class Http2Front:
-    """Forwards connections to a gRPC server on a Unix socket that only this user can reach."""
+    """Forwards connections to a gRPC server on a Unix socket that only this user can reach.
+
+    gRPC's server must listen at `address`.
+
+    Args:
+        name: The name of the dialect.
+        is_client: Returns whether a peer is a client, by gRPC's name of it,
+            `ServicerContext.peer()`.
+    """
 
     def __init__(self, name: str, is_client: Callable[[str], bool]) -> None:
-        """Prepare to forward; gRPC's server must listen at `address`.
-
-        Args:
-            name: Name of the dialect.
-            is_client: Returns whether gRPC's name of a peer, `ServicerContext.peer()`, is that of a
-                client.
-        """
         self.name = name
         self._is_client = is_client
         self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=_SHORT_FOLDER)
         self.path = str(Path(self._folder.name, "grpc"))
         self._lock = threading.Lock()  # guards the next two fields
         self._connections: dict[ForwardedConnection, None] = {}  # the oldest first
-        self._shares: dict[str, str] = {}  # by gRPC's name of the peer
+        self._shares: dict[str, str] = {}  # names of shares by gRPC's name of the peer
 
     @property
     def address(self) -> str:
@@ -68,15 +70,15 @@ class Http2Front:
         return f"unix:{self.path}"
 
     def add(self, client: socket.socket) -> None:
-        """Forward a connection on its own threads; end the oldest that is no client if there are
-        too many.
+        """Forward a connection on its own threads. If there are too many connections that are not
+        clients, end the oldest of them.
         """
         connection = ForwardedConnection(self, client)
         with self._lock:
             strangers = []
-            for other in self._connections:
-                if other.is_open and not self._is_client(other.peer):
-                    strangers.append(other)
+            for earlier in self._connections:
+                if earlier.is_open and not self._is_client(earlier.peer):
+                    strangers.append(earlier)
             self._connections[connection] = None
 
         if len(strangers) >= _STRANGERS:
@@ -84,14 +86,14 @@ class Http2Front:
         connection.thread.start()
 
     def share_of(self, peer: str) -> str:
-        """Return the name under which a peer has a share of the bytes in flight: that of its
+        """Return the name under which a peer has a share of the bytes in flight: the name of its
         address.
         """
         with self._lock:
             return self._shares.get(peer, "address unknown")
 
     def set_share(self, peer: str, share: str) -> None:
-        """Set the name of a peer's share, before gRPC's server knows the peer."""
+        """Set the name of a peer's share, before the peer is connected to gRPC's server."""
         with self._lock:
             self._shares[peer] = share
 
@@ -112,7 +114,7 @@ class Http2Front:
         deadline = time.monotonic() + _END_S
         clients = [connection for connection in connections if self._is_client(connection.peer)]
         for connection in connections:
-            if connection not in clients:  # A stranger must not delay the stop.
+            if connection not in clients:  # a stranger must not delay the stop
                 connection.end()
         for connection in clients:
             connection.wait_answered(deadline)
@@ -123,12 +125,18 @@ class Http2Front:
 
 
 class ForwardedConnection:
-    """One connection of a client, and the one to gRPC's server that belongs to it."""
+    """One connection of a client, and its connection to gRPC's server.
+
+    Args:
+        front: The front.
+        client: The connection of the client.
+    """
 
     def __init__(self, front: Http2Front, client: socket.socket) -> None:
-        self._front, self._client = front, client
+        self._front = front
+        self._client = client
         self._server = socket.socket(socket.AF_UNIX)
-        # The kernel chooses a unique name, by which gRPC's server tells its peers apart.
+        # The kernel chooses a unique name, by which gRPC's server identifies its peers.
         self._server.bind("")
         self.peer = f"unix-abstract:{self._server.getsockname()[1:].decode()}"
         self._frames = FrameCounter()
@@ -154,12 +162,13 @@ class ForwardedConnection:
         """Wait until the client has the answers of a gRPC server that has stopped.
 
         Args:
-            deadline: Time until which to wait, s, of `time.monotonic()`.
+            deadline: The time until which this method waits, s, of `time.monotonic()`.
         """
         if self._answers.is_alive():
             self._answers.join(max(0.0, deadline - time.monotonic()))
 
     def _run(self) -> None:
+        """Forward the connection until it ends; runs on its own thread."""
         try:
             self._read_preface()
             self._front.set_share(self.peer, share_of(self._client))
@@ -178,6 +187,7 @@ class ForwardedConnection:
             self._server.close()
 
     def _read_preface(self) -> None:
+        """Read the preface of HTTP/2; raise `MalformedMessage` for other bytes."""
         deadline = time.monotonic() + _HANDSHAKE_S
         preface = b""
         while preface != PREFACE:
@@ -188,14 +198,15 @@ class ForwardedConnection:
                 raise MalformedMessage(
                     "expected the preface of HTTP/2, got another one; use a client of gRPC"
                 )
+
         self._client.settimeout(None)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client.setsockopt(
-            socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(_SEND_S), 0)
-        )
+        send_limit = struct.pack("ll", int(_SEND_S), 0)
+        self._client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, send_limit)
         set_keep_alive(self._client)
 
     def _forward_requests(self) -> None:
+        """Forward the client's bytes to gRPC's server, at the allowed rate of frames."""
         while True:
             data = self._client.recv(_READ_BYTES)
             if not data:
@@ -219,9 +230,12 @@ class ForwardedConnection:
                 self._server.sendall(data)
 
     def _forward_answers(self) -> None:
+        """Forward the bytes of gRPC's server to the client; runs on its own thread."""
         try:
-            while data := self._server.recv(_READ_BYTES):
+            data = self._server.recv(_READ_BYTES)
+            while data:
                 self._client.sendall(data)
+                data = self._server.recv(_READ_BYTES)
         except OSError as error:
             # A server that ends with unread requests resets the connection after its answers.
             logger.info("%s: disconnected a client: %s", self._front.name, error)

@@ -44,18 +44,18 @@ from vlagents_ray_dialects.messages.lerobot import (
 
 logger = logging.getLogger(__name__)
 
-# Time that a request for actions waits for an observation, as at LeRobot's own server.
+# The time for which a request for actions waits for an observation, as at LeRobot's own server.
 _WAIT_S = 2.0
-# Rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server.
+# The rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server.
 _HZ = 30.0
-_UPLOAD_S = 30.0  # maximum time from an observation's first part to its last
-_END_S = 3.0
+_UPLOAD_S = 30.0  # maximum time from the first piece of an observation to the last
+_END_S = 3.0  # maximum time for the answers to requests when the dialect ends
 _REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
-_HEARTBEAT_MS = 10_000
-# Maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most.
+_HEARTBEAT_MS = 10_000  # the period of gRPC's pings, and their time limit
+# Maximum number of characters of an error, which gRPC sends in a header of at most 8 KiB.
 _DETAILS = 500
-# The names of gRPC's status codes by HTTP status. Clients repeat a request by themselves after
-# UNAVAILABLE or DEADLINE_EXCEEDED.
+# The names of gRPC's status codes by HTTP status. Clients repeat a request after UNAVAILABLE or
+# DEADLINE_EXCEEDED.
 _STATUS = {
     400: "INVALID_ARGUMENT",
     403: "PERMISSION_DENIED",
@@ -83,17 +83,24 @@ class _Waiting:
 class LeRobotConnection(GatewayClient):
     """One client since its `Ready`. Its requests arrive on several threads, of which one at a
     time uses the session.
+
+    Args:
+        context: The context of the gateway.
+        mapping: The mapping of the client's names.
+        checkpoint: The checkpoint that the client must name; None accepts any.
     """
 
     def __init__(
         self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None
     ) -> None:
         super().__init__(context)
-        self._mapping, self._checkpoint = mapping, checkpoint
-        # The protocol has no key, and the deployment accepted that.
+        self._mapping = mapping
+        self._checkpoint = checkpoint
+        # The protocol has no key, which the deployment has accepted.
         self.sessions.show(NoKey.OPEN, None)
+
         self._robot: PolicyInstructions | None = None
-        self._acted = -1  # time step of the last observation that the policy received
+        self._acted = -1  # the time step of the last observation that the policy received
         self._waiting: _Waiting | None = None
         self._arrival = threading.Condition()
         self._acting = threading.Lock()
@@ -112,8 +119,10 @@ class LeRobotConnection(GatewayClient):
                 self._used = time.monotonic()
 
     def set_up(self, robot: PolicyInstructions) -> None:
-        """Set the policy instructions; raise `InvalidInput` if they name another checkpoint than
-        the deployment.
+        """Set the policy instructions of the client.
+
+        Raises:
+            InvalidInput: They name another checkpoint than the deployment.
         """
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
@@ -126,15 +135,23 @@ class LeRobotConnection(GatewayClient):
         self._robot = robot
 
     def observe(self, data: bytes, admission: MessageAdmission) -> None:
-        """Store an observation for the next act, in place of an earlier one that the policy has not
-        received yet.
+        """Store an observation for the next request of actions, in place of an earlier one that the
+        policy has not received yet.
 
         An observation of a time step that the policy has received is ignored, unless the client has
-        no action left. The `admission` of the pickle is released when the observation is dropped or
-        acted on.
+        no action left.
+
+        Args:
+            data: The pickle with the observation.
+            admission: The admission of the pickle, which is released when the observation is
+                dropped or the policy has answered.
+
+        Raises:
+            NotReset: The client has sent no policy instructions.
         """
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+
         admission.begin("act")
         observation = lerobot.read_observation(data, admission)
         if observation.timestep <= self._acted and not observation.must_go:
@@ -147,14 +164,14 @@ class LeRobotConnection(GatewayClient):
 
         waiting = _Waiting(observation, self._robot, obs, instruction, admission)
         with self._arrival:
-            earlier, self._waiting = self._waiting, waiting
+            replaced, self._waiting = self._waiting, waiting
             self._arrival.notify()
-        if earlier is not None:
-            earlier.admission.release()
+        if replaced is not None:
+            replaced.admission.release()
 
     def actions(self) -> bytes | None:
-        """Return the pickled actions for the newest observation; None if there is none within
-        two seconds.
+        """Return the pickled actions for the newest observation; None if no observation arrives
+        within two seconds.
         """
         deadline = time.monotonic() + _WAIT_S
         if not self._acting.acquire(timeout=_WAIT_S):
@@ -172,8 +189,8 @@ class LeRobotConnection(GatewayClient):
                 self.end()
 
     def end(self) -> None:
-        """Drop the waiting observation, and end the session; after a current action, if there is
-        one.
+        """Drop the waiting observation, and end the session, if necessary after the current
+        action.
         """
         with self._arrival:
             self._ended = True
@@ -188,13 +205,16 @@ class LeRobotConnection(GatewayClient):
                 self._acting.release()
 
     def _act(self, waiting: _Waiting) -> bytes:
-        contract, observation = self._context.contract, waiting.observation
-        before, self._acted = self._acted, max(self._acted, observation.timestep)
+        """Return the pickled actions for an observation."""
+        contract = self._context.contract
+        observation = waiting.observation
+        last_acted = self._acted
+        self._acted = max(last_acted, observation.timestep)
         try:
             act = self.sessions.act(waiting.obs, waiting.instruction)
         except BaseException:
             # The client's next observation of this time step must not be ignored.
-            self._acted = before
+            self._acted = last_acted
             raise
         finally:
             waiting.admission.release()
@@ -213,7 +233,7 @@ class LeRobotDialectConfig(KeylessPortConfig):
     port: int = Field(default=8080, ge=1, le=65535)
     checkpoint: str | None = Field(
         default=None,
-        description="the `pretrained_name_or_path` that clients must state; unset: any, as it is "
+        description="the `pretrained_name_or_path` that clients must name; default: any, as it is "
         "not loaded: the policy of the deployment acts",
     )
 
@@ -250,7 +270,8 @@ class LeRobotDialect(PortDialect):
         grpc = require("grpc")
 
         # The methods read and write plain bytes.
-        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
+        unary = grpc.unary_unary_rpc_method_handler
+        stream = grpc.stream_unary_rpc_method_handler
         methods = {
             "Ready": unary(partial(self._answer, grpc, self._ready)),
             "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
@@ -305,26 +326,29 @@ class LeRobotDialect(PortDialect):
         except VLAgentsError as error:
             status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
         except Exception as error:  # noqa: BLE001 - logged, and answered
-            if isinstance(error, grpc.RpcError):  # the client is gone
+            if isinstance(error, grpc.RpcError):  # the client has disconnected
                 return lerobot.EMPTY
             status, text = "INTERNAL", internal_error("lerobot")
         context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
         raise AssertionError  # abort raises
 
     def _ready(self, _: bytes, context: Any) -> None:
+        """Handle `Ready`: add a client."""
         if self._closing.is_set():
             raise _stopping()
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
 
     def _set_up(self, message: bytes, context: Any) -> None:
+        """Handle `SendPolicyInstructions`."""
         with self._request(context) as client:
             data = lerobot.read_data(message)
             if data is None:
                 raise MalformedMessage("policy instructions: got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
 
-    def _observe(self, parts: Iterator[bytes], context: Any) -> None:
+    def _observe(self, messages: Iterator[bytes], context: Any) -> None:
+        """Handle `SendObservations`, a stream of messages with one observation."""
         with self._request(context) as client:
             robot = self.config.priority == "robot"
             admission = MessageAdmission(
@@ -337,12 +361,13 @@ class LeRobotDialect(PortDialect):
             )
             self._uploads[context] = time.monotonic()
             try:
-                data = _joined(parts, admission)
+                data = _joined(messages, admission)
             finally:
                 del self._uploads[context]
             client.observe(data, admission)
 
     def _act(self, _: bytes, context: Any) -> bytes | None:
+        """Handle `GetActions`; return None if there is no observation."""
         with self._request(context) as client:
             actions = client.actions()
         if actions is None and self._closing.is_set():
@@ -364,25 +389,27 @@ class LeRobotDialect(PortDialect):
         return client.request()
 
     def _check_clients(self) -> None:
-        """Remove clients that are gone, and end observations that take too long."""
+        """Remove idle clients, and cancel observations that take too long to arrive."""
         self._clients.forget_quiet()
-        late = time.monotonic() - _UPLOAD_S
+        earliest_begin = time.monotonic() - _UPLOAD_S
         for context, begun in list(self._uploads.items()):
-            if begun < late:
+            if begun < earliest_begin:
                 context.cancel()
 
 
 def _stopping() -> PolicyUnavailable:
+    """Return the error of a request that arrives while the server stops."""
     return PolicyUnavailable("the server is stopping; connect again")
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
     """Return a pickle that arrives in several messages; each counts on arrival."""
-    parts: list[memoryview] = []
-    size, limit = 0, admission.limits.body_bytes
+    pieces: list[memoryview] = []
+    size = 0
+    limit = admission.limits.body_bytes
     for message in messages:
         state, data = lerobot.read_observation_part(message)
-        if state is TransferState.BEGIN and parts:
+        if state is TransferState.BEGIN and pieces:
             raise MalformedMessage("observation: begins twice")
         size += len(data)
         if size > limit:
@@ -390,7 +417,7 @@ def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
                 f"observation: more than {limit} bytes; send smaller images, or raise `limits`"
             )
         admission.receive(len(data))
-        parts.append(data)
+        pieces.append(data)
         if state is TransferState.END:
-            return b"".join(parts)
+            return b"".join(pieces)
     raise MalformedMessage("observation: ended before its last part")

@@ -1,16 +1,16 @@
 """openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server
 sends first.
 
-RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be
-on: RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's
-configuration, which openpi's client takes for metadata.
+RoboArena's clients use nearly the same protocol and also connect to the root. A server may have
+both dialects: RoboArena's requests contain an `endpoint`, openpi's do not. The first message is
+then RoboArena's configuration, which openpi's client reads as metadata.
 
 An error is a text with a request id, after which the connection is closed (1011) except for 429;
 openpi's own server sends a traceback.
 
-A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8),
-which was open when this was written: the reply is one map, whose `actions` are stacked. openpi's
-own client sends nothing when it is reset; the message `{"reset": True}` is that of its derivatives.
+A batch, `{"batch": [observation, ...]}`, has the form of openpi's pull request 941 (its head
+5bdadc8), which was open when this was written: the reply is one map, whose `actions` are stacked.
+openpi's own client sends nothing when it is reset; its derivatives send `{"reset": True}`.
 """
 
 from __future__ import annotations
@@ -55,11 +55,12 @@ class MapDialect(base.RouteDialect):
         await _stream([self], socket)
 
     def at_root(self, sharing: Sequence[MapDialect]) -> base.Stream:
+        """Return the function that serves the root for all dialects that share it."""
         return partial(_stream, sharing)
 
     @abc.abstractmethod
     def first(self) -> dict[str, Any]:
-        """Return the message that a client gets when it connects."""
+        """Return the message that a client receives when it connects."""
 
     @abc.abstractmethod
     def speaks(self, message: dict[str, Any]) -> bool:
@@ -67,6 +68,10 @@ class MapDialect(base.RouteDialect):
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         """Begin an episode if the message requires it.
+
+        Args:
+            message: The message of a client.
+            connection: The connection of the client.
 
         Returns:
             The reply if the message is not an observation; empty if the client expects no reply.
@@ -78,8 +83,12 @@ class MapDialect(base.RouteDialect):
         return None
 
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
-        """Encode the replies in the client's format; `before_ms` is the server's time for the
-        previous message.
+        """Return the answer to a message in the client's format.
+
+        Args:
+            replies: The reply to each observation of the message.
+            before_ms: The server's time for the previous message, ms; None for the first one.
+            batched: Whether the message is a batch.
         """
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
         infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
@@ -114,20 +123,20 @@ class OpenPiDialectConfig(DialectConfig):
     mapping: MappingSetting  # each of openpi's robots has different keys, so there is no default
     metadata: dict[str, Any] = Field(
         default_factory=dict,
-        description="added to what the client is sent first, such as reset_pose",
+        description="further entries of the first message to a client, such as reset_pose",
     )
     answer_reset: bool = Field(
         default=False,
-        description='whether {"reset": True} is answered, by the same; clients differ in waiting '
-        "for it",
+        description='whether {"reset": True} is answered with the same message; only some clients '
+        "wait for it",
     )
 
 
 class OpenPiDialect(MapDialect):
     """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
 
-    The observations of a batch are those of further sessions, in order. A batch of another size
-    ends all their episodes, as the owner of each observation is unknown.
+    The observations of a batch belong to further sessions, in order. A batch of another size ends
+    all their episodes, as the owner of each observation is unknown.
     """
 
     Config = OpenPiDialectConfig
@@ -171,8 +180,8 @@ class OpenPiDialect(MapDialect):
 
 
 class RoboArenaDialectConfig(DialectConfig):
-    """The settings of RoboArena's client; except for `bare`, the fields are those of its
-    PolicyServerConfig.
+    """The settings of RoboArena's client; except for `bare`, its PolicyServerConfig has the same
+    fields.
     """
 
     mapping: MappingSetting = "roboarena"
@@ -187,7 +196,8 @@ class RoboArenaDialectConfig(DialectConfig):
         "joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"
     ] = "joint_position"
     bare: bool = Field(
-        default=False, description="answer the array itself, as older clients want it"
+        default=False,
+        description="whether the answer is the array itself, as older clients need it",
     )
 
 
@@ -238,15 +248,19 @@ class RoboArenaDialect(MapDialect):
 
 
 class MapConnection:
-    """The state of one dialect on a connection, with its session."""
+    """The state of one dialect on a connection, with its session.
+
+    Args:
+        dialect: The dialect.
+    """
 
     def __init__(self, dialect: MapDialect) -> None:
         self.dialect = dialect
         self.sender: Sender = dialect.sender()
         self.session: base.ImplicitSession = dialect.session(self.sender)
-        self.episode: str | None = None  # name of the episode, set by the client
-        self._batched: list[base.ImplicitSession] = []  # sessions by index in a batch
-        self._before_ms: float | None = None
+        self.episode: str | None = None  # the client's name of the episode
+        self._batched: list[base.ImplicitSession] = []  # the sessions by index in a batch
+        self._before_ms: float | None = None  # the server's time for the previous message
 
     def end_episodes(self) -> None:
         """Make the next observation of each session begin an episode."""
@@ -256,8 +270,13 @@ class MapConnection:
     async def answer(
         self, message: dict[str, Any], incoming: IncomingMessage, request_id: str, gate: Sender
     ) -> bytes | str:
-        """Return the reply to one message; `gate` counts the observations of a batch after the
-        first for the key.
+        """Return the answer to one message.
+
+        Args:
+            message: The message.
+            incoming: The same message, for the metrics.
+            request_id: The id of the request.
+            gate: Counts the observations of a batch after the first one for the key.
         """
         dialect = self.dialect
         answer = dialect.begins(message, self)
@@ -280,14 +299,17 @@ class MapConnection:
         replies = await base.act_together(incoming, session_inputs, request_id)
 
         before_ms, batched = self._before_ms, batch is not None
-        data: bytes = dialect.encoded(
-            incoming, lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched))
-        )
+
+        def write() -> bytes:
+            """Encode the answer."""
+            return openpi.encode(dialect.answer(replies, before_ms, batched=batched))
+
+        data: bytes = dialect.encoded(incoming, write)
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
     async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
-        """Return the sessions of a batch of that size, in order; a change of the size ends the
+        """Return the sessions of a batch of this size, in order; a change of the size ends the
         episodes.
         """
         if number != len(self._batched):
@@ -307,6 +329,7 @@ async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
     """
     if not await base.accept_or_refuse(socket, dialects[0].context):
         return
+
     connections: dict[str, MapConnection] = {}
     gate = dialects[0].gate()
     try:
@@ -333,26 +356,37 @@ async def _answer(
     connections: dict[str, MapConnection],
     gate: Sender,
 ) -> bool:
-    """Reply to one message; return False if the connection was closed."""
-    incoming, request_id = dialects[0].arrived(), uuid.uuid4().hex
+    """Answer one message; return False if the connection was closed.
+
+    Args:
+        dialects: The dialects that share the path.
+        socket: The connection.
+        data: The message.
+        admission: The admission of the message, which is released at the end.
+        connections: The state of each dialect on this connection, by name.
+        gate: Counts the requests for the key.
+    """
+    incoming = dialects[0].arrived()
+    request_id = uuid.uuid4().hex
     try:
         message = await base.decoded(
             lambda data, budget: openpi.decode(data, budget.limits), data, admission
         )
 
-        dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
-        arrived, incoming = incoming.arrived, dialect.arrived()
+        dialect = _dialect_of(message, dialects)
+        arrived = incoming.arrived
+        incoming = dialect.arrived()
         incoming.arrived = arrived
-        connection = connections.get(dialect.name) or connections.setdefault(
-            dialect.name, MapConnection(dialect)
-        )
+        if dialect.name not in connections:
+            connections[dialect.name] = MapConnection(dialect)
+        connection = connections[dialect.name]
         answer = await connection.answer(message, incoming, request_id, gate)
     except Exception as error:  # noqa: BLE001 - the error is the reply to the client
         problem = public_problem(error, incoming.transport, request_id)
         dialects[0].record_failure(incoming, problem)
         await socket.send_text(f"{problem} (request {request_id})")
 
-        # The connection stays open, as nothing was acted on.
+        # The connection stays open, as the policy has not received the message.
         if isinstance(problem, TooManyRequests):
             if gate.refused_too_often:
                 await socket.close(base.POLICY_VIOLATION, REFUSED)
@@ -371,3 +405,11 @@ async def _answer(
     elif answer:
         await socket.send_bytes(answer)
     return True
+
+
+def _dialect_of(message: dict[str, Any], dialects: Sequence[MapDialect]) -> MapDialect:
+    """Return the dialect of a message, by default the first one."""
+    for dialect in dialects:
+        if dialect.speaks(message):
+            return dialect
+    return dialects[0]

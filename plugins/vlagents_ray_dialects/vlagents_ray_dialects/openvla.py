@@ -1,6 +1,6 @@
-"""OpenVLA's REST protocol: `POST /act` with an observation, to which the reply is an action.
+"""OpenVLA's REST protocol: `POST /act` with an observation; the reply is an action.
 
-Errors have their own status here, while OpenVLA's own server replies with 200 and "error".
+Errors have a status of their own, while OpenVLA's own server replies with 200 and "error".
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ class OpenVLADialectConfig(DialectConfig):
 
     mapping: MappingSetting = "openvla"
     chunk: bool = Field(
-        default=False, description="answer all rows, as OFT's clients want it, not the first alone"
+        default=False,
+        description="whether the answer has all rows, as OFT's clients need it, or only the first",
     )
     plain: bool = Field(
         default=False,
-        description="answer lists of numbers, as GO-1's clients read them, not arrays",
+        description="whether the answer has lists of numbers, as GO-1's clients read them, instead "
+        "of arrays",
     )
 
 
@@ -51,8 +53,17 @@ class OpenVLADialect(HttpDialect):
     config: OpenVLADialectConfig
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
-        """Convert a client's observation, which needs an instruction if the mapping has a key
-        for it.
+        """Convert a client's observation.
+
+        Args:
+            theirs: The observation.
+
+        Returns:
+            Our observation, and the instruction.
+
+        Raises:
+            InvalidObservation: The mapping has a key of the instruction, and the observation has no
+                instruction.
         """
         obs, instruction = super().read(theirs)
         if instruction is None and self.mapping.instruction is not None:
@@ -62,19 +73,23 @@ class OpenVLADialect(HttpDialect):
         return obs, instruction
 
     async def act(self, http: HttpRequest) -> Response:
-        """Answer one request; the reply is encoded once or twice, like the request."""
+        """Answer one request. The reply is encoded once or twice, like the request."""
         twice = False
 
         def read(data: bytes, budget: Budget) -> dict[str, Any]:
+            """Decode the observation in a request."""
             nonlocal twice
             theirs, twice = openvla.decode(data, budget.limits)
             return theirs
 
         def write(rows: np.ndarray) -> bytes:
-            chosen = rows if self.config.chunk else rows[0]
+            """Encode the action of a reply."""
+            action = rows if self.config.chunk else rows[0]
             if self.config.plain:
-                return openvla.encode(chosen.tolist(), twice)
-            named = self.mapping.columns(chosen)
-            return openvla.encode(named or (list(rows) if self.config.chunk else chosen), twice)
+                return openvla.encode(action.tolist(), twice)
+            columns = self.mapping.columns(action)
+            if columns:
+                return openvla.encode(columns, twice)
+            return openvla.encode(list(rows) if self.config.chunk else action, twice)
 
         return await self.answer(http, read, write)

@@ -1,9 +1,9 @@
 """vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an
 observation per step.
 
-A benchmark executes one action per step, so each reply holds one row of a chunk. A benchmark that
-sends observations without waiting (its live mode) gets a reply to the newest one; the server does
-not act on older ones.
+A benchmark executes one action per step, so each reply contains one row of a chunk. A benchmark
+that sends observations without waiting (its live mode) receives a reply to the newest one; older
+observations are dropped.
 """
 
 from __future__ import annotations
@@ -49,21 +49,22 @@ class VlaEvalDialectConfig(DialectConfig):
     mapping: MappingSetting = "vla-eval"
     priority: PriorityName = "simulation"
     execute: int | None = Field(
-        default=None, ge=1, description="rows of each chunk that are executed; null: all"
+        default=None, ge=1, description="number of executed rows of each chunk; null: all"
     )
     observation_params: dict[str, Any] = Field(
-        default_factory=dict, description="what benchmarks are asked for, such as send_state: true"
+        default_factory=dict,
+        description="parameters that benchmarks are asked for, such as send_state: true",
     )
 
 
 class VlaEvalDialect(base.RouteDialect):
-    """vla-eval's protocol, in which the client states the begin and the end of each episode."""
+    """vla-eval's protocol, in which the client reports the begin and the end of each episode."""
 
     Config = VlaEvalDialectConfig
     clients = "vla-eval"
     summary = (
-        "A session is the connection, which says where episodes begin and end. An error is "
-        "an `error` message."
+        "A session is the connection, whose client reports the begin and end of episodes. An error "
+        "is an `error` message."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /vla-eval": "stream"}
     root = "vla_eval"
@@ -77,7 +78,7 @@ class VlaEvalDialect(base.RouteDialect):
         return self.stream
 
     async def health(self, _http: HttpRequest) -> Response:
-        """Reply whether the policy is ready, like vla-eval's own servers."""
+        """Return whether the policy is ready, like vla-eval's own servers."""
         try:
             self.context.engine.health.require_ready()
         except VLAgentsError as error:
@@ -88,8 +89,11 @@ class VlaEvalDialect(base.RouteDialect):
         """Serve one connection; its session ends with it."""
         if not await base.accept_or_refuse(socket, self.context):
             return
-        sender, gate = self.sender(), self.gate()
-        session, chunk = self.session(sender), ChunkBuffer()  # the buffer holds unsent rows
+
+        sender = self.sender()
+        gate = self.gate()
+        session = self.session(sender)
+        chunk = ChunkBuffer()  # the rows that are not sent yet
         inbox = _Inbox()
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
@@ -114,6 +118,7 @@ class VlaEvalDialect(base.RouteDialect):
     async def _answer(
         self, received: _Received, session: base.ImplicitSession, chunk: ChunkBuffer
     ) -> vla_eval.VlaEvalMessage | None:
+        """Return the answer to a message; None if the client expects none."""
         message = received.message
         if isinstance(message, VLAgentsError):
             return _error(message, 0, uuid.uuid4().hex)
@@ -124,10 +129,11 @@ class VlaEvalDialect(base.RouteDialect):
             session.episode.end()
             return None
         if message.kind != "observation":
-            return None  # the client reports an error
+            return None  # the client has reported an error
         return await self._act(message, received.admission, session, chunk)
 
     def _hello(self, message: vla_eval.VlaEvalMessage) -> vla_eval.VlaEvalMessage:
+        """Return the answer to "hello"."""
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
             error = MalformedMessage(
@@ -153,6 +159,7 @@ class VlaEvalDialect(base.RouteDialect):
         session: base.ImplicitSession,
         chunk: ChunkBuffer,
     ) -> vla_eval.VlaEvalMessage:
+        """Return the action for an observation, or an error."""
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
@@ -184,16 +191,17 @@ class VlaEvalDialect(base.RouteDialect):
 
 @dataclass(slots=True)
 class _Received:
-    """A received message, whose images are not decoded yet, or the error of a refused message."""
+    """A received message, whose images are not decoded yet, or the error of a rejected message."""
 
     message: vla_eval.VlaEvalMessage | VLAgentsError
     admission: MessageAdmission
 
     @property
     def is_observation(self) -> bool:
-        return (
-            isinstance(self.message, vla_eval.VlaEvalMessage) and self.message.kind == "observation"
-        )
+        """Whether the message is an observation."""
+        if isinstance(self.message, VLAgentsError):
+            return False
+        return self.message.kind == "observation"
 
 
 class _Inbox:
@@ -205,14 +213,14 @@ class _Inbox:
         self.end: str | None = None  # the reason why the server ends the connection
 
     async def next(self) -> _Received | None:
-        """Wait for the oldest message and return it; None if the client is gone."""
+        """Wait for the oldest message, and return it; None if the client has disconnected."""
         while not self._messages:
             self._arrival.clear()
             await self._arrival.wait()
         return self._messages.popleft()
 
     async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
-        """Receive messages until the client is gone, or too many of its messages wait for
+        """Receive messages until the client disconnects, or too many of its messages wait for
         replies.
         """
         try:
@@ -227,6 +235,7 @@ class _Inbox:
                     )
                     self._put(_Received(MessageTooLarge(self.end), admission))
                     return
+
                 self._put(await self._read(data, admission))
             self.end = REFUSED
         finally:
@@ -241,24 +250,20 @@ class _Inbox:
             )
             return _Received(message, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            return _Received(
-                public_problem(error, "vla_eval", "of an unreadable message"), admission
-            )
+            problem = public_problem(error, "vla_eval", "of an unreadable message")
+            return _Received(problem, admission)
 
     def _put(self, received: _Received | None) -> None:
+        """Add a message, in place of the last one if both are observations; None ends the inbox."""
+        is_observation = received is not None and received.is_observation
         last = self._messages[-1] if self._messages else None
-        if (
-            last is not None
-            and received is not None
-            and last.is_observation
-            and received.is_observation
-        ):
+        if is_observation and last is not None and last.is_observation:
             self._messages.pop()
         self._messages.append(received)
         self._arrival.set()
 
 
 def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.VlaEvalMessage:
-    return vla_eval.VlaEvalMessage(
-        "error", {"error": f"{error} (request {request_id})", "code": error.code}, seq
-    )
+    """Return the message with an error."""
+    payload = {"error": f"{error} (request {request_id})", "code": error.code}
+    return vla_eval.VlaEvalMessage("error", payload, seq)

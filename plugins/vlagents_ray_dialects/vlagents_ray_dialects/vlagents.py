@@ -46,27 +46,35 @@ _METHODS = ("act", "reset", "name", "is_initialized", "git_status")
 _FOLDER = "/dev/shm"  # noqa: S108 - the folder of Linux for shared memory
 # The names that Python's `SharedMemory` generates; clients may name no other file in the folder.
 _NAME = re.compile(r"/?(psm_[0-9a-f]{1,32})")
-_KEPT = 64
-_END_S = 3.0
+_KEPT = 64  # maximum number of segments of a client that are kept open
+_END_S = 3.0  # maximum time for the answers to requests when the dialect ends
 
 
 class VlagentsConnection:
-    """One connection of a client, from its first byte to its last."""
+    """One connection of a client, from its first byte to its last.
+
+    Args:
+        dialect: The dialect.
+        connection: The connection.
+    """
 
     def __init__(self, dialect: VlagentsDialect, connection: socket.socket) -> None:
-        self._context = context = dialect.context
-        self._dialect, self._connection = dialect, connection
+        context = dialect.context
+        self._context = context
+        self._dialect = dialect
+        self._connection = connection
         self._session = GatewaySessions(context.connect, context.contract)
-        # The protocol has no key, and the deployment accepted that.
+        # The protocol has no key, which the deployment has accepted.
         self._session.show(NoKey.OPEN, None)
+
         robot = dialect.config.priority == "robot"
-        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._share = share_of(connection)  # the name of its share of the bytes in flight
         self._reader = ClientReader(connection, context.admission, robot=robot)
         self._segments = SharedMemory(
             same_machine=dialect.config.shared_memory and _is_same_machine(connection)
         )
         self._sending = threading.Lock()
-        # Sequence number of the request that is being processed.
+        # The sequence number of the request that is being processed.
         self._unanswered: int | None = None
 
     def run(self) -> None:
@@ -116,13 +124,15 @@ class VlagentsConnection:
         return unanswered is not None
 
     def stop_reading(self) -> None:
-        """Read no further requests: the connection ends after the answer to the current one.
-        From any thread.
+        """Read no further requests, so that the connection ends after the answer to the current
+        one; called on any thread.
         """
         shut_down(self._connection, socket.SHUT_RD)
 
     def end(self) -> None:
-        """Answer the current request with an error, and end the connection. From any thread."""
+        """Answer the current request with an error, and end the connection; called on any
+        thread.
+        """
         error = PolicyUnavailable("the server is stopping; connect again")
         # Without a request there is nothing to answer, and the lock may be held for a client that
         # reads an answer slowly.
@@ -130,13 +140,14 @@ class VlagentsConnection:
             with self._sending:
                 sequence, self._unanswered = self._unanswered, None
                 if sequence is not None:
-                    with contextlib.suppress(OSError):  # the client is gone, or does not read
-                        self._send(
-                            rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}")
-                        )
+                    text = f"{error.code}: {error}"
+                    # The client may have disconnected, or may not read.
+                    with contextlib.suppress(OSError):
+                        self._send(rpyc.exception(sequence, "RuntimeError", text))
         shut_down(self._connection)
 
     def _answer(self, call: RpycCall) -> bytes:
+        """Return the frame that answers a request, which may be an exception."""
         try:
             if call.handler is Handler.GETROOT:
                 return rpyc.reference_reply(call.sequence, rpyc.ROOT)
@@ -144,27 +155,30 @@ class VlagentsConnection:
                 return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
-            kind = "RuntimeError"
+            class_name = "RuntimeError"
             if isinstance(error, TimeoutError):
-                kind = "TimeoutError"
+                class_name = "TimeoutError"
             elif isinstance(error, ValueError):
-                kind = "ValueError"
-            return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
+                class_name = "ValueError"
+            return rpyc.exception(call.sequence, class_name, f"{error.code}: {error}")
         except Exception:  # noqa: BLE001 - logged, and answered
             return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
 
     def _value(self, call: RpycCall) -> Any:
+        """Return the value of the reply to a request."""
         if call.handler is Handler.PING:
             return _echo(call)
         if call.handler is Handler.DEL:
             return None
         if call.handler is Handler.INSPECT:
             return tuple((name, None) for name in _METHODS)
+
         method, args = _called(call)
         if method in ("act", "reset"):
             if len(args) != 1 or not isinstance(args[0], (str, bytes)):
                 raise MalformedMessage(f"{method}: want one argument, text")
             return self._act(args[0]) if method == "act" else self._reset(args[0])
+
         if args:
             raise MalformedMessage(f"{method}: want no arguments")
         if method == "name":
@@ -174,6 +188,7 @@ class VlagentsConnection:
         return json_numpy.dumps({"vlagents_ray": importlib.metadata.version("vlagents-ray")})
 
     def _act(self, text: str | bytes) -> str:
+        """Return the result of the method `act`."""
         admission = self._admission(text)
         request = vlagents.read_act(text, admission, self._segments)
         obs = self._ours(request.obs)
@@ -183,17 +198,18 @@ class VlagentsConnection:
             act = self._session.act_on(obs)
         admission.release()
 
-        parts = self._dialect.parts
-        if isinstance(parts, vlagents.Part):
+        columns = self._dialect.columns
+        if isinstance(columns, vlagents.RobotColumns):
             if len(request.robots) > 1:
                 raise InvalidInput(
                     f"got the robots {list(request.robots)[:8]}; state their columns in "
                     "dialects.vlagents.robots"
                 )
-            parts = dict.fromkeys(request.robots, parts)
-        return vlagents.write_act(act, request.robots, parts)
+            columns = dict.fromkeys(request.robots, columns)
+        return vlagents.write_act(act, request.robots, columns)
 
     def _reset(self, text: str | bytes) -> str:
+        """Return the result of the method `reset`."""
         admission = self._admission(text)
         request, options = vlagents.read_reset(text, admission, self._segments)
         info = self._session.reset(self._ours(request.obs), request.instruction, **options)
@@ -201,6 +217,7 @@ class VlagentsConnection:
         return json_numpy.dumps(info)
 
     def _admission(self, text: str | bytes) -> MessageAdmission:
+        """Return the admission of a request, which counts its bytes."""
         robot = self._dialect.config.priority == "robot"
         return MessageAdmission(
             self._context.admission,
@@ -213,7 +230,7 @@ class VlagentsConnection:
         )
 
     def _ours(self, obs: Obs) -> Obs:
-        """Return the observation under the policy's names, converted if the deployment has a
+        """Return an observation with the policy's names, converted if the deployment has a
         mapping.
         """
         mapping = self._dialect.stated_mapping
@@ -232,13 +249,12 @@ class VlagentsConnection:
         """Receive the next message, and whether it is compressed; None if the client
         disconnected before it.
         """
-        header = self._reader.read(
-            rpyc.HEADER.size,
-            self._context.idle_s,
-            time.monotonic() + self._context.idle_s + _FRAME_S,
-        )
+        idle_s = self._context.idle_s
+        deadline = time.monotonic() + idle_s + _FRAME_S
+        header = self._reader.read(rpyc.HEADER.size, idle_s, deadline)
         if header is None:
             return None
+
         length, compressed = rpyc.read_header(bytes(header), self._context.limits.body_bytes)
         body = self._reader.read(length, _FRAME_S, time.monotonic() + _FRAME_S)
         if body is None:
@@ -246,22 +262,23 @@ class VlagentsConnection:
         return bytearray(body), compressed
 
     def _send(self, frame: bytes) -> None:
+        """Send a frame; raise `TimeoutError` if the client does not read it in time."""
         self._connection.settimeout(_SEND_S)
         self._connection.sendall(frame)
 
 
 def _echo(call: RpycCall) -> str | bytes | None:
-    """Return the value that a ping is answered with."""
+    """Return the value with which a ping is answered."""
     match call.args:
         case ():
             return None
-        case (str() | bytes() | None as said, *_):
-            return said
+        case (str() | bytes() | None as value, *_):
+            return value
     raise MalformedMessage(f"ping: got {shown(call.args[0])}, want text")
 
 
 def _number(args: tuple[Any, ...]) -> int:
-    """Return the number that identifies the method a client looks up."""
+    """Return the number of the method that a client looks up."""
     match args:
         case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
             return _METHODS.index(name) + 1
@@ -294,7 +311,7 @@ def _is_same_machine(connection: socket.socket) -> bool:
     """
     try:
         return bool(connection.getpeername()[0] == connection.getsockname()[0])
-    except OSError:  # the client is already gone
+    except OSError:  # the client has disconnected
         return False
 
 
@@ -306,16 +323,25 @@ def _is_same_machine(connection: socket.socket) -> bool:
 
 
 class SharedMemory:
-    """The segments of one client, kept open between its requests."""
+    """The segments of one client, kept open between its requests.
+
+    Args:
+        same_machine: Whether the client is on this machine; otherwise every name is rejected.
+    """
 
     def __init__(self, *, same_machine: bool) -> None:
-        """Prepare to read; unless the client is on the `same_machine`, every name is refused."""
         self._same_machine = same_machine
-        self._open: dict[str, int] = {}
+        self._open: dict[str, int] = {}  # descriptors by name, the oldest first
 
     def read(self, name: str, size: int) -> bytearray:
-        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if
-        that is impossible.
+        """Return a copy of the first bytes of a segment.
+
+        Args:
+            name: The name of the segment.
+            size: The number of bytes.
+
+        Raises:
+            InvalidObservation: There is no such segment, or it is shorter.
         """
         if not self._same_machine:
             raise InvalidObservation(
@@ -327,8 +353,9 @@ class SharedMemory:
             raise InvalidObservation(
                 f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape"
             )
+
         data = bytearray(size)
-        filled = 0  # number of bytes that have been read
+        filled = 0  # the number of bytes that have been read
         while filled < size:
             count = os.preadv(descriptor, [memoryview(data)[filled:]], filled)
             if count == 0:
@@ -345,20 +372,20 @@ class SharedMemory:
         self._open.clear()
 
     def _descriptor(self, name: str) -> int:
+        """Return the descriptor of a segment, which is opened if necessary."""
         match = _NAME.fullmatch(name)
         if match is None:
             raise InvalidObservation(
                 f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'"
             )
 
-        known = self._open.get(match[1])
-        if known is not None:
-            return known
+        file_name = match[1]
+        if file_name in self._open:
+            return self._open[file_name]
 
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
         try:
-            descriptor = os.open(
-                f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
-            )
+            descriptor = os.open(f"{_FOLDER}/{file_name}", flags)
         except OSError as error:
             raise InvalidObservation(
                 f"shared memory {name[:40]!r}: cannot be opened ({error.strerror})"
@@ -366,25 +393,30 @@ class SharedMemory:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise InvalidObservation(f"shared memory {name[:40]!r}: is none")
+
         if len(self._open) >= _KEPT:  # a client creates another segment when its images grow
-            os.close(self._open.pop(next(iter(self._open))))
-        self._open[match[1]] = descriptor
+            oldest = next(iter(self._open))
+            os.close(self._open.pop(oldest))
+        self._open[file_name] = descriptor
         return descriptor
 
 
 class GripperArgs(BaseModel, extra="forbid"):
     """The column of a robot's gripper in a row of the policy's actions, and its values."""
 
-    column: int = Field(default=-1, description="as in Python: -1 is the last")
+    column: int = Field(default=-1, description="index as in Python: -1 is the last column")
     open: float | None = Field(
-        default=None, description="its value for open; default: the policy's contract, or 1"
+        default=None,
+        description="value for an open gripper; default: the policy's contract, or 1",
     )
     closed: float | None = Field(
-        default=None, description="and for closed; default: the policy's contract, or 0"
+        default=None,
+        description="value for a closed gripper; default: the policy's contract, or 0",
     )
 
     @model_validator(mode="after")
     def _two_values(self) -> GripperArgs:
+        """Reject equal values."""
         if self.open is not None and self.open == self.closed:
             raise ValueError(f"open and closed are both {self.open}; they must differ")
         return self
@@ -396,35 +428,37 @@ class RobotArgs(BaseModel, extra="forbid"):
     start: int | None = None
     stop: int | None = None
     gripper: GripperArgs | None = Field(
-        default=None, description="the column that goes into SingleAct.gripper; unset: none"
+        default=None, description="the column that becomes SingleAct.gripper; default: none"
     )
 
 
 class VlagentsDialectConfig(KeylessPortConfig):
     """The settings of the RPyC protocol of the package `vlagents`, 0.2 and 0.3.
 
-    A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as
-    they are.
+    A mapping reads cameras/NAME, state/NAME, gripper and info; without one, the client's names stay
+    as they are.
     """
 
     port: int = Field(default=8080, ge=1, le=65535)
     name: str | None = Field(
         default=None,
-        description="the model's name, which clients must give; default: the application's",
+        description="the name of the model, which clients must name; default: the application's",
     )
     gripper: GripperArgs | None = Field(
         default=None,
-        description="of the only robot: the column that goes into SingleAct.gripper; unset: none",
+        description="for a single robot: the column that becomes SingleAct.gripper; default: none",
     )
     robots: dict[str, RobotArgs] = Field(
-        default_factory=dict, description="with several, which columns are whose"
+        default_factory=dict, description="for several robots: the columns of each"
     )
     shared_memory: bool = Field(
-        default=True, description="read the cameras of clients on this machine in place"
+        default=True,
+        description="whether the cameras of clients on this machine are read from shared memory",
     )
 
     @model_validator(mode="after")
     def _one_way(self) -> VlagentsDialectConfig:
+        """Reject settings for both one robot and several."""
         if self.gripper is not None and self.robots:
             raise ValueError("gripper is for a single robot; with robots, state each robot's own")
         return self
@@ -441,8 +475,8 @@ class VlagentsDialect(PortDialect):
     )
     scheme = "rpyc"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # this project's own names, for clients that need a mapping but whose protocol defines no
-        # names
+        # The names of this project, for clients that need a mapping but whose protocol defines no
+        # names.
         "vlagents": {
             "cameras": {"*": "cameras/*"},
             "state": {"*": "state/*"},
@@ -457,10 +491,13 @@ class VlagentsDialect(PortDialect):
         super().__init__(name, config, context)
         self.stated_mapping = config.keys()  # None if clients use this project's names
         spec = ActionSpec() if context.contract is None else context.contract.action
-        # The columns of each robot, or of the only one.
-        self.parts: Mapping[str, vlagents.Part] | vlagents.Part = {
-            name: _part(robot, spec) for name, robot in config.robots.items()
-        } or _part(RobotArgs(gripper=config.gripper), spec)
+        # The columns of each robot, or of a single one.
+        self.columns: Mapping[str, vlagents.RobotColumns] | vlagents.RobotColumns
+        if config.robots:
+            self.columns = {name: _columns(robot, spec) for name, robot in config.robots.items()}
+        else:
+            self.columns = _columns(RobotArgs(gripper=config.gripper), spec)
+
         self._clients: dict[threading.Thread, VlagentsConnection] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -468,8 +505,8 @@ class VlagentsDialect(PortDialect):
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:  # noqa: ARG003 - overrides
-        """Return nothing: the instruction is sent beside the observation, and `robots` states
-        each robot's columns.
+        """Return nothing: the instruction is sent next to the observation, and `robots` contains
+        the columns of each robot.
         """
         return []
 
@@ -500,6 +537,7 @@ class VlagentsDialect(PortDialect):
                 client.end()
 
     def _add(self, connection: socket.socket) -> None:
+        """Serve a connection on a new thread, or close it if there are too many clients."""
         client = VlagentsConnection(self, connection)
         thread = threading.Thread(
             target=self._serve, args=(client,), name="vlagents-client", daemon=True
@@ -518,6 +556,7 @@ class VlagentsDialect(PortDialect):
             thread.start()
 
     def _serve(self, client: VlagentsConnection) -> None:
+        """Serve a client until it disconnects; runs on its own thread."""
         try:
             client.run()
         finally:
@@ -525,15 +564,20 @@ class VlagentsDialect(PortDialect):
                 del self._clients[threading.current_thread()]
 
 
-def _part(robot: RobotArgs, spec: ActionSpec) -> vlagents.Part:
-    if (gripper := robot.gripper) is None:
-        return vlagents.Part(robot.start, robot.stop)
-    opened, closed = (
-        _first(gripper.open, spec.gripper_open, 1.0),
-        _first(gripper.closed, spec.gripper_closed, 0.0),
+def _columns(robot: RobotArgs, spec: ActionSpec) -> vlagents.RobotColumns:
+    """Return the columns of a robot, with the gripper's values of the contract as defaults."""
+    gripper = robot.gripper
+    if gripper is None:
+        return vlagents.RobotColumns(robot.start, robot.stop)
+    return vlagents.RobotColumns(
+        start=robot.start,
+        stop=robot.stop,
+        gripper=gripper.column,
+        gripper_open=_first(gripper.open, spec.gripper_open, 1.0),
+        gripper_closed=_first(gripper.closed, spec.gripper_closed, 0.0),
     )
-    return vlagents.Part(robot.start, robot.stop, gripper.column, opened, closed)
 
 
 def _first(*values: float | None) -> float:
+    """Return the first value that is not None."""
     return next(value for value in values if value is not None)

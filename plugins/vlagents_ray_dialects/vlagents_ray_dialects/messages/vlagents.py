@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
@@ -30,41 +30,54 @@ from vlagents_ray.protocol.values import is_number
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages import rpyc
 
-RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"
+RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"  # formats of a camera
 _TOP_3 = {"obs", "language_instruction", "goal_image", "goal_image_data_type"}
 _ROBOT_3 = {"cameras", "camera_data_type", "gripper", "joints", "xyzrpy", "tquat", "info"}
 _ROBOT_2 = {"cameras", "camera_data_type", "gripper", "state", "info"}
 _LEVELS = 4  # levels of nesting above the values in `info`: message, robots, robot, info
-_PARTS = ("joints", "xyzrpy", "tquat", "state")
-_TAKEN = {"self", "obs", "instruction", "contract"}  # arguments of `reset` that are not options
+_STATE_NAMES = ("joints", "xyzrpy", "tquat", "state")
+_NO_OPTIONS = {"self", "obs", "instruction", "contract"}  # arguments of `reset` that are no options
 
 
 class Segments(Protocol):
     """Reads a client's shared memory."""
 
     def read(self, name: str, size: int) -> bytearray:
-        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if
-        that is impossible.
+        """Return a copy of the first bytes of a segment.
+
+        Args:
+            name: The name of the segment.
+            size: The number of bytes.
+
+        Raises:
+            InvalidObservation: The segment cannot be read.
         """
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RobotColumns:
     """The columns of one robot in a row of actions, with indices as in Python: -1 is the last
     column.
     """
 
     start: int | None = None
     stop: int | None = None
-    # The column that becomes `SingleAct.gripper` instead of a part of `action`.
+    # The column that becomes `SingleAct.gripper` instead of a number of `action`.
     gripper: int | None = None
-    gripper_open: float = 1.0  # the column's value for an open gripper, which vlagents writes as 1
-    # The column's value for a closed gripper, which vlagents writes as 0.
-    gripper_closed: float = 0.0
+    gripper_open: float = 1.0  # the value of an open gripper, which vlagents writes as 1
+    gripper_closed: float = 0.0  # the value of a closed gripper, which vlagents writes as 0
 
     def split(self, row: np.ndarray) -> tuple[np.ndarray, float | None]:
-        """Return the action, (d,), and the gripper, None or in [0, 1] with 1 = open, of a row,
-        (D,) float32.
+        """Split a row of the policy's actions.
+
+        Args:
+            row: The row, (D,) float32.
+
+        Returns:
+            The action of the robot, (d,), and its gripper in [0, 1] with 1 = open, or None.
+
+        Raises:
+            InvalidAction: The row has no such columns.
         """
         columns = np.arange(len(row))[self.start : self.stop]
         if not len(columns):
@@ -77,20 +90,30 @@ class Part:
             raise InvalidAction(
                 f"vlagents: no column {self.gripper} for the gripper in a row of {len(row)}"
             )
-        span = self.gripper_open - self.gripper_closed
-        opened = (float(row[self.gripper]) - self.gripper_closed) / span
-        return row[columns[columns != self.gripper % len(row)]], min(1.0, max(0.0, opened))
+
+        width = self.gripper_open - self.gripper_closed
+        opening = (float(row[self.gripper]) - self.gripper_closed) / width
+        action_columns = columns[columns != self.gripper % len(row)]
+        return row[action_columns], min(1.0, max(0.0, opening))
 
 
 @dataclass(frozen=True, slots=True)
 class ObservationRequest:
+    """The observation in a call of a client."""
+
     obs: Obs
     instruction: str | None
-    robots: tuple[str, ...]  # names in order; empty for vlagents 0.2, which has no names
+    robots: tuple[str, ...]  # the names in order; empty for vlagents 0.2, which has no names
 
 
 def read_act(text: str | bytes, budget: Budget, segments: Segments) -> ObservationRequest:
-    """Return the observation of an `act`, and count it as a request."""
+    """Read the argument of the method `act`, and count it as a request.
+
+    Args:
+        text: The argument, JSON.
+        budget: Counts the requests and the images.
+        segments: Reads the shared memory of the client.
+    """
     budget.begin("act")
     return _read(json_numpy.loads(text, budget.limits, _LEVELS), budget, segments)
 
@@ -98,8 +121,15 @@ def read_act(text: str | bytes, budget: Budget, segments: Segments) -> Observati
 def read_reset(
     text: str | bytes, budget: Budget, segments: Segments
 ) -> tuple[ObservationRequest, dict[str, Any]]:
-    """Return the observation and the options of a `reset` of vlagents 0.2, and count it as a
-    request.
+    """Read the argument of the method `reset` of vlagents 0.2, and count it as a request.
+
+    Args:
+        text: The argument, JSON.
+        budget: Counts the requests and the images.
+        segments: Reads the shared memory of the client.
+
+    Returns:
+        The observation and the options.
     """
     budget.begin("reset")
     document = json_numpy.loads(text, budget.limits, _LEVELS)
@@ -108,28 +138,34 @@ def read_reset(
 
     request = _read(document[0], budget, segments)
     kwargs = _mapping(document[2], "reset: options")
-    taken = kwargs.keys() & _TAKEN
-    if taken:
-        raise MalformedMessage(f"reset: got the options {sorted(taken)}, which are no options")
+    no_options = kwargs.keys() & _NO_OPTIONS
+    if no_options:
+        raise MalformedMessage(f"reset: got the options {sorted(no_options)}, which are no options")
 
     instruction = _instruction(document[1], budget.limits)
     return ObservationRequest(request.obs, instruction, request.robots), kwargs
 
 
-def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None = None) -> str:
-    """Return the reply to an `act` of those robots; without `parts`, each robot's action is a
-    whole row.
+def write_act(
+    act: Act, robots: Sequence[str], columns: Mapping[str, RobotColumns] | None = None
+) -> str:
+    """Return the result of the method `act`.
+
+    Args:
+        act: The policy's action.
+        robots: The names of the robots in the request; empty for vlagents 0.2.
+        columns: The columns of each robot in a row; by default, each robot has the whole row.
     """
     if not robots:
         return json_numpy.dumps({"action": act.action, "done": act.done, "info": act.info})
 
     rows = act.rows()
-    parts_by_robot = parts or dict.fromkeys(robots, Part())
+    columns_by_robot = columns or dict.fromkeys(robots, RobotColumns())
     steps = []
     for number, row in enumerate(rows):
         step = {}
-        for robot, columns in parts_by_robot.items():
-            action, gripper = columns.split(row)
+        for robot, robot_columns in columns_by_robot.items():
+            action, gripper = robot_columns.split(row)
             step[robot] = {
                 "action": action,
                 "gripper": gripper,
@@ -141,6 +177,7 @@ def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None 
 
 
 def _read(document: Any, budget: Budget, segments: Segments) -> ObservationRequest:
+    """Return the observation in a decoded document of either version."""
     limits = budget.limits
     top = _mapping(document, "observation")
     if "obs" not in top:
@@ -175,29 +212,34 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
 
     goal = top.get("goal_image")
     if goal is not None:
-        kind = top.get("goal_image_data_type", RAW)
-        obs.info[GOAL_IMAGE] = _image(goal, kind, GOAL_IMAGE, budget, segments)
+        image_format = top.get("goal_image_data_type", RAW)
+        obs.info[GOAL_IMAGE] = _image(goal, image_format, GOAL_IMAGE, budget, segments)
 
     instruction = _instruction(top.get("language_instruction"), limits)
     return ObservationRequest(obs, instruction, tuple(robots))
 
 
 def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segments) -> Obs:
-    """Return one robot's observation; a `prefix` is added to all names, and moves the gripper
-    into the state, (1,).
+    """Return the observation of one robot.
+
+    Args:
+        robot: The decoded observation.
+        prefix: Added to all names; with a prefix, the gripper becomes a part of the state, (1,).
+        budget: Counts the images.
+        segments: Reads the shared memory of the client.
     """
     limits = budget.limits
     cameras = _mapping(robot.get("cameras") or {}, "cameras")
     if len(cameras) > limits.cameras:
         raise MessageTooLarge(f"cameras: got {len(cameras)}, the limit is {limits.cameras}")
 
-    kind = robot.get("camera_data_type", RAW)
+    image_format = robot.get("camera_data_type", RAW)
     obs = Obs()
     for name, image in cameras.items():
-        obs.cameras[prefix + name] = _image(image, kind, name, budget, segments)
+        obs.cameras[prefix + name] = _image(image, image_format, name, budget, segments)
     for name, value in _mapping(robot.get("info") or {}, "info").items():
         obs.info[prefix + name] = value
-    for name in _PARTS:
+    for name in _STATE_NAMES:
         vector = robot.get(name)
         if vector is not None:
             obs.state[prefix + name] = _vector(vector, name, limits)
@@ -219,7 +261,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
 
 def _vector(value: Any, name: str, limits: MessageLimits) -> np.ndarray:
     """Return a part of the state, a list or an array of numbers, as (D,) float32."""
-    if isinstance(value, list) and all(is_number(x) for x in value):
+    if isinstance(value, list) and all(map(is_number, value)):
         value = np.asarray(value, np.float32)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise InvalidObservation(f"{name}: got {type(value).__name__}, want (D,) float32")
@@ -230,15 +272,19 @@ def _vector(value: Any, name: str, limits: MessageLimits) -> np.ndarray:
     return value.astype(np.float32).reshape(-1)
 
 
-def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments) -> np.ndarray:
-    """Return a camera's image, (H, W, 3) uint8; of several frames, (N, H, W, 3), the last one."""
+def _image(
+    image: Any, image_format: Any, name: str, budget: Budget, segments: Segments
+) -> np.ndarray:
+    """Return the image of a camera, (H, W, 3) uint8; of several frames, (N, H, W, 3), the last
+    one.
+    """
     limits = budget.limits
-    if kind == JPEG:
+    if image_format == JPEG:
         file = json_numpy.decode_base64(image, f"camera {name[:40]!r}")
         [frame] = decode_files([file], budget, [name])
-    elif kind == SHARED:
+    elif image_format == SHARED:
         frame = _shared(_mapping(image, f"camera {name[:40]!r}"), budget, segments)
-    elif kind == RAW:
+    elif image_format == RAW:
         if not isinstance(image, np.ndarray):
             raise InvalidObservation(
                 f"camera {name[:40]!r}: got {type(image).__name__}, want an array"
@@ -246,7 +292,7 @@ def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments)
         frame = image
     else:
         raise MalformedMessage(
-            f"camera_data_type: got {shown(kind)}, want {RAW!r}, {JPEG!r} or {SHARED!r}"
+            f"camera_data_type: got {shown(image_format)}, want {RAW!r}, {JPEG!r} or {SHARED!r}"
         )
 
     if frame.ndim == 4 and len(frame):
@@ -263,15 +309,12 @@ def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments)
 
 
 def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> np.ndarray:
+    """Return a copy of an image in the client's shared memory."""
     _require_known(payload, {"shm_name", "shape", "dtype"}, "shared memory")
     name, shape = payload.get("shm_name"), payload.get("shape")
     if not isinstance(name, str) or payload.get("dtype", "uint8") != "uint8":
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
-    if not (
-        isinstance(shape, list)
-        and 0 < len(shape) <= 4
-        and all(type(n) is int and n > 0 for n in shape)
-    ):
+    if not _is_shape(shape):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
 
     size = math.prod(shape)
@@ -283,7 +326,15 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)
 
 
+def _is_shape(value: object) -> TypeGuard[list[int]]:
+    """Return whether a value is a list of one to four sizes."""
+    if not isinstance(value, list) or not 0 < len(value) <= 4:
+        return False
+    return all(type(size) is int and size > 0 for size in value)
+
+
 def _instruction(value: Any, limits: MessageLimits) -> str | None:
+    """Return an instruction, which may be missing."""
     if value is not None and not isinstance(value, str):
         raise MalformedMessage(f"instruction: got {type(value).__name__}, want text")
     if value is not None and len(value) > limits.text:
@@ -294,28 +345,30 @@ def _instruction(value: Any, limits: MessageLimits) -> str | None:
 
 
 def _mapping(value: Any, path: str) -> dict[str, Any]:
+    """Return a JSON object; raise `MalformedMessage` for anything else."""
     if not isinstance(value, dict):
         raise MalformedMessage(f"{path}: got {type(value).__name__}, want an object")
     return value
 
 
-def _require_known(value: Mapping[str, Any], known: set[str], path: str) -> None:
-    unknown = value.keys() - known
+def _require_known(value: Mapping[str, Any], known_keys: set[str], path: str) -> None:
+    """Raise `MalformedMessage` if an object has other keys."""
+    unknown = value.keys() - known_keys
     if unknown:
         raise MalformedMessage(
-            f"{path}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}"
+            f"{path}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known_keys)}"
         )
 
 
 # The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and their
 # results.
 #
-# The server sends a reference to its root once; calls consist of that reference and the name of a
+# The server sends a reference to its root once; a call consists of this reference and the name of a
 # method. No object of this process is offered to the server, which returns text, a truth value, or
 # an error.
 
 _ACTION_LEVELS = 4  # levels of nesting above an action: reply, acts, step, robot
-_ERROR = 2000  # characters of an error that are kept
+_ERROR = 2000  # most characters of an error that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,6 +379,7 @@ class RemoteError:
 
 
 def get_root(sequence: int) -> bytes:
+    """Return the frame that requests the server's root."""
     return rpyc.request(sequence, rpyc.Handler.GETROOT, (rpyc.VALUE, ()))
 
 
@@ -336,8 +390,16 @@ def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes
 
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:
-    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is
-    not a reply.
+    """Read a reply.
+
+    Args:
+        body: The body of a frame, after the header.
+        compressed: Whether the message is compressed.
+        limit: Largest size of the message after decompression, bytes.
+
+    Returns:
+        The sequence number of the request, and the value or a `RemoteError`; None if the message is
+        not a reply.
     """
     message = rpyc.read_reply(body, compressed, limit)
     if message is None:
@@ -353,8 +415,10 @@ def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[
 
 
 def write_observation(observation: Mapping[str, Any]) -> str:
-    """Return the argument of `act`: the instruction, and each robot's cameras, state and
-    gripper, (1,).
+    """Return the argument of the method `act`.
+
+    Args:
+        observation: The instruction, and the cameras, state and gripper, (1,), of each robot.
     """
     robots = {}
     for name, robot in observation.items():
@@ -371,27 +435,32 @@ def write_observation(observation: Mapping[str, Any]) -> str:
             "tquat": robot.get("tquat"),
             "info": dict(robot.get("info", {})),
         }
-    return json_numpy.dumps(
-        {
-            "obs": robots,
-            "language_instruction": observation.get("language_instruction"),
-            "goal_image": None,
-            "goal_image_data_type": "raw",
-        }
-    )
+    document = {
+        "obs": robots,
+        "language_instruction": observation.get("language_instruction"),
+        "goal_image": None,
+        "goal_image_data_type": "raw",
+    }
+    return json_numpy.dumps(document)
 
 
 def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
-    """Return the actions in the reply to `act` by robot, each (H, D); a gripper is the last
-    column, 1 = open.
+    """Read the result of the method `act`.
+
+    Args:
+        text: The result, JSON.
+        limits: The limits of its size and content.
+
+    Returns:
+        The actions of each robot, (H, D); the last column is the gripper, 1 = open, if there is
+        one.
+
+    Raises:
+        MalformedMessage: The text is something else.
     """
     document = json_numpy.loads(text, limits, _ACTION_LEVELS)
     steps = document.get("acts") if isinstance(document, dict) else None
-    if (
-        not isinstance(steps, list)
-        or not steps
-        or not all(isinstance(step, dict) and step for step in steps)
-    ):
+    if not _are_steps(steps):
         raise MalformedMessage(
             "vlagents: want `acts`, a list of one step or more, with the robots of each"
         )
@@ -409,7 +478,15 @@ def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str,
     return actions
 
 
+def _are_steps(value: object) -> TypeGuard[list[dict[str, Any]]]:
+    """Return whether a value is a list of steps, each with at least one robot."""
+    if not isinstance(value, list) or not value:
+        return False
+    return all(isinstance(step, dict) and step for step in value)
+
+
 def _row(robot: str, act: Any) -> np.ndarray:
+    """Return the action of a robot in a step, with the gripper as the last number."""
     action = act.get("action") if isinstance(act, dict) else None
     if isinstance(action, list) and all(map(is_number, action)):
         action = np.asarray(action)
