@@ -758,7 +758,7 @@ def _grpc_head(stream: int, method: str, *, is_complete: bool = True) -> bytes:
         ":path": f"/{lerobot.SERVICE}/{method}",
         ":authority": "x",
         "content-type": "application/grpc",
-        "te": "trailers",
+        "te": "trailers",  # codespell:ignore te
     }
     fields = b""
     for name, value in headers.items():

@@ -61,7 +61,7 @@ class OnGpu(Agent):
         )
 
 
-class OwnLoading(OnGpu):
+class SelfLoading(OnGpu):
     """Loads parameters by itself."""
 
     def load_parameters(self, values: Any) -> None:
@@ -163,7 +163,7 @@ def test_a_dropped_version_gives_its_memory_back(cuda: FakeCuda) -> None:
     assert (cuda.memory.allocated, cuda.emptied) == (MODEL, 1)
 
 
-@pytest.mark.parametrize("kind", [OnGpu, OwnLoading])
+@pytest.mark.parametrize("kind", [OnGpu, SelfLoading])
 @pytest.mark.parametrize(
     ("values", "options"),
     [
@@ -204,7 +204,7 @@ def test_no_push_waits_for_an_act(
     assert pushed.agent.act(Obs()).action.tolist() == [3 if name in names else 2 for name in "abcd"]
 
 
-@pytest.mark.parametrize("kind", [OnGpu, OwnLoading])
+@pytest.mark.parametrize("kind", [OnGpu, SelfLoading])
 def test_a_push_that_reads_values_while_another_version_takes_their_place_reads_them_again(
     cuda: FakeCuda, kind: type[OnGpu], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,7 +264,7 @@ def test_a_part_of_the_values_completes_a_version_in_the_memory_of_the_host(cuda
 
 
 def test_an_agent_that_loads_parameters_itself_gets_those_of_a_version(cuda: FakeCuda) -> None:
-    pushed = Pushed(cuda, OwnLoading(cuda))
+    pushed = Pushed(cuda, SelfLoading(cuda))
     old, new = pushed.begin(follows=False), pushed.begin(follows=True)
     pushed.push(1)
     for _ in range(2):
