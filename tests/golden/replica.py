@@ -193,7 +193,7 @@ class Server:
     def do(self, what: str) -> None:
         """Something that happens to the server."""
         happens = {
-            "drains": self.engines[0].drain,
+            "drains": self.engines[0].drain_list.drain,
             "is acting": lambda: (
                 self._gate.acting.wait(20) or pytest.fail("the policy was not asked")
             ),

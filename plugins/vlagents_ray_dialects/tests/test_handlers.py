@@ -322,7 +322,7 @@ def test_a_session_over_http_goes_on_at_another_replica_with_its_state(stops: bo
 
         assert [act(0), act(0), act(0)] == [1, 2, 3]
         if stops:
-            replicas.engines[0].drain()
+            replicas.engines[0].drain_list.drain()
             assert replicas.hand_over(0) == 1
         assert [act(1), act(1)] == [4, 5]
         assert [act(1, "task 2"), act(1, "task 2")] == [1, 2]
