@@ -99,12 +99,12 @@ def shown_progress(
     debugger.
 
     Args:
-        config: The evaluation. Its Ray must be running already.
+        plan: The plan of the evaluation. Its Ray must be running already.
         live: The address of the live page; None for no page.
         goes_on: Whether further evaluations in the same folder follow.
 
     Yields:
-        The progress, for `evaluate`.
+        The progress, for `evaluate_plan`.
     """
     progress = progress_for(out) if plan.workers else LineProgress(out)
     if live is None:
@@ -162,7 +162,7 @@ def run_evaluation(
     Args:
         config: The evaluation.
         address: The Ray cluster, see `served`.
-        end_at: The time after which no episode ends, as in `evaluate`.
+        end_at: The time after which no episode ends, as in `evaluate_plan`.
         replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
         live: The host and port of the live page; None for no page.
     """
@@ -207,9 +207,9 @@ def evaluate_and_print(
     """Evaluate policies, and print the table of the results, also if the evaluation is interrupted.
 
     Args:
-        config: The evaluation, as `served` yields it.
+        plan: The plan of the evaluation, as `served` yields it.
         progress: Shows the progress.
-        end_at: The time after which no episode ends, as in `evaluate`.
+        end_at: The time after which no episode ends, as in `evaluate_plan`.
         agents: The policies that run in this process, as `served` yields them.
 
     Returns:
@@ -237,7 +237,7 @@ def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
     cases, and with status 1 if infrastructure lost an episode.
 
     Args:
-        config: The evaluation; only its cases are considered.
+        cases: The cases that this command has planned; others are not considered.
         summary: The summary of the results.
     """
     planned = {case.fingerprint for case in cases}
