@@ -1,12 +1,14 @@
-"""Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before
-they are used.
+"""The compilation of a model's cores, which are compared with the eager pass before they are used.
 
-A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions
-are fixed; it returns such a tensor, or a tuple of them. On a GPU it is captured in a CUDA graph for
-each batch size, and so is what `torch.compile` makes of it, without graph breaks; the faster graph
-is used. On a CPU there is only torch's program. All programs are made while the policy loads. A
-batch between two sizes is padded with copies of its last row, whose results are dropped; one for
-which there is no program, as its rows have another shape, or as it is too large, runs eagerly.
+A core is a function of tensors alone. The first dimension of its arguments is the batch, and their
+other dimensions are fixed. It returns such a tensor, or a tuple of them.
+
+On a GPU, a core is captured in a CUDA graph for each of a few batch sizes. The program that
+`torch.compile` makes of it, without graph breaks, is captured in a second graph, and the faster
+graph is used. On a CPU there is only torch's program. All programs are made while the policy loads.
+
+A batch between two sizes is padded with copies of its last row, whose results are dropped. A batch
+without a program runs eagerly: its rows have another shape, or it is too large.
 """
 
 from __future__ import annotations
@@ -34,10 +36,10 @@ _TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def keep_torch_programs() -> None:
-    """Keep torch's programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another
-    folder.
+    """Keep torch's programs in the user's cache, for the next start.
 
-    Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
+    If the user has set `TORCHINDUCTOR_CACHE_DIR`, nothing is changed. Torch writes its default,
+    /tmp/torchinductor_USER, into that variable when it first needs it.
     """
     chosen = Path(os.environ.get(_TORCH, "")).name
     if chosen and not chosen.startswith("torchinductor_"):
@@ -48,8 +50,9 @@ def keep_torch_programs() -> None:
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Keep JAX's programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is
-    set.
+    """Keep JAX's programs for a GPU in the user's cache, for the next start.
+
+    If the user has set `JAX_COMPILATION_CACHE_DIR`, nothing is changed.
     """
     if platform == "cpu":
         return
@@ -107,24 +110,25 @@ _EMPTY = "CUDA Graph is empty"  # in torch's warning
 
 
 class CaptureLock:
-    """Keeps acts, of which it is the context, and pushes of weights out of the captures of this
-    process.
+    """Excludes forward passes and pushes of weights while this process captures a CUDA graph.
 
-    A call that waits for a whole device ends any capture on it, with an error on both threads,
-    whatever the mode of the capture. A waiting capture goes before the next act, but waits for a
-    push without delaying acts.
+    The lock itself is the context of a forward pass. A call that waits for a whole device ends any
+    capture on that device, with an error on both threads, whatever the mode of the capture. A
+    waiting capture has priority over the next forward pass. While it waits for a push, forward
+    passes continue.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._acting: set[int] = set()  # threads
-        self._capturing = False  # or about to
-        # The context of a push, within which its thread may also act.
+        self._acting: set[int] = set()  # identifiers of threads
+        self._capturing = False  # whether a capture runs, or waits for forward passes to end
+        # The context of a push, in which its thread may also run forward passes.
         self.pushes = threading.RLock()
 
     def __enter__(self) -> None:
-        """Begin an act: wait for the end of a capture. None begins until its end; a thread
-        enters once at a time.
+        """Begin a forward pass, after the end of a running capture.
+
+        No capture begins before the pass ends. A thread may not enter twice.
         """
         with self._changed:
             self._changed.wait_for(lambda: not self._capturing)
@@ -137,7 +141,7 @@ class CaptureLock:
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes, and block new ones within this context."""
+        """Wait for running forward passes and pushes, and block new ones in this context."""
         if threading.get_ident() in self._acting:
             raise RuntimeError(
                 "a CUDA graph cannot be captured within an act; capture it in Agent.initialize"
@@ -186,33 +190,37 @@ class GraphMemory:
 
 
 class CudaGraph:
-    """A function, captured once with inputs of one shape; calls copy their inputs to where the
-    graph reads them.
+    """A function that is captured once with inputs of one shape.
 
-    It is captured here, and not by `torch.compile`, whose graphs belong to the thread that captured
-    them: a checkpoint is loaded on another thread than the one that acts with it.
+    Each call copies its inputs into the tensors from which the graph reads. The graph is not made
+    by `torch.compile`, whose graphs belong to the thread that captured them: one thread loads a
+    checkpoint, and another one runs it.
     """
 
-    replays: ClassVar[int] = 0  # of all graphs of this process
+    replays: ClassVar[int] = 0  # number of replays of all graphs of this process
 
     def __init__(
         self, function: Callable[..., Any], inputs: Sequence[Any], memory: GraphMemory | None = None
     ) -> None:
-        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if
-        that fails.
+        """Capture a function.
 
         Args:
-            function: The function. It is kept, since the graph reads its constants.
-            inputs: Tensors from which each replay reads, and to which a call copies its own.
-            memory: That of the policy's graphs; None: of this graph alone.
+            function: A function of tensors on one GPU, without other effects. It is kept, since the
+                graph reads its constants.
+            inputs: The tensors from which each replay reads, and into which a call copies its
+                inputs.
+            memory: The memory of the policy's graphs; None allocates memory for this graph alone.
+
+        Raises:
+            RuntimeError: The capture failed.
         """
         torch = require("torch")
         device = inputs[0].device
         memory = memory or GraphMemory(device)
         self._function, self._inputs = function, inputs
 
-        # The current stream is entered again, since `torch.cuda.graph` leaves its own if the
-        # capture fails.
+        # Enter the current stream again: if the capture fails, `torch.cuda.graph` leaves its
+        # stream as the current one.
         stream, current = memory.stream, torch.cuda.current_stream(device)
         with torch.cuda.device(device), torch.cuda.stream(current):
             stream.wait_stream(current)
@@ -224,7 +232,7 @@ class CudaGraph:
             self._graph = torch.cuda.CUDAGraph()
             with CAPTURES.capture(), warnings.catch_warnings(record=True) as caught_warnings:
                 warnings.simplefilter("always")
-                # Other threads still prepare acts; their calls must not end the capture.
+                # Other threads continue to prepare requests. Their calls must not end the capture.
                 with torch.cuda.graph(
                     self._graph, memory.pool, stream, capture_error_mode="thread_local"
                 ):
@@ -236,7 +244,7 @@ class CudaGraph:
             )
 
     def __call__(self, *tensors: Any) -> Any:
-        """Return the results of at most as many rows as were captured, in memory of their own."""
+        """Return copies of the results for at most as many rows as were captured."""
         rows = len(tensors[0])
         for graph_input, tensor in zip(self._inputs, tensors, strict=True):
             graph_input[:rows].copy_(tensor, non_blocking=True)
@@ -262,11 +270,11 @@ class CudaGraph:
 
 CompileMode = bool | Literal["auto", "graphs", "require"]
 
-# Errors of a row of a core's result are shares of the row's norm. Compiled sums run in another
-# order, and merged kernels keep float32 where the eager pass rounds between them. How much that
-# changes depends on the checkpoint: it is measured, as the error of the eager core with smaller
-# batches and other roundings. Torch's programs had half of it.
-_ROUNDINGS = 2.0  # largest error of a program, as a multiple of that one
+# The error of a row of a core's result is a share of the row's norm. Compiled programs add in
+# another order, and merged kernels keep float32 where the eager pass rounds. The resulting error
+# depends on the checkpoint. It is therefore compared with the error of the eager core with smaller
+# batches and other roundings, which is measured. The errors of torch's programs were half of that.
+_ROUNDINGS = 2.0  # largest accepted error of a program, as a multiple of the measured one
 _LEAST = 1e-3  # the error that is always accepted
 # The largest error that is ever accepted, by the coarsest type in which a core computes. In
 # bfloat16, ten steps of a flow of 3.5 billion parameters differ by 0.067 from the same eager pass
@@ -276,9 +284,9 @@ _SHOWN = 300  # characters of a compiler's error in the log
 # A compiled program replaces the graph of the eager core if its replay takes at most this share of
 # the time: a smaller gain may be noise, and only the graph computes as the eager pass does.
 _FASTER = 0.97
-_REPLAYS = 5  # of each, of which the shortest counts
+_REPLAYS = 5  # replays of each graph, of which the shortest is used
 
-# Tiers: the eager core, and torch's program, both in graphs on a GPU.
+# The tiers: the eager core, and torch's program. On a GPU, both are in graphs.
 _GRAPH, _COMPILED = "CUDA graph", "torch.compile"
 
 
@@ -288,20 +296,21 @@ class Compilation:
     backend: ClassVar[str] = "inductor"  # of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
-        """Begin to compile: False: nothing, "graphs": CUDA graphs of eager cores, True:
-        `torch.compile` also.
+        """Set what is compiled.
 
-        "require" is True with an error for each failure. "auto" stays open until the policy is
-        loaded.
+        Args:
+            mode: False compiles nothing. "graphs" captures eager cores in CUDA graphs. True also
+                uses `torch.compile`. "require" is like True, and each failure is an error. "auto"
+                is resolved when the policy is loaded.
         """
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        # The tier of the parts that a core calls now; None: outside of `parts`.
+        # The tier of the parts that a core calls; None outside of the context `parts`.
         self.tier_of_parts: str | None = None
         self.cores: list[Core] = []
-        self.memories: dict[Any, GraphMemory] = {}  # by device
-        self.graph_bytes = 0  # which CUDA graphs took on all devices
+        self.memories: dict[Any, GraphMemory] = {}  # device -> memory of its graphs
+        self.graph_bytes = 0  # memory of the CUDA graphs on all devices
         if mode is True or mode == "require":
             keep_torch_programs()
 
@@ -316,13 +325,13 @@ class Compilation:
 
         Args:
             name: The core's name in messages.
-            function: The core. Its arguments are tensors on the model's device. It must read
-                nothing that changes but the model's weights, whose values may change.
-            rows: The most rows of a call, if that does not follow from the batch size, such as
-                those of a planner's candidates: the core then has one program, for so many rows.
-                None: those of each batch size.
-            parts: The cores that the function calls. It is then one CUDA graph with all of them; on
-                a CPU, only they are compiled.
+            function: The core. Its arguments are tensors on the model's device. Of all that may
+                change, it may read only the values of the model's weights.
+            rows: The largest number of rows of a call, if that does not follow from the batch size,
+                as for the candidates of a planner. The core then has one program, for that number
+                of rows. None makes a program for each batch size.
+            parts: The cores that the function calls. It becomes one CUDA graph with all of them. On
+                a CPU, only the parts are compiled.
         """
         if not self.mode:
             return function
@@ -330,16 +339,15 @@ class Compilation:
         return self.cores[-1]
 
     def add_size(self, size: int, forward: Callable[[], object]) -> None:
-        """Make the programs of all cores for a batch size, and compare them twice with the eager
-        pass.
+        """Make the programs of all cores for a batch size.
 
-        Sizes are added from the largest to the smallest, so that graphs of smaller ones fit into
-        the memory of larger ones. A core whose programs all fail uses that of the next larger size,
-        or runs eagerly.
+        Each program is compared twice with the eager pass. Sizes are added from the largest to the
+        smallest, so that the graphs of smaller sizes fit into the memory of larger ones. A core
+        whose programs all fail uses the program of the next larger size, or runs eagerly.
 
         Args:
             size: The number of rows.
-            forward: Runs a forward pass of that many rows, of other values each time.
+            forward: Runs a forward pass with that many rows, and with other values each time.
 
         Raises:
             ConfigError: A program failed, and the mode is "require".
@@ -373,8 +381,10 @@ class Compilation:
 
     @contextmanager
     def parts(self, tier: str) -> Iterator[None]:
-        """Let cores call a tier of their parts within the context: eager functions, or torch's
-        programs.
+        """Let cores call a tier of their parts in the context.
+
+        Args:
+            tier: `_GRAPH` for eager functions, or `_COMPILED` for torch's programs.
         """
         self.tier_of_parts = tier
         try:
@@ -383,8 +393,9 @@ class Compilation:
             self.tier_of_parts = None
 
     def drop_graphs(self) -> None:
-        """Free all CUDA graphs, since they read weights at fixed addresses; `add_size` makes
-        them again.
+        """Free all CUDA graphs, which read weights at fixed addresses.
+
+        `add_size` makes them again.
         """
         if not self.memories:
             return
@@ -396,7 +407,7 @@ class Compilation:
 
 
 class Core:
-    """A core with its programs."""
+    """A core and its programs."""
 
     def __init__(
         self,
@@ -408,11 +419,11 @@ class Core:
     ) -> None:
         self.name = name
         self._owner, self._function, self._rows, self._parts = owner, function, rows, parts
-        # Programs by rows and tier; only one tier is left after `settle`.
+        # Number of rows -> tier -> program; after `settle` there is one tier.
         self._programs: dict[int, dict[str, Any]] = {}
-        # Shapes and types of the rows of arguments, for each program.
+        # Number of rows -> shapes and types of the rows of each argument.
         self._kinds: dict[int, list[Any]] = {}
-        self._compiled: dict[int, Callable[..., Any]] = {}  # torch's programs, by rows
+        self._compiled: dict[int, Callable[..., Any]] = {}  # number of rows -> torch's program
         # Inputs of the graph with the most rows; other graphs read their first rows.
         self._graph_inputs: list[Any] = []
         # Failures at the batch size whose programs are being made.
@@ -423,7 +434,7 @@ class Core:
         if not owner.mode or (self._parts and tensors[0].device.type != "cuda"):
             return self._function(*tensors)
 
-        # A core of which this one is a part is being made.
+        # The program of another core, of which this core is a part, is being made.
         if owner.tier_of_parts is not None:
             if owner.tier_of_parts == _COMPILED:
                 return self._compiled[rows](*map(_of_one_kind, tensors))
@@ -452,8 +463,9 @@ class Core:
         return next(iter(self._programs.get(self._rows or size, ())), None)
 
     def drop_graphs(self) -> None:
-        """Free the graphs, and their inputs; torch's programs read no fixed addresses, and are
-        kept.
+        """Free the graphs and their inputs.
+
+        Torch's programs are kept, since they do not read fixed addresses.
         """
         self._programs.clear()
         self._kinds.clear()
@@ -484,9 +496,7 @@ class Core:
         return failures
 
     def _compared(self, tensors: Sequence[Any]) -> Any:
-        """Return the eager result, once the programs are made; keep those whose results are near
-        it.
-        """
+        """Make the programs, keep those whose results are correct, and return the eager result."""
         eager_result, size = self._function(*tensors), len(tensors[0])
         is_first = size not in self._programs
         if is_first:
@@ -516,18 +526,17 @@ class Core:
     def _tiers(self, size: int, device: Any) -> list[str]:
         """Return the tiers of which programs are made for a batch size."""
         tiers = [_GRAPH] if device.type == "cuda" else []
-        parts_compiled = all(_COMPILED in part._programs.get(size, ()) for part in self._parts)
-        if self._owner.mode != "graphs" and parts_compiled:
+        are_parts_compiled = all(_COMPILED in core._programs.get(size, ()) for core in self._parts)
+        if self._owner.mode != "graphs" and are_parts_compiled:
             tiers.append(_COMPILED)
         return tiers
 
     def _limit(self, tensors: Sequence[Any], eager_result: Any) -> float:
-        """Return the largest error of a right program, as measured with the eager core on the same
-        inputs.
+        """Return the largest error that a correct program may have on these inputs.
 
-        The core runs with the first and the second half of the batch, and with other roundings.
-        Another composition alone often changes nothing, since the same kernels compute each row as
-        before.
+        It is measured with the eager core, which runs with the first and the second half of the
+        batch and with other roundings. Smaller batches alone often change nothing, since the same
+        kernels compute each row in the same way.
         """
         from vlagents_ray.policies.rounding import OtherRounding
 
@@ -546,8 +555,8 @@ class Core:
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
 
-        It is made with other values than those of a comparison: a CUDA graph that missed a part of
-        the core returns the results of the values with which it was captured.
+        It is made with other values than those of the comparison. A CUDA graph that has missed some
+        of the core's work would otherwise return correct results there: those of its capture.
         """
         function, owner = self._function, self._owner
         size, device = len(tensors[0]), tensors[0].device
@@ -566,8 +575,9 @@ class Core:
             return CudaGraph(function, inputs, owner.memories[device])
 
     def _inputs(self, tensors: Sequence[Any]) -> list[Any]:
-        """Return zeros of these shapes, in the memory of the inputs of more rows if there are
-        such.
+        """Return zeros of these shapes.
+
+        They use the memory of the inputs of larger graphs, if those have the same rows.
         """
         size = len(tensors[0])
         fits = (
@@ -586,7 +596,7 @@ class Core:
         def core(*tensors: Any) -> Any:
             return function(*tensors)
 
-        # Torch counts the programs of each code object, and gives up after eight of them.
+        # Torch limits the programs of a code object to eight. The name makes it another one.
         core.__code__ = core.__code__.replace(
             co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_")
         )
@@ -598,16 +608,16 @@ class Core:
 
 
 def _of_one_kind(tensor: Any) -> Any:
-    """Return the tensor as programs were made for it: contiguous, and an inference tensor in
-    inference mode.
+    """Return a tensor of the kind for which programs are made.
 
-    `torch.compile` makes another program for tensors of another kind.
+    It is contiguous, and it is an inference tensor only if the argument is one. `torch.compile`
+    makes another program for tensors of another kind.
     """
     return tensor.contiguous() if tensor.is_inference() else tensor.clone().contiguous()
 
 
 def _padded(tensor: Any, size: int) -> Any:
-    """Return the tensor with its last row again, up to `size` rows."""
+    """Return a tensor whose last row is repeated, so that it has `size` rows."""
     missing = size - len(tensor)
     if not missing:
         return tensor
@@ -615,6 +625,7 @@ def _padded(tensor: Any, size: int) -> Any:
 
 
 def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
+    """Return the shape of a row and the type of each tensor."""
     return [(tensor.shape[1:], tensor.dtype) for tensor in tensors]
 
 
@@ -624,8 +635,10 @@ def _each(result: Any) -> Sequence[Any]:
 
 
 def _largest_error(actual: Any, expected: Any) -> float:
-    """Return the largest relative error of a row, by its Euclidean norm, among all tensors of
-    the results; NaN if one of them is NaN.
+    """Return the largest relative error of a row in the results of a core.
+
+    The error is the Euclidean norm of the difference, divided by the norm of the expected row. It
+    is NaN if a value is NaN.
     """
     errors = []
     for actual_rows, expected_rows in zip(_each(actual), _each(expected), strict=True):

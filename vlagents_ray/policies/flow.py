@@ -1,13 +1,13 @@
 """Flow matching in random steps, so that an action chunk has a log-probability (Flow-SDE).
 
-A flow's steps from noise to actions are deterministic, and the density of its actions is not known.
-The stochastic differential equation with the same marginal distributions at each time (Song et al.
-2021, arXiv 2011.13456) makes each step a normal distribution, and the steps a Markov chain whose
-log-probability is a sum. Learners that fine-tune flows train with it: Flow-GRPO (arXiv 2505.05470),
-whose noise schedule this is, and πRL (arXiv 2510.25889).
+The steps of a flow from noise to actions are deterministic, and the density of its actions is not
+known. A stochastic differential equation has the same marginal distributions at each time (Song et
+al. 2021, arXiv 2011.13456). With it, each step is a normal distribution, and the steps are a Markov
+chain whose log-probability is a sum. Learners that fine-tune flows use it: Flow-GRPO (arXiv
+2505.05470), from which the noise schedule is taken, and πRL (arXiv 2510.25889).
 
-Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions. The
-functions take arrays of any library, and are differentiable there.
+Flow time is that of openpi: 1 is noise, 0 is the actions, and the velocity is noise minus actions.
+The functions accept arrays of any library, and are differentiable in it.
 """
 
 from __future__ import annotations
@@ -28,14 +28,12 @@ from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
-OFFERED = ("logprob", "entropy", "replay")  # of chunks from random steps
+OFFERED = ("logprob", "entropy", "replay")  # outputs of chunks from random steps
 _LOG_2_PI = math.log(2 * math.pi)
 
 
 Change = Callable[[Any, Any, float], Any]
-"""The velocity (B, H, D), noisy actions (B, H, D) and flow time of a step -> the velocity that
-it takes.
-"""
+"""A change of a step: velocity (B, H, D), noisy actions (B, H, D) and flow time -> new velocity."""
 
 
 def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *changes: Change) -> Any:
@@ -64,10 +62,10 @@ def normal_logprob(values: Any, mean: Any, std: float) -> Any:
 
 
 def step_std(step: int, steps: int, noise_level: float) -> float:
-    """Return the standard deviation of each number after a step.
+    """Return the standard deviation of each value after a step.
 
-    It is a * sqrt(t / (1 - t) / steps) for the noise level a at the time t = 1 - step / steps, with
-    the time of the next step for 1 - t in the first one, where that is 0.
+    For the noise level a and the time t = 1 - step / steps, it is a * sqrt(t / (1 - t) / steps).
+    In the first step, 1 - t would be 0, and the value of the second step is used for it.
     """
     return noise_level * math.sqrt((steps - step) / max(step, 1) / steps)
 
@@ -77,10 +75,10 @@ def step_mean(actions: Any, velocity: Any, step: int, steps: int, noise_level: f
 
     Args:
         actions: The noisy actions before the step, (B, H, D).
-        velocity: The flow's velocity there, (B, H, D).
-        step: The number of the step, from 0.
-        steps: The number of all steps.
-        noise_level: The share of randomness a in the steps; 0 for the deterministic flow.
+        velocity: The flow's velocity at these actions, (B, H, D).
+        step: The index of the step, from 0.
+        steps: The number of steps.
+        noise_level: The randomness of the steps; 0 for the deterministic flow.
 
     Returns:
         The mean, (B, H, D).
@@ -92,19 +90,18 @@ def step_mean(actions: Any, velocity: Any, step: int, steps: int, noise_level: f
 
 
 def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_level: float) -> Any:
-    """Return the log-probability of the steps from noise to actions, given the noise, under a
-    learner's weights.
+    """Return the log-probability of a chain of steps under a learner's weights, given the noise.
 
     Args:
         velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time
             in (0, 1].
         chain: The noisy actions before and after each step, (B, K + 1, H, D), in the model's units:
-            `replay["chain"]` of B acts or samples.
+            `replay["chain"]` of B answers or samples.
         noise_level: `replay["noise_level"]`.
 
     Returns:
-        The log-probability of each number, summed over the steps, (B, H, D), nats. That of an act
-        is of the rows and numbers that it returns: `[:, :execute, :action_dim]`.
+        The log-probability of each value, summed over the steps, (B, H, D), nats. The rows and
+        values that an answer returns are `[:, :execute, :action_dim]`.
     """
     steps = chain.shape[1] - 1
     total: Any = 0.0
@@ -116,8 +113,9 @@ def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_le
 
 
 def chain_entropy(steps: int, noise_level: float) -> float:
-    """Return the entropy of one number of a chain, given the noise, nats: it depends on the
-    noise level alone.
+    """Return the entropy of one value of a chain, given the noise, nats.
+
+    It depends only on the number of steps and on the noise level.
     """
     entropy = 0.0
     for step in range(steps):
@@ -126,11 +124,10 @@ def chain_entropy(steps: int, noise_level: float) -> float:
 
 
 class RandomSteps:
-    """The random steps of the rows of a batch with requested values; the others keep their
-    velocity.
+    """The random steps of the rows of a batch for which outputs are requested.
 
-    Each row draws from its session's generator, so that neighbours do not matter. Arrays are torch
-    tensors.
+    The other rows keep their velocity. Each row draws from the generator of its session, so that
+    the other rows of a batch do not matter. Arrays are torch tensors.
     """
 
     def __init__(
@@ -143,19 +140,20 @@ class RandomSteps:
         """Draw the noise of all steps.
 
         Args:
-            rows: Those of the batch.
-            shape: The number of steps K, rows and numbers of a chunk, (K, H, D).
+            rows: The rows of the batch.
+            shape: The number of steps, of rows of a chunk and of values of a row, (K, H, D).
             noise_level: As for `step_mean`.
-            convert: Makes a tensor of an array, on the model's device.
+            convert: Makes a tensor on the model's device from an array.
         """
         self._wants = {i: row.want for i, row in enumerate(rows) if row.want}
         self._steps, self._level = shape[0], noise_level
-        # (K, E, H, D)
+        # The noise of the E requested rows, (K, E, H, D).
         self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._wants], axis=1))
-        # (E,); a list would be copied to the device at each step.
+        # The indices of these rows, (E,). A list would be copied to the device in each step.
         self._index = convert(np.array(list(self._wants)))
-        self._chain: list[Any] = []  # noisy actions (E, H, D) at first, and after each step
-        self._means: list[Any] = []  # of those after each step
+        # Noisy actions (E, H, D) before the first step and after each step.
+        self._chain: list[Any] = []
+        self._means: list[Any] = []  # means of the noisy actions after each step
 
     @classmethod
     def for_rows(
@@ -165,36 +163,40 @@ class RandomSteps:
         noise_level: float,
         convert: Callable[[np.ndarray], Any],
     ) -> RandomSteps | None:
-        """Return the random steps of a batch; None if there are none, in which case nothing is
-        drawn.
+        """Return the random steps of a batch.
+
+        Returns:
+            The steps; None if no row requests outputs, in which case nothing is drawn.
         """
         if not noise_level or not any(row.want for row in rows):
             return None
         return cls(rows, shape, noise_level, convert)
 
     def change(self, velocity: Any, actions: Any, time: float) -> Any:
-        """Return the velocity (B, H, D) of the next step, which moves the requested rows to
-        drawn actions.
-        """
+        """Return the velocity (B, H, D) with which the next step reaches the drawn actions."""
         step, before = len(self._means), actions[self._index]
         mean = step_mean(before, velocity[self._index], step, self._steps, self._level)
         drawn = mean + step_std(step, self._steps, self._level) * self._draws[step]
         change = (before - drawn) * self._steps
         self._chain = self._chain or [before]
-        self._chain.append(before - change / self._steps)  # rounded as the actions will be
+        # Computed as `follow` computes the actions, so that the rounding is the same.
+        self._chain.append(before - change / self._steps)
         self._means.append(mean)
         return velocity.index_copy(0, self._index, change.to(velocity.dtype))
 
     def outputs(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return the outputs that rows request, by the index of the row, after the last step.
+        """Return the requested outputs after the last step.
 
         Args:
-            execute: How many rows of a chunk are used; None: all.
-            dim: How many numbers of an action are the robot's; None: all.
+            execute: The number of rows of a chunk that are used; None uses all.
+            dim: The number of values of an action that are the robot's; None uses all.
+
+        Returns:
+            Index of the row -> name of the output -> value.
         """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
-        # A single copy from the device, for which this thread waits.
+        # Make a single copy from the device, for which this thread waits.
         *chain, all_logprobs = fetch(require("torch").stack([*self._chain, total]))
         logprobs = all_logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprobs[0].size
@@ -213,18 +215,18 @@ class RandomSteps:
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """The plan that each row of a batch of chunks follows, as arrays of the library in which the
-    model is written.
-    """
+    """The plan that each chunk of a batch follows, as arrays of the model's library."""
 
     plan: Any  # (B, H, D) in the model's units, i.e. normalised; zeros where there is no plan
-    frozen: Any  # (B, H, 1): 1.0 where a row will have been executed, else 0.0
-    weight: Any  # (B, H, 1) in [0, 1]: how closely a later row follows
+    frozen: Any  # (B, H, 1), 1.0 for rows that will have been executed, otherwise 0.0
+    weight: Any  # (B, H, 1) in [0, 1], how closely a later row follows the plan
 
     @classmethod
     def for_rows(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
-        """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no
-        row has any.
+        """Return the guide from the rows' `delay` and `leftover`, in the model's units.
+
+        Returns:
+            The guide; None if no row has a leftover plan.
         """
         if all(row.leftover is None for row in rows):
             return None
@@ -240,8 +242,8 @@ class Guide:
             plan[i, : len(leftover), : leftover.shape[1]] = leftover
             frozen[i, :delay] = 1.0
 
-            # The paper's soft mask: from about 1 after the frozen rows down to 0 where the plan
-            # ends.
+            # The soft mask of real-time chunking: it falls from about 1 after the frozen rows to 0
+            # where the plan ends.
             later_rows = np.arange(delay, horizon, dtype=np.float32)
             share = np.clip((len(leftover) - later_rows) / (len(leftover) - delay + 1), 0.0, 1.0)
             weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
@@ -252,17 +254,16 @@ class Guide:
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
     def insert_frozen(self, noise: Any) -> Any:
-        """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was
-        trained with prefixes.
+        """Return noise (B, H, D) in which the frozen rows are those of the plan.
 
-        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `frozen`),
-        and continues them without any correction (training-time action conditioning,
-        https://arxiv.org/abs/2512.05964).
+        This is for policies that were trained with prefixes. They read these rows as actions, at
+        flow time 0 (`frozen` of `FlowPasses.sample`), and continue them without a correction
+        (training-time action conditioning, https://arxiv.org/abs/2512.05964).
         """
         return self.frozen * self.plan + (1.0 - self.frozen) * noise
 
     def keep(self, velocity: Any, actions: Any, time: float) -> Any:
-        """Return the velocity (B, H, D) that leaves the frozen rows as they are."""
+        """Return the velocity (B, H, D), which is 0 for the frozen rows."""
         return (1.0 - self.frozen) * velocity
 
     def steer(
@@ -276,12 +277,18 @@ class Guide:
         limit: float,
         lower: Callable[[Any, float], Any] = min,
     ) -> Any:
-        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of a time of a
-        flow from `noise`.
+        """Return the velocity (B, H, D), corrected towards the plan.
 
-        The gain of the correction of a later row is at most `limit`, and at most the number of
-        steps: with that, one step goes to the end. `lower` returns the smaller of two numbers, for
-        libraries whose `time` is not a plain number.
+        Args:
+            velocity: The velocity of the flow, (B, H, D).
+            actions: The noisy actions, (B, H, D).
+            time: The flow time.
+            noise: The noise with which the flow began, (B, H, D).
+            steps: The number of steps. It limits the gain, since with that gain a single step
+                reaches the plan.
+            limit: The largest gain of the correction.
+            lower: Returns the smaller of two numbers, for libraries whose `time` is not a plain
+                number.
         """
         spread = (1.0 - time) ** 2 + time**2
         gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
@@ -290,21 +297,22 @@ class Guide:
 
 
 class FlowPasses(abc.ABC):
-    """The passes of a model: one over its inputs, and one for each step of the flow, or one for
-    all steps.
+    """The forward passes of a model: one over its inputs, and one for each step of the flow.
+
+    The steps may also be compiled as one pass.
     """
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Use the passes of a model, in their compiled form if there is one."""
         self.model = model
         self.adapters = LoraAdapters()  # of the policy
-        # With the functions of its authors' own passes.
+        # The module that defines the model, which has the functions of its authors' passes.
         self.module = sys.modules[type(model).__module__]
         self._compilation = compilation
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
-        self._flows: dict[int, Callable[..., Any]] = {}  # whole flows, by their steps
-        self.by_row = False  # whether `velocity` takes a time for each row of a chunk, (B, H)
+        self._flows: dict[int, Callable[..., Any]] = {}  # number of steps -> whole flow
+        self.by_row = False  # whether `velocity` accepts a time for each row of a chunk, (B, H)
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
         """Return the input of `encode` for images (P, 3, H, W)."""
@@ -314,15 +322,18 @@ class FlowPasses(abc.ABC):
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
     ) -> tuple[Any, Any]:
-        """Return keys and values, or all else that `velocity` reads of inputs, and the mask (P, L)
-        of the tokens that are there.
+        """Encode the inputs of P observations.
 
         Args:
-            tokens: Of the instruction, (P, T) int64.
-            mask: (P, T) bool, which of them are no padding.
-            cameras: (P, N) bool, which of the images are there.
-            state: (P, S).
-            images: What `encode_images` returned for the N images.
+            tokens: The tokens of the instruction, (P, T) int64.
+            mask: Whether each of these tokens is no padding, (P, T) bool.
+            cameras: Whether each image is present, (P, N) bool.
+            state: The state vector, (P, S).
+            images: The results of `encode_images` for the N images.
+
+        Returns:
+            The keys and values, or whatever else `velocity` reads of the inputs; and the mask of
+            the tokens that are present, (P, L).
         """
 
     @abc.abstractmethod
@@ -331,9 +342,9 @@ class FlowPasses(abc.ABC):
 
         Args:
             encoded: The first result of `encode`, for B rows.
-            present: The second one, the mask (B, L) of its tokens.
-            state: (B, S).
-            actions: (B, H, D).
+            present: The second result of `encode`, the mask (B, L) of the tokens.
+            state: The state vector, (B, S).
+            actions: The noisy actions, (B, H, D).
             times: The flow times (B,), or (B, H) with `by_row`.
         """
 
@@ -349,19 +360,22 @@ class FlowPasses(abc.ABC):
         dim: int | None,
         convert: Callable[[np.ndarray], Any],
     ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return actions (B, H, D) in the model's units, and the outputs that rows request, by the
-        index of the row.
+        """Compute the chunks of a batch, with plans and random steps.
 
         Args:
-            rows: Those of the batch, with plans in the model's units.
+            rows: The rows of the batch, with plans in the model's units.
             inputs: The first five arguments of `sample`.
-            owners: The observation of each row.
-            noise: Drawn for each row, (B, H, D), before that of the steps, which only some rows
-                draw.
+            owners: The index of the observation of each row.
+            noise: The noise of each row, (B, H, D). It is drawn before the noise of the steps,
+                which only some rows draw.
             steps: The number of steps.
-            config: The policy's `noise_level`, `guidance` and `execute`.
-            dim: How many of the numbers are the robot's; None: all.
-            convert: Makes a tensor of an array, on the model's device.
+            config: Defines `noise_level`, `guidance` and `execute` of the policy.
+            dim: The number of values of an action that are the robot's; None uses all.
+            convert: Makes a tensor on the model's device from an array.
+
+        Returns:
+            Actions (B, H, D) in the model's units, and the requested outputs by the index of the
+            row.
         """
         _, horizon, width = noise.shape
         start = convert(noise)
@@ -409,25 +423,25 @@ class FlowPasses(abc.ABC):
         """Return actions (B, H, D).
 
         Args:
-            images: Of P observations, (P, 3, H, W) for each of N cameras.
-            cameras: Which of them are there, (P,) bool for each camera.
+            images: The images of P observations, (P, 3, H, W) for each of N cameras.
+            cameras: Whether each image is present, (P,) bool for each camera.
             tokens: See `encode`.
             mask: See `encode`.
-            state: See `encode`; None for a model that has it in its prompt.
+            state: See `encode`; None for a model whose prompt contains the state.
             noise: (B, H, D).
-            owners: The observation of each row.
-            steps: Of the flow.
+            owners: The index of the observation of each row.
+            steps: The number of steps of the flow.
             changes: See `follow`.
-            fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
-            frozen: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H,
-                1), 1.0 or 0.0.
-            states: Of a memory, from LeRobot's π0.5 after 0.6.1, and None, as models with a memory
-                are refused.
+            fingerprints: The adapter of each row, see `Row.adapter`; empty if no row has one.
+            frozen: With `by_row`, 1.0 for the rows of chunks that are already actions, at time 0,
+                otherwise 0.0, (B, H, 1).
+            states: The states of a memory, which LeRobot's π0.5 passes since 0.6.1. It is None,
+                since models with a memory are rejected.
             state_masks: As `states`.
         """
         torch = require("torch")
         observations = len(mask)
-        # The adapter of an observation is that of the first of its rows.
+        # An observation is encoded with the adapter of its first row.
         encoding_adapters: list[str] = []
         if fingerprints:
             first_rows = [list(owners).index(owner) for owner in range(observations)]
@@ -449,7 +463,7 @@ class FlowPasses(abc.ABC):
             return flow(encoded, present, state, noise)
 
     def _whole_flow(self, steps: int) -> Callable[..., Any]:
-        """Return the flow of all steps without changes, which is one core."""
+        """Return the flow without changes, whose steps are one core."""
         if steps not in self._flows:
             function = partial(self._flow, steps, (), None)
             self._flows[steps] = self._compilation.core("flow", function, parts=[self._velocity])
@@ -465,8 +479,9 @@ class FlowPasses(abc.ABC):
         state: Any,
         noise: Any,
     ) -> Any:
-        """Return actions (B, H, D): without changes, whose values differ for each batch, all
-        steps are one core.
+        """Return actions (B, H, D).
+
+        Without changes, whose values differ for each batch, this function is a core.
         """
         float32 = require("torch").float32
 

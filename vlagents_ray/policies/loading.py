@@ -22,17 +22,17 @@ class LoadingReport:
     """The report of one policy."""
 
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
-    batch_sizes: Sequence[int]  # the server's, ascending
+    batch_sizes: Sequence[int]  # the batch sizes of the server, ascending
     # Parts that run without compilation, although `compile` is set.
     uncompiled: list[str] = field(default_factory=list)
-    # Of the models, see `accelerator.torch_device`.
+    # Descriptions of the models' devices, see `accelerator.torch_device`.
     devices: list[dict[str, Any]] = field(default_factory=list)
-    most_rows: int | None = None  # of a forward pass, if memory limits it
-    # Whether the policy itself pads batches to its sizes, with fewer rows than a server knows of.
+    most_rows: int | None = None  # largest number of rows of a forward pass, if memory limits it
+    # Whether the policy pads batches to its sizes, so that the server does not pad them.
     pads: bool = False
-    # Shortest duration of a forward pass so far, s, by its rows.
+    # Number of rows of a forward pass -> its shortest duration so far, s.
     pass_s: dict[int, float] = field(default_factory=dict)
-    # Called whenever a forward pass does not fit, even later.
+    # Called whenever a forward pass does not fit into memory, also after loading.
     on_out_of_memory: Callable[[], None] = lambda: None
     # Called with the time of each forward pass on a GPU.
     on_gpu_ms: Callable[[float], None] = lambda _: None
@@ -55,8 +55,9 @@ def loading_report(
     on_out_of_memory: Callable[[], None] = lambda: None,
     on_gpu_ms: Callable[[float], None] = lambda _: None,
 ) -> Iterator[LoadingReport]:
-    """Yield the report of the policy that is loaded in this context; see the fields of
-    `LoadingReport`.
+    """Yield the report of the policy that is loaded in this context.
+
+    The arguments are fields of `LoadingReport`.
     """
     report = LoadingReport(
         on_progress, batch_sizes, on_out_of_memory=on_out_of_memory, on_gpu_ms=on_gpu_ms
@@ -96,9 +97,7 @@ def report_device(device: dict[str, Any]) -> None:
 
 
 def report_uncompiled(part: str) -> None:
-    """Log and report a part that runs uncompiled although its policy's settings require
-    compilation.
-    """
+    """Log and report a part that runs uncompiled, although the settings require compilation."""
     logger.warning("not compiled: %s", part)
     report = _report.get()
     if report is not None:

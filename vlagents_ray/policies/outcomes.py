@@ -1,6 +1,4 @@
-"""The results of a batch in which an error stands in the place of a row, and fails the request
-of its session alone.
-"""
+"""Batches in which a row may be an error, which is the result of its session's request alone."""
 
 from __future__ import annotations
 
@@ -17,8 +15,10 @@ def attempt(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def compute_valid(rows: Sequence[Any], compute: Callable[[list[Any]], Iterable[Any]]) -> list[Any]:
-    """Compute the rows that are no exceptions in one call, if there are any; return their
-    results among the exceptions, in the order of the rows.
+    """Compute the rows of a batch that are not exceptions, in one call.
+
+    Returns:
+        The results and the exceptions, in the order of the rows.
     """
     valid = [index for index, row in enumerate(rows) if not isinstance(row, Exception)]
     results = list(rows)

@@ -1,6 +1,4 @@
-"""Devices, dtypes and errors of torch and JAX, and the fix for a torchvision that does not match
-torch.
-"""
+"""Devices, dtypes, memory and errors of torch, JAX and ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -26,15 +24,16 @@ from vlagents_ray.policies.compilation import keep_jax_programs
 from vlagents_ray.policies.loading import LoadingReport, report_device
 from vlagents_ray.registry import require
 
-VISIBLE = "CUDA_VISIBLE_DEVICES"  # Ray sets it in a process that it gives GPUs
-# Share of its GPU's memory that a process may use; unset: all of it.
+VISIBLE = "CUDA_VISIBLE_DEVICES"  # set by Ray in a process that has GPUs
+# Variable with the share of its GPU's memory that a process may use; all of it if it is not set.
 GPU_SHARE = "VLAGENTS_RAY_GPU_SHARE"
 
 # The oldest driver for each major version of CUDA:
 # https://docs.nvidia.com/deploy/cuda-compatibility/minor-version-compatibility.html
 OLDEST_DRIVERS = {12: 525, 13: 580}
 _DRIVER = Path("/proc/driver/nvidia/version")
-# Texts of errors of torch, JAX and ONNX Runtime, whose classes differ between their versions.
+# Messages of errors of torch, JAX and ONNX Runtime. The classes of these errors differ between
+# versions.
 _EXHAUSTED = re.compile(
     r"out of memory|ALLOC_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED|Failed to allocate memory",
     re.IGNORECASE,
@@ -50,8 +49,8 @@ def torch_device(name: str = "auto") -> Any:
     """Return the `torch.device` of a name.
 
     Args:
-        name: A name of torch's, or "auto": a GPU, or a CPU only if this process was given no GPU
-            and torch finds none.
+        name: A name of torch, or "auto". "auto" selects a GPU, or the CPU if this process was given
+            no GPU and torch finds none.
 
     Raises:
         ConfigError: There is no such device, or torch cannot use it.
@@ -90,10 +89,12 @@ def torch_device(name: str = "auto") -> Any:
 
 
 def _limit_jax() -> float:
-    """Limit the memory of JAX, also beside torch, before its first use of a GPU; return this
-    process's share, or 0.
+    """Limit the memory of JAX, before its first use of a GPU.
 
-    By itself JAX allocates three quarters of the memory at once.
+    By default, JAX allocates three quarters of the memory at once, even if torch uses the same GPU.
+
+    Returns:
+        This process's share of the memory; 0 if it has no limit.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     share = os.environ.get(GPU_SHARE, "")
@@ -109,6 +110,7 @@ def _given_gpus() -> str:
 
 
 def _unusable(library: str, reason: str) -> ConfigError:
+    """Return the error for a library that cannot use the GPU of this process."""
     return ConfigError(
         f"device 'auto': this process was given GPU {_given_gpus()} ({VISIBLE}), which {library} "
         f"cannot use: {reason}; install a build of it for the GPU and its driver, or set device: "
@@ -117,14 +119,12 @@ def _unusable(library: str, reason: str) -> ConfigError:
 
 
 def driver_version() -> str | None:
-    """Return the version of NVIDIA's driver, such as "580.65.06"; None if there is none, or it
-    does not say.
-    """
+    """Return the version of NVIDIA's driver, such as "580.65.06"; None if it is not known."""
     with suppress(OSError):
         driver = re.search(r"Kernel Module\s+(?:for \S+\s+)?([\d.]+)", _DRIVER.read_text())
         return driver and driver[1]
 
-    # WSL2 has no such file.
+    # The file does not exist in WSL2.
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     with suppress(OSError, subprocess.SubprocessError, IndexError):
         answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)  # noqa: S603
@@ -133,8 +133,9 @@ def driver_version() -> str | None:
 
 
 def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
-    """Return the `torch.dtype` of a name; "auto" is `preferred` on an accelerator, float32 on a
-    CPU.
+    """Return the `torch.dtype` of a name.
+
+    "auto" is `preferred` on an accelerator, and float32 on a CPU.
     """
     torch = require("torch")
     usual = "float32" if device.type == "cpu" else preferred
@@ -144,21 +145,20 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
 def jax_device(name: str = "auto") -> Any:
     """Return the JAX device of a name.
 
-    From then on, the programs that JAX compiles for a device that is no CPU are kept for the next
-    start.
+    After this call, the programs that JAX compiles for an accelerator are kept for the next start.
 
     Args:
-        name: A platform of JAX, such as "gpu" or "gpu:1", or "auto": the first device, which is a
-            CPU only if this process was given no GPU.
+        name: A platform of JAX, such as "gpu" or "gpu:1", or "auto". "auto" selects the first
+            device, which is a CPU only if this process was given no GPU.
 
     Raises:
         ConfigError: There is no such device, or JAX cannot use it.
     """
     _limit_jax()
     jax = require("jax")
-    kind, _, index = name.partition(":")
+    platform, _, index = name.partition(":")
     try:
-        device = jax.devices()[0] if name == "auto" else jax.devices(kind)[int(index or 0)]
+        device = jax.devices()[0] if name == "auto" else jax.devices(platform)[int(index or 0)]
         if name == "auto" and device.platform == "cpu" and _given_gpus():
             device = jax.devices("gpu")[0]
     except (RuntimeError, IndexError, ValueError) as error:
@@ -183,10 +183,14 @@ def jax_device(name: str = "auto") -> Any:
 
 
 def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
-    """Return the provider of ONNX Runtime for a device, and its settings; "auto" as in
-    `torch_device`.
+    """Return the provider of ONNX Runtime for a device, and its settings.
 
-    Raises `ConfigError` for a device that this ONNX Runtime was not built for.
+    Args:
+        name: "cpu", "cuda" or "cuda:1", or "auto" as in `torch_device`.
+        matmul: The precision of float32 products.
+
+    Raises:
+        ConfigError: This ONNX Runtime was not built for the device.
     """
     runtime = require("onnxruntime")
     kind, _, index = name.partition(":")
@@ -217,8 +221,12 @@ def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
 
 
 def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
-    """Set, and add to the description of a GPU, the precision of float32 products and
-    convolutions of this process.
+    """Set the precision of float32 products and convolutions of this process.
+
+    Args:
+        precision: The precision.
+        device: The description of the device, to which the precision is added. Nothing is changed
+            for a CPU.
     """
     if device["kind"] == "cpu" or "onnxruntime" in device:
         return
@@ -233,11 +241,11 @@ def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
 
 
 def fetch(tensor: Any) -> np.ndarray:
-    """Return the values of a tensor as an array, after the work that computes them.
+    """Wait until a tensor is computed, and return it as an array.
 
-    Meanwhile other threads should use the GPU, to prepare the next batch or to load weights. During
-    `Tensor.cpu`, whose copy is to pageable memory, each of their calls of CUDA waited for all of
-    that work (torch 2.11, H200).
+    Meanwhile, other threads can use the GPU to prepare the next batch or to load weights. The
+    method `Tensor.cpu` would copy to pageable memory, during which each of their CUDA calls waited
+    for all work on the GPU (torch 2.11, H200).
     """
     if tensor.device.type != "cuda":
         return np.asarray(tensor.cpu())
@@ -247,43 +255,44 @@ def fetch(tensor: Any) -> np.ndarray:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether a library's error says that the memory of an accelerator is exhausted."""
-    return _is_of_a_runtime(error) and bool(_EXHAUSTED.search(str(error)))
+    """Return whether an error reports that the memory of an accelerator is exhausted."""
+    return _is_from_runtime(error) and bool(_EXHAUSTED.search(str(error)))
 
 
 def is_device_failure(error: BaseException) -> bool:
-    """Return whether an error says that an accelerator failed, other than for its memory.
+    """Return whether an error reports a failure of an accelerator, other than exhausted memory.
 
-    Such errors last: after an illegal access, or the loss of the device, each further call of the
-    process fails.
+    Such failures are permanent: after an illegal access, or the loss of the device, each further
+    call in the process fails.
     """
     return (
-        _is_of_a_runtime(error)
+        _is_from_runtime(error)
         and bool(_GPU_ERROR.search(str(error)))
         and not is_out_of_memory(error)
     )
 
 
-def _is_of_a_runtime(error: BaseException) -> bool:
-    """Return whether torch, JAX or ONNX Runtime may have raised an error; classes of the latter
-    are no RuntimeError.
-    """
-    return (
-        isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "onnxruntime"
-    )
+def _is_from_runtime(error: BaseException) -> bool:
+    """Return whether torch, JAX or ONNX Runtime may have raised an error."""
+    if isinstance(error, RuntimeError):
+        return True
+    # The classes of ONNX Runtime are not derived from RuntimeError.
+    return type(error).__module__.partition(".")[0] == "onnxruntime"
 
 
 def free_memory() -> None:
-    """Free memory at once: agents often contain reference cycles, and torch caches the GPU
-    memory that it allocated.
+    """Free memory immediately.
+
+    Agents often contain reference cycles, and torch caches the GPU memory that it has allocated.
     """
     gc.collect()
     empty_cache()
 
 
 def empty_cache() -> None:
-    """Return the GPU memory that torch does not use to the device, for other processes; JAX
-    keeps its own.
+    """Return GPU memory that torch caches to the device, for other processes.
+
+    JAX keeps its memory.
     """
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
@@ -291,10 +300,14 @@ def empty_cache() -> None:
 
 
 def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return the memory of this process's GPUs among `devices`, bytes: "allocated" for values,
-    "reserved" and "free".
+    """Return the memory of this process's GPUs.
 
-    The result is empty if there is none, as when the policy runs in a child process.
+    Args:
+        devices: Descriptions of devices, of which those of this process are used.
+
+    Returns:
+        Bytes that are "allocated" for values, "reserved" and "free". It is empty if this process
+        uses no GPU, for example if the policy runs in a child process.
     """
     memory: Counter[str] = Counter()
     torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
@@ -307,6 +320,7 @@ def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def _torch_memory(cuda: Any, device: str) -> dict[str, int]:
+    """Return the memory of a device of torch, of which this process may use a share."""
     reserved = cuda.memory_reserved(device)
     free, total = cuda.mem_get_info(device)
     share = float(os.environ.get(GPU_SHARE) or 1)
@@ -319,6 +333,7 @@ def _torch_memory(cuda: Any, device: str) -> dict[str, int]:
 
 
 def _jax_memory(jax: Any, name: str) -> dict[str, int]:
+    """Return the memory of a device of JAX."""
     device = next(device for device in jax.local_devices() if str(device) == name)
     stats = device.memory_stats() or {}
     used = stats.get("bytes_in_use", 0)
@@ -327,11 +342,10 @@ def _jax_memory(jax: Any, name: str) -> dict[str, int]:
 
 
 def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None]]:
-    """Return a context of each forward pass of a policy, which reports the time on a GPU when the
-    next pass begins.
+    """Return a context for each forward pass of a policy, which measures its time on a GPU.
 
-    The time is that from the first operation to the last one, with the gaps between them. Nothing
-    waits for the GPU.
+    The time is reported when the next pass begins, so that nothing waits for the GPU. It spans from
+    the first operation to the last one, gaps included.
     """
     cuda = require("torch").cuda if "torch" in sys.modules else None
     gpus = [device for device in report.devices if device["kind"] == "cuda"]
@@ -358,7 +372,7 @@ def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None
 
 
 def ensure_torchvision() -> None:
-    """Make torchvision importable beside a CPU-only torch, for which PyPI has no build of it."""
+    """Make torchvision importable with a CPU-only torch, for which PyPI has no build of it."""
     import_fixes.install()
     if importlib.util.find_spec("torchvision") is not None:
         importlib.import_module("torchvision")
