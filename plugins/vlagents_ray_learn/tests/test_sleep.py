@@ -35,8 +35,10 @@ from vlagents_ray_learn import Publisher
 def serving() -> Iterator[Callable[..., Engine]]:
     engines: list[Engine] = []
 
-    def serve(agent: Agent, **options: Any) -> Engine:
-        engines.append(Engine(agent, EngineSettings(**options)))
+    def serve(
+        agent: Agent, *, clock: Callable[[], float] = time.perf_counter, **settings: Any
+    ) -> Engine:
+        engines.append(Engine(agent, EngineSettings(**settings), clock=clock))
         engines[-1].start()
         assert (
             answered(
