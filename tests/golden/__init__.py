@@ -18,6 +18,11 @@ ZeroMQ and gRPC carry the messages. `traces/FILE.txt` has, for each scenario,
       «564c4101e4000000»{"request_id":"r-1", …
     server; drains          an event, see `Server.do`
 
+`endpoints/NAME.txt` is the same for the table of `tests/support/endpoint_situations.py`, which has
+each endpoint in each situation: also a wrong key, garbage, half a message, and the stop of the
+server. There every byte of a connection is recorded, from the handshake to the end. Its tests are
+tests/serve/endpoints/test_golden_bytes.py, and that of the dialects.
+
 A second line of data is what travels outside of the message: what lies in the memory file, or
 LeRobot's message beside the method's name. A session that moves is played with two replicas: the
 last digit of a line's name counts them.
@@ -28,8 +33,8 @@ LeRobot's aside. Not compared is what varies by nature, which `masks` replaces b
 and timestamps, ids that are drawn at random (16 or 32 hexadecimal digits), the headers Date and
 Server, the CPU core, and which memory files are free again. A length around such a value is made to
 fit. How many digits or bytes a time has is compared, and so is the batch's size. Steps begin at
-10**15, since the server gets a wall clock that stands still. Bytes within ZeroMQ's and gRPC's own
-framing, API keys (tests/serve/test_access_matrix.py) and the metadata of a replica under Ray are
+10**15, since the server gets a wall clock that stands still. Bytes within gRPC's own framing, other
+cases of API keys (tests/serve/test_access_matrix.py) and the metadata of a replica under Ray are
 not recorded.
 
 A difference is printed by step, in lines of about a field:
@@ -44,7 +49,7 @@ in a commit of its own: with
 
     python -m pytest tests/golden --record
 
-all traces are written again, and the commit's diff of `traces` is what is reviewed: it has that
-change and no other. A new scenario is a `yield` and the same command; so is a version of uvicorn,
-websockets or Python with other texts.
+all files are written again, and the commit's diff of `traces` and `endpoints` is what is reviewed:
+it has that change and no other. A new scenario is a `yield` and the same command; so is a version
+of uvicorn, websockets or Python with other texts.
 """

@@ -4,6 +4,7 @@ client of this package.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import re
@@ -14,7 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
-from tests.golden.masks import masked, masked_local, masked_rpyc
+from tests.golden.masks import masked, masked_local, masked_rpyc, masked_websocket, masked_zmtp
 
 ANSWER_S = 20.0
 Got = tuple[str, bytes]
@@ -33,6 +34,7 @@ class Line(Protocol):
 
     def send(self, data: bytes, more: list[bytes]) -> None: ...
     def receive(self) -> Got: ...
+    def finish(self) -> Got: ...
     def close(self) -> None: ...
 
 
@@ -42,15 +44,24 @@ class TcpLine(ABC):
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
         self._file = self._socket.makefile("rb")
+        self._message = b""  # what has been read of the current message
 
     def send(self, data: bytes, more: list[bytes]) -> None:
         self._socket.sendall(data)
 
     def receive(self) -> Got:
+        """The next message; at the end of the connection, the part of it that came."""
+        self._message = b""
         try:
             return self._next()
         except (EOFError, ConnectionError):
-            return "end", b""
+            return "end", masked(self._message)
+
+    def finish(self) -> Got:
+        """Send no more, and wait for the end of the connection; what came until then."""
+        with contextlib.suppress(OSError):  # the server may have closed the connection
+            self._socket.shutdown(socket.SHUT_WR)
+        return "end", masked(self._read_to_end())
 
     def close(self) -> None:
         self._file.close()
@@ -61,9 +72,17 @@ class TcpLine(ABC):
 
     def _read(self, length: int) -> bytes:
         data = self._file.read(length)
+        self._message += data
         if len(data) < length:
             raise EOFError
         return data
+
+    def _read_to_end(self) -> bytes:
+        rest = b""
+        with contextlib.suppress(ConnectionError):
+            while data := self._file.read1(2**16):
+                rest += data
+        return rest
 
     def _read_response(self) -> bytes:
         head = b""
@@ -111,6 +130,64 @@ class WebSocketLine(TcpLine):
         return _FRAME_KINDS.get(first, f"{first:02x}"), masked(self._read(size))
 
 
+class WholeWebSocketLine(TcpLine):
+    """A WebSocket with its handshake and the heads of its frames.
+
+    The client sends all bytes itself; `{path}` in them is where the server expects its handshake.
+    """
+
+    def __init__(self, port: int, path: str) -> None:
+        super().__init__(port)
+        self._path = path.encode()
+        self._is_open = False
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        self._socket.sendall(data if self._is_open else data.replace(b"{path}", self._path))
+
+    def _next(self) -> Got:
+        if not self._is_open:
+            response = self._read_response()
+            self._is_open = response.startswith(b"HTTP/1.1 101 ")
+            return "response", masked(response)
+        head = self._read(2)
+        size = head[1]
+        if size >= 126:
+            head += self._read(2 if size == 126 else 8)
+            size = int.from_bytes(head[2:], "big")
+        return "frame", masked_websocket(head + self._read(size))
+
+
+class ZmtpLine(TcpLine):
+    """A connection of ZeroMQ: its greeting, its commands, and its messages with all their frames."""
+
+    _GREETING_BYTES = 64
+    _MORE, _LONG = 1, 2  # flags of a frame
+
+    def __init__(self, port: int) -> None:
+        super().__init__(port)
+        self._is_greeted = False
+
+    def _next(self) -> Got:
+        if not self._is_greeted:
+            self._is_greeted = True
+            return "greeting", self._read(self._GREETING_BYTES)
+        message, has_more = b"", True
+        while has_more:
+            flags = self._read(1)
+            size = self._read(8 if flags[0] & self._LONG else 1)
+            body = self._read(int.from_bytes(size, "big"))
+            message += flags + size + masked_zmtp(body)
+            has_more = bool(flags[0] & self._MORE)
+        return "message", message
+
+
+class StrangerLine(TcpLine):
+    """A connection without a whole message of its protocol, which the server ends."""
+
+    def _next(self) -> Got:
+        return "end", self._read_to_end()
+
+
 class UnixLine:
     """Messages of a Unix socket, whose requests lie in memory: that of memory files, or what
     `store` keeps.
@@ -146,6 +223,15 @@ class UnixLine:
                 return "control, in a file", masked_local(data + file.read())
         return "control", masked_local(data)
 
+    def finish(self) -> Got:
+        """Send no more, and wait for the end of the connection; what came until then."""
+        with contextlib.suppress(OSError):  # the server may have closed the connection
+            self._socket.shutdown(socket.SHUT_WR)
+        rest = b""
+        while data := self._socket.recv(2**18):
+            rest += data
+        return "end", rest
+
     def close(self) -> None:
         self._socket.close()
 
@@ -163,6 +249,10 @@ class CallLine:
 
     def receive(self) -> Got:
         return self._calls.pop(0).result(ANSWER_S)
+
+    def finish(self) -> Got:
+        """A call has no more than its answer."""
+        return "end", b""
 
     def close(self) -> None:
         self._thread.shutdown()
@@ -185,6 +275,10 @@ class ZmqLine:
 
     def receive(self) -> Got:
         return "message", masked(self._socket.recv())
+
+    def finish(self) -> Got:
+        """ZeroMQ's library shows messages alone."""
+        return "end", b""
 
     def close(self) -> None:
         self._socket.close()

@@ -69,6 +69,30 @@ def masked_rpyc(data: bytes) -> bytes:
     return (len(data) - 6).to_bytes(4, "big") + _without_ids(data[4:])
 
 
+def masked_websocket(frame: bytes) -> bytes:
+    """A frame of a server: the length in its head is that of what is left."""
+    head_bytes = 2 + {126: 2, 127: 8}.get(frame[1], 0)
+    body = frame[head_bytes:]
+    if frame[1:head_bytes] != _websocket_size(body):
+        return frame
+    body = masked(body)
+    return frame[:1] + _websocket_size(body) + body
+
+
+def _websocket_size(body: bytes) -> bytes:
+    if len(body) < 126:
+        return bytes([len(body)])
+    if len(body) < 2**16:
+        return bytes([126]) + len(body).to_bytes(2, "big")
+    return bytes([127]) + len(body).to_bytes(8, "big")
+
+
+def masked_zmtp(body: bytes) -> bytes:
+    """The body of a frame of ZeroMQ, which stays as long as it was: floats have one length."""
+    body_masked = masked(body)
+    return body_masked if len(body_masked) == len(body) else body
+
+
 def _without_ids(data: bytes) -> bytes:
     return _ID.sub(lambda found: b"0" * len(found[0]), data)
 

@@ -6,6 +6,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from dialect_situations import DIALECTS
+from endpoint_situations import CORE
+from endpoint_situations import record as record_situations
+
 from tests.golden import dialects, own_protocol
 from tests.golden.traces import Trace, write
 
@@ -42,3 +46,4 @@ def record() -> None:
                 else:
                     same.endpoints += one.endpoints
             write(file, found)
+        record_situations([*CORE, *DIALECTS], Path(folder))

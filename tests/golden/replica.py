@@ -1,5 +1,7 @@
 """A server without Ray: one replica, or two that know each other, with all of its endpoints and
 dialects.
+
+Only this module knows how a replica is built: traces hold the bytes of a rebuilt one as well.
 """
 
 from __future__ import annotations
@@ -8,6 +10,8 @@ import asyncio
 import contextlib
 import threading
 from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +22,9 @@ from api_key_replica import PlasmaChannel, plasma_server
 from asgi_server import served
 from dialect_server import METADATA
 from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
 from in_process_replicas import Replicas
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from tests.golden.failing import fail
 from tests.golden.lines import (
@@ -27,19 +33,23 @@ from tests.golden.lines import (
     HttpLine,
     Line,
     RpycLine,
+    StrangerLine,
     UnixLine,
     WebSocketLine,
+    WholeWebSocketLine,
     ZmqLine,
+    ZmtpLine,
 )
 from tests.golden.masks import masked
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.registry import dialect_class
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.api_keys import Caller, Keys, NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
+from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -61,8 +71,16 @@ STRICT = Contract(
 )
 # For dialects, each of which has names of its own.
 OPEN = Contract(instruction=True, action=STRICT.action, chunk=2)
+# For documents of JSON, which have no images.
+STATE_ONLY = replace(STRICT, cameras={})
+CONTRACTS = {"strict": STRICT, "open": OPEN, "state only": STATE_ONLY}
+KEY = "vlr_robot"  # of the only client that a server with keys admits
 _DRAWN_AT = 10**15  # ns, of the wall clock that the first step of an episode is drawn from
 _GATEWAYS = {"gr00t": ZmqLine, "lerobot": GrpcLine, "vlagents": RpycLine}
+# The end of an endpoint's name if a connection records the handshake and the heads of frames too.
+EACH_BYTE = ", each byte"
+_EACH_BYTE_OF_GATEWAY = {"gr00t": ZmtpLine}
+STRANGER = "stranger"  # the name of a line that sends no whole message begins with it
 
 
 class Gate:
@@ -139,8 +157,10 @@ def _wall_clock() -> int:
 
 
 class Server:
-    """What a scenario talks to; its settings are `sessions`, `ready`, `replicas`, and `dialects`
-    by name.
+    """What a scenario talks to.
+
+    Its settings are `sessions`, `ready`, `replicas`, `keys`, the name of a `contract`, and
+    `dialects` by name.
     """
 
     def __init__(
@@ -149,9 +169,22 @@ class Server:
         self._stack, self._patch, self._folder = stack, patch, folder
         self._dialects: dict[str, Any] = settings.get("dialects", {})
         self._ready = settings.get("ready", True)
+        self._contract = CONTRACTS[settings.get("contract", "open" if self._dialects else "strict")]
+        self._keys: Keys | None = None
+        if settings.get("keys"):
+            keys = ChangingKeys()
+            keys.add(KEY.removeprefix("vlr_"))
+            self._keys = keys.keys
+        self._shutdown = Shutdown()
+        self._websockets = 0  # open ones, of HTTP
         self._gate = Gate()
         self._own: Any = None
-        stack.callback(lambda: self._own and self._own.close())  # after the engine
+
+        # What ends when the server stops, the last first; at the latest with the scenario.
+        self._running = contextlib.ExitStack()
+        stack.callback(self._running.close)
+        self._running.callback(lambda: self._own and self._own.close())  # after the engine
+
         session_limit = settings.get("sessions", 100)
         self._offered = partial(
             Checkpoints, self._agent, {"checkpoint": "first"}, {"other": {"checkpoint": "second"}}
@@ -164,12 +197,12 @@ class Server:
                 wall_clock=_wall_clock,
                 session_limit=session_limit,
             )
-            stack.callback(self._replicas.close)
+            self._running.callback(self._replicas.close)
             self.engines = self._replicas.engines
         else:
             engine_settings = EngineSettings(session_limit=session_limit)
             self.engines = [Engine(self._offered(), engine_settings, wall_clock=_wall_clock)]
-            stack.callback(self.engines[0].close)
+            self._running.callback(self.engines[0].close)
         self._ports: dict[int, int] = {}  # of HTTP, by replica
         for name in gateway:
             self._open_gateway(name)
@@ -180,30 +213,53 @@ class Server:
         first.
         """
         number = int(name[-1]) if name[-1].isdigit() else 0
+        each_byte = endpoint.endswith(EACH_BYTE)
+        endpoint = endpoint.removesuffix(EACH_BYTE)
         if endpoint in _GATEWAYS:
-            return _GATEWAYS[endpoint](self._gateway_port)
-        if endpoint in ("own port", "shared memory", "plasma"):
-            return self._own_line(endpoint)
+            gateway_line = _EACH_BYTE_OF_GATEWAY if each_byte else _GATEWAYS
+            line = StrangerLine if name.startswith(STRANGER) else gateway_line[endpoint]
+            return line(self._gateway_port)
+        if endpoint in ("shared memory", "plasma"):
+            return self._unix_line(endpoint)
         if endpoint == "handle":
             self._start()
             return self._handle(self.engines[number], name)
-        port = self._http(number)
-        return HttpLine(port) if endpoint == "http" else WebSocketLine(port, endpoint)
+
+        if endpoint == "own port":
+            own = self._open_own(endpoint)
+            port, path = own.address.port, own.path
+        else:
+            port, path = self._http(number), endpoint
+        if endpoint == "http":
+            return HttpLine(port)
+        return WholeWebSocketLine(port, path) if each_byte else WebSocketLine(port, path)
 
     def do(self, what: str) -> None:
         """Something that happens to the server."""
         happens = {
             "drains": self.engines[0].drain_list.drain,
+            "stops": self._stop,
             "is acting": lambda: (
                 self._gate.acting.wait(20) or pytest.fail("the policy was not asked")
             ),
             "acts on": self._gate.opened.set,
             "has no session": lambda: wait_for(lambda: not len(self.engines[0].sessions)),
+            "has a request": lambda: wait_for(self._gateway_has_request),
         }
         happens[what]()
 
+    def _stop(self) -> None:
+        """Stop as a replica does: its WebSockets end first, then the engine, then the endpoints."""
+        self._shutdown.begin()
+        wait_for(lambda: not self._websockets)
+        self._running.close()
+
+    def _gateway_has_request(self) -> bool:
+        clients = self._gateway._clients._clients.values()
+        return any(client._unanswered for client in clients)
+
     def _agent(self, settings: Any) -> Policy:
-        return Policy(OPEN if self._dialects else STRICT, self._gate, settings["checkpoint"])
+        return Policy(self._contract, self._gate, settings["checkpoint"])
 
     def _start(self) -> None:
         if self._ready and self._replicas is None and not self.engines[0].health.alive:
@@ -213,34 +269,58 @@ class Server:
         if number not in self._ports:
             self._start()
             engine = self.engines[number]
+            metadata = METADATA | {"contract": self._contract.to_json()}
             routes = dialect_routes(
-                DialectArgs(**self._dialects), ReplicaContext(engine, lambda: METADATA, LIMITS)
+                DialectArgs(**self._dialects), ReplicaContext(engine, lambda: metadata, LIMITS)
             )
-            app = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
-            self._ports[number] = self._stack.enter_context(
-                served(AccessMiddleware(app, None, "app"))
+            inside = build_http_app(engine, lambda: metadata, LIMITS, more=routes)
+            guarded = AccessMiddleware(
+                inside,
+                self._keys,
+                "app",
+                admission=engine.admission,
+                shutdown=self._shutdown,
             )
+            app = FrontMiddleware(self._counting_websockets(guarded))
+            self._ports[number] = self._stack.enter_context(served(app))
         return self._ports[number]
 
-    def _own_line(self, endpoint: str) -> Line:
-        engine = self.engines[0]
+    def _counting_websockets(self, app: ASGIApp) -> ASGIApp:
+        async def run(scope: Scope, receive: Receive, send: Send) -> None:
+            is_websocket = scope["type"] == "websocket"
+            self._websockets += is_websocket
+            try:
+                await app(scope, receive, send)
+            finally:
+                self._websockets -= is_websocket
+
+        return run
+
+    def _open_own(self, endpoint: str) -> Any:
+        """The server of the endpoint, which listens."""
         if self._own is None:
+            engine, admit = self.engines[0], self._check()
             if endpoint == "own port":
-                self._own = WebSocketServer(engine, LIMITS, "127.0.0.1", None, NoKey.OPEN)
+                self._own = WebSocketServer(engine, LIMITS, "127.0.0.1", None, admit)
             elif endpoint == "plasma":
                 self._own = plasma_server(engine, LIMITS, self._patch, self._folder)
             else:
-                self._own = ShmServer(engine, LIMITS, NoKey.OPEN)
+                self._own = ShmServer(engine, LIMITS, admit)
             self._own.open()
             self._start()
-        if endpoint == "own port":
-            return WebSocketLine(self._own.address.port, self._own.path)
+        return self._own
+
+    def _unix_line(self, endpoint: str) -> UnixLine:
+        own = self._open_own(endpoint)
         if endpoint == "plasma":
             return UnixLine(
-                self._own.plasma.socket,
+                own.plasma.socket,
                 lambda message, data: PlasmaChannel.frames.update({message[:28]: data}),
             )
-        return UnixLine(f"\0{self._own.address.socket}")
+        return UnixLine(f"\0{own.address.socket}")
+
+    def _check(self) -> Callable[[str | None], Caller] | NoKey:
+        return NoKey.OPEN if self._keys is None else partial(self._keys.check, app="app")
 
     def _handle(self, engine: Engine, name: str) -> Line:
         from vlagents_ray.serve.replica.replica import answer_frame
@@ -258,9 +338,9 @@ class Server:
             8,
             30.0,
             OPEN,
-            NoKey.OPEN,
+            self._check(),
         )
-        dialect = cls(name, cls.Config(port=port, **self._dialects[name]), context)
+        dialect: Any = cls(name, cls.Config(port=port, **self._dialects[name]), context)
         dialect.serve(reserve(name, "127.0.0.1", port))
-        self._stack.callback(dialect.close)
-        self._gateway_port = port
+        self._running.callback(dialect.close)
+        self._gateway, self._gateway_port = dialect, port

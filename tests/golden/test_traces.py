@@ -7,6 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from dialect_situations import DIALECTS
+from endpoint_situations import CORE, FOLDER
 
 from tests.golden.record import FILES
 from tests.golden.traces import TRACES, Trace, differences, read
@@ -40,3 +42,9 @@ def test_the_server_answers_as_recorded(
 def test_traces_are_small_and_of_today() -> None:
     assert {file.stem for file in TRACES.glob("*.txt")} == FILES.keys()
     assert sum(file.stat().st_size for file in TRACES.glob("*.txt")) < 300_000
+
+
+def test_the_files_of_endpoints_are_small_and_of_today() -> None:
+    sizes = {file.stem: file.stat().st_size for file in FOLDER.glob("*.txt")}
+    assert sizes.keys() == {endpoint.name for endpoint in (*CORE, *DIALECTS)}
+    assert sum(sizes.values()) < 300_000

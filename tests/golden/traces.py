@@ -25,8 +25,8 @@ class Step:
 
     Args:
         who: A line's name; or "server", to which something happens.
-        what: "sends", "gets", "opens" (and gets the answer to the handshake), or "leaves"; of the
-            server, `Server.do`.
+        what: "sends", "gets", "opens" (and gets the answer to the handshake), "finishes" (sends no
+            more, and gets all until the end), or "leaves"; of the server, `Server.do`.
         data: What is sent or got: the message, and what travels outside of it; `kind` says how it
             came.
     """
@@ -82,6 +82,8 @@ def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -
     elif step.what == "opens":
         assert isinstance(line, WebSocketLine)
         got = line.opened
+    elif step.what == "finishes":
+        got = line.finish()
     else:
         got = line.receive()
     return step if got is None else Step(step.who, step.what, got[0], (got[1],))
@@ -103,12 +105,12 @@ def differences(recorded: Trace, played: Trace) -> str:
     return "\n".join(found)
 
 
-def read(name: str) -> list[Trace]:
+def read(name: str, folder: Path = TRACES) -> list[Trace]:
     """The traces in a file: of each its name, a line with its endpoints and the server's
     settings, and its steps.
     """
     found: list[Trace] = []
-    for part in (TRACES / f"{name}.txt").read_text().split("== ")[1:]:
+    for part in (folder / f"{name}.txt").read_text().split("== ")[1:]:
         title, head, *lines = part.splitlines()
         found.append(Trace(title, *json.loads(head)))
         for line in lines:
@@ -120,7 +122,7 @@ def read(name: str) -> list[Trace]:
     return found
 
 
-def write(name: str, traces: Sequence[Trace]) -> None:
+def write(name: str, traces: Sequence[Trace], folder: Path = TRACES) -> None:
     """Write a file."""
     lines = []
     for one in traces:
@@ -128,4 +130,4 @@ def write(name: str, traces: Sequence[Trace]) -> None:
         for step in one.steps:
             words = (step.who, step.what, step.kind)
             lines += ["; ".join(filter(None, words)), *(f"  {as_text(data)}" for data in step.data)]
-    (TRACES / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")

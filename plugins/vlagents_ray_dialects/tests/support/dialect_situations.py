@@ -1,0 +1,374 @@
+"""The endpoints of the dialects, for the table of `endpoint_situations`.
+
+Each connection is recorded from its first byte, but for LeRobot's: the bytes around its messages
+are those of gRPC's library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from endpoint_situations import (
+    NO_FRAME,
+    NO_HTTP,
+    WRONG_KEY,
+    Endpoint,
+    finishes,
+    handshake,
+    websocket_frame,
+)
+from lerobot_messages import field_of, parts_of, pickled, robot_saw, setup
+
+from tests.golden.dialects import JOINTS, LIBERO, PIXELS, RUBBISH, without
+from tests.golden.masks import masked
+from tests.golden.replica import EACH_BYTE, KEY
+from tests.golden.scenarios import Send, Steps, asks, gets, http, server
+from vlagents_ray_dialects.messages import gr00t, openpi, openvla, vla_eval, vlagents
+from vlagents_ray_dialects.messages.http2 import PREFACE
+
+_NO_DEADLINE = "the protocol has no deadlines"
+_NO_KEY = "the protocol has no field for a key"
+_SESSION_IS_CONNECTION = "a session is the connection"
+NOT_APPLICABLE: dict[str, dict[str, str]] = {
+    "openpi": {
+        "unknown session": _SESSION_IS_CONNECTION,
+        "expired deadline": _NO_DEADLINE,
+    },
+    "roboarena": {
+        "unknown session": "a session is the connection, and any `session_id` begins an episode",
+        "expired deadline": _NO_DEADLINE,
+    },
+    "openvla": {
+        "metadata": "the protocol has none",
+        "reset": "the protocol has none: each new instruction begins an episode",
+        "unknown session": "a session begins with its first request",
+        "expired deadline": _NO_DEADLINE,
+    },
+    "vla_eval": {
+        "unknown session": _SESSION_IS_CONNECTION,
+        "expired deadline": _NO_DEADLINE,
+    },
+    "gr00t": {
+        "unknown session": _SESSION_IS_CONNECTION,
+        "expired deadline": _NO_DEADLINE,
+    },
+    "vlagents": {
+        "unknown session": _SESSION_IS_CONNECTION,
+        "wrong key": _NO_KEY,
+        "expired deadline": _NO_DEADLINE,
+    },
+    "lerobot": {
+        "metadata": "the protocol has none",
+        "wrong key": _NO_KEY,
+        "expired deadline": "the deadline of a call is known to gRPC's library alone",
+    },
+}
+
+
+# Dialects of WebSockets.
+
+
+def _websocket(
+    name: str,
+    path: str,
+    settings: dict[str, Any],
+    *,
+    metadata: Sequence[bytes] = (),
+    reset: list[Steps],
+    acts: Sequence[bytes],
+    wrong: bytes,
+    greets: bool = False,
+) -> Endpoint:
+    """Describe a dialect.
+
+    Args:
+        metadata: The messages that ask for it, if the server does not send it unasked.
+        reset: The steps of a client that is connected.
+        acts: Two messages.
+        wrong: A message whose picture has a wrong shape.
+        greets: Whether the server sends the first message, and ends the connection after an error.
+    """
+
+    def says(*messages: bytes, who: str = "a") -> list[Steps]:
+        return asks(*((websocket_frame(message),) for message in messages), who=who)
+
+    def connect(who: str = "a", key: str | None = None) -> list[Steps]:
+        opening: list[Steps] = [Send(who, (handshake(path, key),)), gets(who)]
+        return [*opening, gets(who)] if greets else opening
+
+    def is_refused(who: str, key: str | None) -> list[Steps]:
+        return [Send(who, (handshake(path, key),)), gets(who), finishes(who)]
+
+    frame = websocket_frame(acts[0])
+    half = (frame[: len(frame) // 2],)
+    after_error: list[Steps] = [gets(), finishes()] if greets else [says(acts[0]), finishes()]
+    situations: dict[str, list[Steps]] = {
+        "metadata": [connect(), says(*metadata), finishes()],
+        "reset": [connect(), reset, finishes()],
+        "act": [connect(), says(*acts), finishes()],
+        "act with a wrong shape": [connect(), says(wrong), after_error],
+        "wrong key": [
+            [is_refused("a", WRONG_KEY), is_refused("b", None)],
+            [connect("c", KEY), says(acts[0], who="c"), finishes("c")],
+        ],
+        "garbage": [
+            [connect(), says(RUBBISH), after_error],
+            [connect("b"), asks((NO_FRAME,), who="b"), finishes("b")],
+            [asks((NO_HTTP,), who="c"), finishes("c")],
+        ],
+        "half a message, then close": [
+            [connect(), says(acts[0]), Send("a", half), finishes()],
+            [connect("b"), says(acts[0], who="b"), finishes("b")],
+        ],
+        "stop of the server": [connect(), says(acts[0]), server("stops"), gets(), finishes()],
+    }
+    dialects = {"dialects": {name: settings}}
+    return Endpoint(name, path + EACH_BYTE, situations, NOT_APPLICABLE[name], dialects)
+
+
+def _openpi() -> Endpoint:
+    settings = {
+        "mapping": "openpi-libero",
+        "metadata": {"reset_pose": [0.5]},
+        "answer_reset": True,
+    }
+    reset = asks((websocket_frame(openpi.encode({"reset": True})),))
+    return _websocket(
+        "openpi",
+        "/openpi",
+        settings,
+        reset=reset,
+        acts=[openpi.encode(LIBERO), openpi.encode(LIBERO | {"prompt": "place it"})],
+        wrong=openpi.encode(LIBERO | {"observation/image": PIXELS[0]}),
+        greets=True,
+    )
+
+
+def _roboarena() -> Endpoint:
+    def infer(**more: Any) -> bytes:
+        return openpi.encode(LIBERO | {"endpoint": "infer", "session_id": "one"} | more)
+
+    return _websocket(
+        "roboarena",
+        "/roboarena",
+        {"mapping": "openpi-libero"},
+        reset=asks((websocket_frame(openpi.encode({"endpoint": "reset"})),)),
+        acts=[infer(), infer(session_id="two")],
+        wrong=infer(**{"observation/image": PIXELS[0]}),
+        greets=True,
+    )
+
+
+def _vla_eval() -> Endpoint:
+    def message(kind: Any, seq: int, **payload: Any) -> bytes:
+        # Without the time at which it is sent.
+        return masked(vla_eval.encode(vla_eval.VlaEvalMessage(kind, payload, seq)))
+
+    def observation(seq: int, picture: Any = PIXELS) -> bytes:
+        return message(
+            "observation",
+            seq,
+            images={"front": picture},
+            task_description="pick",
+            state=JOINTS,
+        )
+
+    # The begin of an episode is not answered; the action after it belongs to the new episode.
+    begin = Send("a", (websocket_frame(message("episode_start", 2)),))
+    reset = [begin, asks((websocket_frame(observation(3)),))]
+    return _websocket(
+        "vla_eval",
+        "/vla-eval",
+        {"observation_params": {"send_state": True}},
+        metadata=[message("hello", 0, protocol_version=1), message("hello", 1, protocol_version=9)],
+        reset=reset,
+        acts=[observation(3), observation(4)],
+        wrong=observation(3, PIXELS[0]),
+    )
+
+
+# Dialects of HTTP.
+
+
+def _openvla() -> Endpoint:
+    seen = {"image": PIXELS, "instruction": "pick"}
+
+    def post(
+        body: dict[str, Any] | bytes = seen, session: str = "", **headers: str
+    ) -> tuple[bytes]:
+        data = body if isinstance(body, bytes) else openvla.encode(body)
+        return (http("POST", "/act", data, "application/json", session, **headers),)
+
+    def with_key(who: str, key: str) -> list[Steps]:
+        return [asks(post(authorization=f"Bearer {key}"), who=who), finishes(who)]
+
+    half = (post()[0][:-100],)
+    situations: dict[str, list[Steps]] = {
+        "act": [asks(post(), post(session="s-1"), post(session="s-1")), finishes()],
+        "act with a wrong shape": [
+            asks(post(seen | {"image": PIXELS[0]}), post(without(seen, "image")), post()),
+            finishes(),
+        ],
+        "wrong key": [
+            [with_key("a", WRONG_KEY), asks(post(), who="b"), finishes("b")],
+            with_key("c", KEY),
+        ],
+        "garbage": [
+            [asks(post(b"garbage"), post()), finishes()],
+            [asks((NO_HTTP,), who="b"), finishes("b")],
+        ],
+        "half a message, then close": [
+            [Send("a", half), finishes()],
+            [asks(post(), who="b"), finishes("b")],
+        ],
+        "stop of the server": [asks(post()), server("stops"), asks(post()), finishes()],
+    }
+    dialects = {"dialects": {"openvla": {}}}
+    return Endpoint("openvla", "http", situations, NOT_APPLICABLE["openvla"], dialects)
+
+
+# Dialects with a port of their own.
+
+_GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\0" + b"NULL".ljust(20, b"\0") + bytes(32)
+_READY = (
+    b"\x04\x26\x05READY"
+    b"\x0bSocket-Type\0\0\0\x03REQ"
+    b"\x08Identity\0\0\0\0"
+)  # fmt: skip
+
+
+def _zmtp_message(payload: bytes) -> bytes:
+    """A message of a REQ socket: an empty frame, and that of the payload."""
+    if len(payload) < 256:
+        return b"\x01\0" + bytes([0, len(payload)]) + payload
+    return b"\x01\0" + b"\x02" + len(payload).to_bytes(8, "big") + payload
+
+
+def _gr00t() -> Endpoint:
+    def observed(picture: Any = PIXELS) -> dict[str, Any]:
+        robot = {"video": {"ego": picture}, "state": {"arm": JOINTS}, "language": {"task": "pick"}}
+        return gr00t.batch([robot], "task")
+
+    def get_action(picture: Any = PIXELS, key: str | None = None) -> bytes:
+        data = {"observation": observed(picture), "options": None}
+        return gr00t.write("get_action", data, key)
+
+    def says(*payloads: bytes, who: str = "a") -> list[Steps]:
+        return asks(*((_zmtp_message(payload),) for payload in payloads), who=who)
+
+    def connect(who: str = "a") -> list[Steps]:
+        return asks((_GREETING,), (_READY,), who=who)
+
+    ping, modalities = (
+        gr00t.write("ping", None, None),
+        gr00t.write("get_modality_config", None, None),
+    )
+    reset = gr00t.write("reset", {"options": None}, None)
+    wrong = gr00t.write(
+        "get_action", {"observation": observed() | {"video": {}}, "options": None}, None
+    )
+    message = _zmtp_message(get_action())
+    half = (message[: len(message) // 2],)
+    situations: dict[str, list[Steps]] = {
+        "metadata": [connect(), says(ping, modalities), finishes()],
+        "reset": [connect(), says(reset), finishes()],
+        "act": [connect(), says(get_action(), get_action()), finishes()],
+        "act with a wrong shape": [
+            connect(),
+            says(get_action(PIXELS[0]), wrong, get_action()),
+            finishes(),
+        ],
+        "wrong key": [
+            [connect(), says(get_action(key=WRONG_KEY)), finishes()],
+            [connect("b"), says(get_action(), who="b"), finishes("b")],
+            [connect("c"), says(get_action(key=KEY), who="c"), finishes("c")],
+        ],
+        "garbage": [
+            [connect(), says(RUBBISH, gr00t.write("jump", None, None), get_action()), finishes()],
+            asks((NO_HTTP,), who="stranger"),
+        ],
+        "half a message, then close": [
+            [connect(), says(get_action()), Send("a", half), finishes()],
+            [connect("b"), says(get_action(), who="b"), finishes("b")],
+        ],
+        "stop of the server": [connect(), says(get_action()), server("stops"), finishes()],
+    }
+    dialects = {"dialects": {"gr00t": {}}}
+    return Endpoint("gr00t", "gr00t" + EACH_BYTE, situations, NOT_APPLICABLE["gr00t"], dialects)
+
+
+def _vlagents() -> Endpoint:
+    def call(method: str, *args: str) -> tuple[bytes]:
+        return (vlagents.call(7, ("vlagents_ray.Policy", 1, 1), method, *args),)
+
+    def see(**changes: Any) -> tuple[bytes]:
+        arm = {"cameras": {"front": PIXELS}, "joints": JOINTS, "gripper": JOINTS[:1] + 0.25}
+        observation = {"arm": arm | changes, "language_instruction": "pick"}
+        return call("act", vlagents.write_observation(observation))
+
+    old_reset = (
+        '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", '
+        '{"seed": 3}]'
+    )
+    root = (vlagents.get_root(1),)
+    half = (see()[0][:100],)
+    situations: dict[str, list[Steps]] = {
+        "metadata": [asks(root, call("name"), call("is_initialized")), finishes()],
+        "reset": [asks(call("reset", old_reset)), finishes()],
+        "act": [asks(see(), see()), finishes()],
+        "act with a wrong shape": [asks(see(cameras={"front": PIXELS[0]}), see()), finishes()],
+        "garbage": [
+            [asks(call("act", "{"), call("act"), call("jump"), see())],
+            [Send("a", (b"\0\0\0\x03\0bad\n",)), finishes()],
+        ],
+        "half a message, then close": [
+            [asks(see()), Send("a", half), finishes()],
+            [asks(see(), who="b"), finishes("b")],
+        ],
+        "stop of the server": [asks(see()), server("stops"), finishes()],
+    }
+    dialects = {"dialects": {"vlagents": {}}}
+    return Endpoint("vlagents", "vlagents", situations, NOT_APPLICABLE["vlagents"], dialects)
+
+
+def _lerobot() -> Endpoint:
+    def call(method: str, *messages: bytes) -> tuple[bytes, ...]:
+        return (f"/transport.AsyncInference/{method}".encode(), *messages)
+
+    def send(observation: Any) -> tuple[bytes, ...]:
+        return call("SendObservations", *parts_of(pickled(observation)))
+
+    ready, get_actions = call("Ready", b""), call("GetActions", b"")
+    instruct = call("SendPolicyInstructions", field_of(1, pickled(setup())))
+    unreadable = call("SendObservations", *parts_of(RUBBISH))
+    begin = asks(ready, instruct)
+    half = (PREFACE[: len(PREFACE) // 2],)
+    situations: dict[str, list[Steps]] = {
+        "reset": [begin],
+        "act": [begin, asks(send(robot_saw(0)), get_actions, send(robot_saw(1)), get_actions)],
+        "act with a wrong shape": [
+            [begin, asks(send(robot_saw(0, front=PIXELS[0])))],
+            asks(send(robot_saw(0)), get_actions),
+        ],
+        "unknown session": [asks(get_actions, ready, send(robot_saw(0)))],
+        "garbage": [begin, asks(unreadable), asks((NO_HTTP,), who="stranger")],
+        "half a message, then close": [Send("stranger", half), finishes("stranger")],
+        "stop of the server": [
+            [begin, Send("a", get_actions), server("has a request")],
+            [server("stops"), gets()],
+        ],
+    }
+    dialects = {"dialects": {"lerobot": {}}}
+    return Endpoint("lerobot", "lerobot", situations, NOT_APPLICABLE["lerobot"], dialects)
+
+
+DIALECTS = (
+    _openpi(),
+    _roboarena(),
+    _openvla(),
+    _vla_eval(),
+    _gr00t(),
+    _vlagents(),
+    _lerobot(),
+)

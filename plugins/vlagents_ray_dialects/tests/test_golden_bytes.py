@@ -1,0 +1,30 @@
+"""Each dialect answers with the recorded bytes in each situation.
+
+tests/golden/endpoints has the bytes, and `dialect_situations` the table of situations.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from dialect_situations import DIALECTS
+from endpoint_situations import (
+    Endpoint,
+    case_ids,
+    cases,
+    require_each_situation_recorded,
+    require_recorded_answers,
+)
+
+
+@pytest.mark.parametrize(("endpoint", "situation"), cases(DIALECTS), ids=case_ids(DIALECTS))
+def test_the_dialect_answers_with_the_recorded_bytes(
+    endpoint: Endpoint, situation: str, tmp_path: Path
+) -> None:
+    require_recorded_answers(endpoint, situation, tmp_path)
+
+
+@pytest.mark.parametrize("endpoint", DIALECTS, ids=[endpoint.name for endpoint in DIALECTS])
+def test_each_situation_of_the_dialect_is_recorded(endpoint: Endpoint) -> None:
+    require_each_situation_recorded(endpoint)
