@@ -32,7 +32,7 @@ from vlagents_ray.cli.console import errors, out, progress
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan as planned
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
@@ -103,7 +103,7 @@ def measure_soak(
         with SoakWatcher(notes, ledger, soak) as watcher:
             evaluate(config, progress=ledger)
         found = Results.load(config.out)
-        wanted = sorted(str(job.key) for job in planned(plan_cases(config)))
+        wanted = sorted(str(job.key) for job in plan_jobs(plan_cases(config)))
         return report(soak, ledger, watcher, read_episode_times(notes), found, wanted)
 
 

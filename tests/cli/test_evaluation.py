@@ -34,7 +34,7 @@ from vlagents_ray.evaluate import (
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -149,7 +149,7 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
     config = EvalConfig.model_validate({"policies": of_a, "suites": suites, "out": out, **changes})
     with Store(resolve(config)) as store:
         store.begin_run({})
-        first, *others = plan(store.cases)
+        first, *others = plan_jobs(store.cases)
         failure = Failure(
             "worker", "env_failed", "env step: RuntimeError: it exploded\nand more", ""
         )
@@ -193,7 +193,7 @@ def test_a_case_that_stopped_early_misses_nothing(
 ) -> None:
     config = lost(tmp_path, stop={"target": 0.01, "at_least": 1})
     with Store(resolve(config.model_copy(update={"resume": True}))) as store:
-        store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True, 3), 1)
+        store.record(EpisodeResult(plan_jobs(store.cases)[0].key, "done", True, True, 3), 1)
     [case] = Results.load(tmp_path).cases
     assert case.stopped_at is not None
     with closing(sqlite3.connect(tmp_path / "results.db")) as db, db:
@@ -208,7 +208,7 @@ def test_only_what_was_asked_for_now_is_missed(
     suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
     other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
     with Store(resolve(other)) as store:
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
     assert end_of(other, monkeypatch) == (0, "")
 

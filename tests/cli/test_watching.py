@@ -17,7 +17,7 @@ from vlagents_ray.cli.policies import resolve_policies
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -64,7 +64,7 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
         played.append(resolved.policies[0].steps)
         with Store(resolved) as store:
             store.begin_run({})
-            for job in plan(store.cases):
+            for job in plan_jobs(store.cases):
                 status: Status = (
                     "infra_failed" if job.case.step == 10 and job.key.episode == 3 else "done"
                 )

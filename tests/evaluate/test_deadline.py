@@ -14,10 +14,10 @@ from in_process_evaluation import flat_config
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, Progress, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.run import CLOSING_S, MARGIN, Deadline
 
-JOBS = plan(plan_cases(flat_config(envs=["tabletop"], episodes=3, out="out")))
+JOBS = plan_jobs(plan_cases(flat_config(envs=["tabletop"], episodes=3, out="out")))
 
 
 def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longest() -> None:

@@ -19,7 +19,7 @@ from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports import rows
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.success import compare_all, families_json
@@ -101,7 +101,7 @@ def played(
     said = served(own_weights) | (stated or {})
     with Store(resolve(config)) as store:
         store.begin_run({})
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             if str(job.key) in store.finished():
                 continue
             store.note_policy(job.case.policy.name, said)
@@ -453,7 +453,7 @@ def test_a_case_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> N
         config = EvalConfig.model_validate({**settings, "resume": resume, "accept_changes": resume})
         with Store(resolve(config)) as store:
             store.begin_run({})
-            for job in plan(store.cases):
+            for job in plan_jobs(store.cases):
                 if job.key.episode == resume:
                     store.record(EpisodeResult(job.key, "done", True, True), attempts=1)
         edit("prog_env.py")

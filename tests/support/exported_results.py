@@ -7,7 +7,7 @@ from in_process_evaluation import play
 
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 
@@ -26,7 +26,7 @@ def with_a_lost_episode(settings: EvalConfig) -> Results:
     play(settings, left_out=[2])
     with Store(resolve(settings.model_copy(update={"resume": True}))) as store:
         store.begin_run({})
-        key = next(job.key for job in plan(store.cases) if job.key.episode == 2)
+        key = next(job.key for job in plan_jobs(store.cases) if job.key.episode == 2)
         store.record(
             EpisodeResult(key, "infra_failed", error='env_failed: it hung, "again"'), attempts=4
         )

@@ -11,7 +11,7 @@ from eval_fakes import ToZero
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.recorder import Recording, save
 from vlagents_ray.evaluate.artifacts.storage import versions
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Rollout
@@ -31,7 +31,7 @@ def play(
     with Store(resolve(config)) as store:
         store.begin_run(versions())
         finished = store.finished()
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             if str(job.key) in finished or job.key.episode in left_out:
                 continue
             [report] = worker.run((job,))

@@ -18,7 +18,7 @@ from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.jobs import Job, plan
+from vlagents_ray.evaluate.plan.jobs import Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Obs
@@ -77,7 +77,7 @@ def record(
     """
     with Store(resolve(config)) as store:
         store.begin_run(versions())
-        jobs = plan(store.cases)
+        jobs = plan_jobs(store.cases)
         shown = config.video == "all"
         for job in jobs:
             result = _result(job, outcome(job.case, job.key.seed))

@@ -18,7 +18,7 @@ from vlagents_ray.envs.base import BatchEnv, SequentialBatch
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, PolicyFailed, UnknownEnv
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import Job, plan
+from vlagents_ray.evaluate.plan.jobs import Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan
 from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
@@ -95,7 +95,9 @@ def planned(episodes: int, env: str = LINE) -> list[str]:
     """The keys of an evaluation."""
     return [
         str(job.key)
-        for job in plan(plan_cases(flat_config(envs=[env], episodes=episodes, out="out", seed=0)))
+        for job in plan_jobs(
+            plan_cases(flat_config(envs=[env], episodes=episodes, out="out", seed=0))
+        )
     ]
 
 

@@ -17,7 +17,7 @@ from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray_learn import rollouts as recording
@@ -295,7 +295,7 @@ def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state(
     assert (first["action"] != second["action"]).any()
     assert (str(one), str(other)) == (f"{LINE}#3@3:x", f"{LINE}#3@3/99:x")
     assert {
-        job.key.policy_seed for job in plan(plan_cases(flat_config(envs=[LINE], out="out")))
+        job.key.policy_seed for job in plan_jobs(plan_cases(flat_config(envs=[LINE], out="out")))
     } == {None}
 
 

@@ -21,7 +21,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.storage import require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.replay import find
 from vlagents_ray.evaluate.report.page import write_report
@@ -138,7 +138,7 @@ def test_a_lost_episode_gives_way_to_one_that_was_played(
     a, b = part("a", 5), part("b")
     with Store(resolve(config(out=a, resume=True))) as store:
         store.begin_run({})
-        lost = EpisodeResult(plan(store.cases)[5].key, "infra_failed", error="it hung")
+        lost = EpisodeResult(plan_jobs(store.cases)[5].key, "infra_failed", error="it hung")
         store.record(lost, attempts=4)
     for order in ([a, b], [b, a]):
         out = tmp_path / order[0].name / "merged"

@@ -19,17 +19,17 @@ from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import expand, plan_cases
 from vlagents_ray.evaluate.plan.config import ClockConfig, SuiteConfig, canonical, fingerprint
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan_jobs
 
 Config = Callable[..., EvalConfig]
 
 
 def jobs_of(env: str, count: int, **settings: Any) -> list[Job]:
-    return plan(plan_cases(flat_config(envs=[env], episodes=count, out="out", **settings)))
+    return plan_jobs(plan_cases(flat_config(envs=[env], episodes=count, out="out", **settings)))
 
 
 def keys(config: EvalConfig) -> list[EpisodeKey]:
-    return [job.key for job in plan(plan_cases(config))]
+    return [job.key for job in plan_jobs(plan_cases(config))]
 
 
 def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
@@ -64,7 +64,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
 
 
 def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
-    jobs = plan(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
+    jobs = plan_jobs(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
     assert [(job.case.contender, job.key.env) for job in jobs] == [
         ("policy@10", LINE),
         ("policy@10", OTHER_LINE),

@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.cases import EvalCase, plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report import results_document, terminal
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
@@ -51,7 +51,7 @@ class Played:
         self.config = runs(out, episodes=4, **changes)
         self.document = document
         self.store = Store(resolve(self.config))
-        self.jobs = plan(self.store.cases)
+        self.jobs = plan_jobs(self.store.cases)
         self.store.begin_run({})
         document.begin(self.store.cases, {}, len(self.jobs))
 
@@ -164,7 +164,7 @@ def test_a_training_waits_between_its_versions_and_has_a_learning_curve(tmp_path
     for step in (1000, 2000):
         learner = {"name": "learner", "url": "http://localhost:1", "steps": [step]}
         config = runs(tmp_path, policies=[learner], resume=step == 2000)
-        document.begin(plan_cases(config), {}, len(plan(plan_cases(config))))
+        document.begin(plan_cases(config), {}, len(plan_jobs(plan_cases(config))))
         record(config)
         document.end()
         assert read(document)["state"] == "waiting"

@@ -19,7 +19,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
@@ -36,13 +36,13 @@ import os, sys
 from pathlib import Path
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.store import Store
 config = EvalConfig.model_validate_json(sys.argv[1])
 store = Store(resolve(config))
 store.begin_run({})
-store.record(EpisodeResult(plan(store.cases)[0].key, "done", True, True), 1)
+store.record(EpisodeResult(plan_jobs(store.cases)[0].key, "done", True, True), 1)
 os._exit(9)
 """
 
@@ -56,7 +56,7 @@ def begun(config: EvalConfig) -> Store:
     """A store with an episode in it."""
     store = Store(resolve(config))
     store.begin_run({})
-    store.record(EpisodeResult(plan(plan_cases(config))[0].key, "done", True, True), 1)
+    store.record(EpisodeResult(plan_jobs(plan_cases(config))[0].key, "done", True, True), 1)
     return store
 
 

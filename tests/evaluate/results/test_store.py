@@ -13,7 +13,7 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.results.summary import summarize
 
 
 def planned(config: EvalConfig) -> list[Job]:
-    return plan(plan_cases(config))
+    return plan_jobs(plan_cases(config))
 
 
 FAILURE = Failure("worker", "env_failed", "it hung", "Traceback ...")
@@ -138,7 +138,7 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
     planned_first = {"envs": [LINE, OTHER_LINE], "seeds": [0, 100]}
     with Store(resolve(config(**planned_first))) as store:
         store.begin_run({})
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             store.record(done(job.key), attempts=1)
     with pytest.raises(ConfigError, match=f"plan: .*{told}"):
         Store(resolve(config(**planned_first | changes, resume=True)))

@@ -15,7 +15,7 @@ from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.reader import Results
@@ -31,7 +31,7 @@ def summary(config: Config) -> Summary:
     settings = config(
         envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1"
     )
-    jobs = plan(plan_cases(settings))
+    jobs = plan_jobs(plan_cases(settings))
     keys = [job.key for job in jobs]
     with Store(resolve(settings)) as store:
         store.begin_run(versions())
@@ -138,7 +138,7 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     settings = config(envs=[LINE], episodes=2, policy="act", policy_url="http://localhost:1")
     with Store(resolve(settings)) as store:
         store.begin_run(versions())
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             done = EpisodeResult(
                 job.key,
                 "done",
@@ -166,7 +166,7 @@ def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: in
     """The summary of an evaluation whose suites had these outcomes."""
     with Store(resolve(settings)) as store:
         store.begin_run(versions())
-        for job in plan(store.cases):
+        for job in plan_jobs(store.cases):
             if job.key.episode < len(outcomes[job.case.suite.name]):
                 success = outcomes[job.case.suite.name][job.key.episode]
                 waited = fields if job.case.suite.clock else {}
@@ -258,7 +258,8 @@ def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     assert alike.totals[0].success_once.rate == 1.0
     with Store(resolve(settings)) as store:
         store.begin_run({})
-        for job in plan(store.cases):  # one task is solved at once, the other every second time
+        # One task is solved at once, the other every second time.
+        for job in plan_jobs(store.cases):
             success = job.case.env == LINE or bool(job.key.episode % 2)
             if job.case.env == OTHER_LINE or job.key.episode < 12:
                 store.record(
@@ -309,7 +310,7 @@ def test_pushed_weights_are_named_with_the_checkpoint(
     settings = config(envs=[LINE], episodes=2, policy="act")
     with Store(resolve(settings)) as store:
         store.begin_run({})
-        for job, (first, last) in zip(plan(plan_cases(settings)), versions, strict=True):
+        for job, (first, last) in zip(plan_jobs(plan_cases(settings)), versions, strict=True):
             done = EpisodeResult(
                 job.key, "done", True, True, first_policy_version=first, policy_version=last
             )

@@ -18,7 +18,7 @@ from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import plan_cases
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.workers import pool
 from vlagents_ray.evaluate.workers.base import WorkerHandle
@@ -193,7 +193,7 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
 
 def test_reports_that_have_come_are_taken_in_one_turn(config: Config) -> None:
     settings = config(workers=2)
-    jobs = plan(plan_cases(settings))
+    jobs = plan_jobs(plan_cases(settings))
     with WorkerPool(resolve(settings), lambda _: ToZero()) as pool:
         for job in jobs[:2]:
             pool.start(job.case)

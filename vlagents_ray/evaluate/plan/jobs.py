@@ -43,7 +43,7 @@ class Job:
         return replace(self, attempt=self.attempt + 1, alone=self.alone or alone)
 
 
-def plan(cases: Iterable[EvalCase]) -> list[Job]:
+def plan_jobs(cases: Iterable[EvalCase]) -> list[Job]:
     """Return every episode of `cases`, case by case and seed by seed."""
     jobs = []
     for case in cases:

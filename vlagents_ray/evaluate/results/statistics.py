@@ -398,7 +398,7 @@ class Stopping:
 
 
 def place_in_plan(key: EpisodeKey, seeds: Sequence[int], episodes_per_seed: int) -> int | None:
-    """Return the index of an episode in its case's part of `jobs.plan`; None if it is no longer
+    """Return the index of an episode in its case's part of `plan_jobs`; None if it is no longer
     planned.
     """
     first_seed = key.seed - key.episode
