@@ -52,14 +52,14 @@ class LoraAdapter:
         return {"checkpoint": self.source, "weights": self.weights, "revision": self.revision}
 
 
-# Indices of the adapters of the rows of this thread's pass, int64; None if no row has one.
+# Index of the adapter of each row of this thread's pass, int64; None if no row has an adapter.
 _CHOSEN: ContextVar[Any] = ContextVar("chosen adapters", default=None)
 
 
 class _Values(dict[str, Any]):
     """The values of one adapter by their names in its file, float32 in the memory of the host.
 
-    A value that is set is also rounded into the tensors that the passes read.
+    Setting a value also writes it, rounded, into the tensors that the forward passes read.
     """
 
     def __init__(self, index: int) -> None:
@@ -68,8 +68,13 @@ class _Values(dict[str, Any]):
         self._targets: dict[str, tuple[Any, Any, float]] = {}
 
     def read(self, name: str, value: Any, target: Any, scale: float) -> None:
-        """Set a value of the file, which is written into `target` after multiplication by
-        `scale`.
+        """Set a value of the file.
+
+        Args:
+            name: The name in the file.
+            value: The value.
+            target: The tensor into which the value is written, and later those that replace it.
+            scale: The factor by which values are multiplied before that.
         """
         self._targets[name] = value, target, scale
         self[name] = value
@@ -91,11 +96,12 @@ class LoraAdapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
-        self.base = ""  # fingerprint of the base alone
+        self.base = ""  # fingerprint of the base without an adapter
         # Memory of the base that is on the host while the policy sleeps.
         self.moved: list[tuple[Any, Any]] = []
-        self._by_name: dict[str, LoraAdapter] = {}  # the names are those of resets
-        self._values = {"": _Values(0)}  # by fingerprint; those of the base are zeros
+        self._by_name: dict[str, LoraAdapter] = {}  # name in resets -> adapter
+        # Fingerprint -> values. The base has index 0, whose values are zeros.
+        self._values = {"": _Values(0)}
         self._device: Any = None
 
     @property
@@ -105,8 +111,9 @@ class LoraAdapters:
 
     @property
     def trainable(self) -> dict[str, dict[str, Any]]:
-        """The values of each adapter by their names in its file, which act when they are
-        replaced.
+        """The values of each adapter by their names in its file.
+
+        Replacing a value changes the actions.
         """
         return {name: self._values[adapter.fingerprint] for name, adapter in self._by_name.items()}
 
@@ -121,23 +128,23 @@ class LoraAdapters:
 
         Args:
             network: The torch module.
-            sources: The path or hub id of each adapter, by its name in resets.
+            sources: Name in resets -> path or hub id of the adapter.
             find: Returns the adapter at a source, and its folder.
-            adapt: Called with the fingerprint and the folder of each adapter that was read.
+            adapt: Is called with the fingerprint and the folder of each adapter.
 
         Raises:
             ConfigError: An adapter does not fit the network.
         """
         import torch
 
-        # A, B and scale by layer and fingerprint.
+        # Layer -> fingerprint -> A, B and scale.
         layers: dict[str, dict[str, tuple[Any, Any, float]]] = {}
         for name, source in sources.items():
             try:
                 adapter, folder = find(source)
                 self._values.setdefault(adapter.fingerprint, _Values(len(self._values)))
-                for layer, read in read_adapter(folder, network).items():
-                    layers.setdefault(layer, {})[adapter.fingerprint] = read
+                for layer, change in read_adapter(folder, network).items():
+                    layers.setdefault(layer, {})[adapter.fingerprint] = change
                 adapt(adapter.fingerprint, folder)
             except ConfigError as error:
                 raise ConfigError(f"adapter {name!r}: {error}") from error
@@ -163,9 +170,11 @@ class LoraAdapters:
             modules[layer].register_forward_hook(partial(self._add, downs, ups))
             self._device = weight.device
 
-    def named(self, name: object) -> LoraAdapter:
-        """Return the adapter with this name, or no adapter for None; raises `UnknownCheckpoint`
-        for an unknown name.
+    def find(self, name: object) -> LoraAdapter:
+        """Return the adapter with a name, or an empty one for None.
+
+        Raises:
+            UnknownCheckpoint: There is no adapter with this name.
         """
         if name is None:
             return LoraAdapter()
@@ -177,25 +186,27 @@ class LoraAdapters:
         return self._by_name[name]
 
     def example(self, number: int) -> str:
-        """Return an adapter's fingerprint for example row `number`; successive rows have
-        different ones.
+        """Return the fingerprint of an adapter for an example row.
+
+        Successive numbers select different adapters.
         """
         return list(self._values)[(number + 1) % len(self._values)]
 
     def require(self, fingerprint: str) -> str:
-        """Return the fingerprint; raise `UnknownSession` if the adapter of a moved session is
-        not loaded here.
+        """Return the fingerprint if its adapter is loaded.
+
+        Raises:
+            UnknownSession: The adapter of a moved session is not loaded in this replica.
         """
         if fingerprint not in self._values:
             raise UnknownSession(f"its adapter {fingerprint} is not loaded here; reset the session")
         return fingerprint
 
-    def stated(self, fingerprint: str) -> dict[str, Any]:
-        """Return the info of an act about its weights, which no push has changed; empty if the
-        server states them.
+    def weights_info(self, fingerprint: str) -> dict[str, Any]:
+        """Return the info of an answer about its weights, as long as no push has changed any.
 
-        A version of a learner is one of all adapters, which a replica that starts later gets as a
-        whole.
+        After a push, it is empty, and the server reports the version instead. A version of a
+        learner includes all adapters, and a replica that starts later gets all of them.
         """
         if fingerprint and any(values.pushed for values in self._values.values()):
             return {}
@@ -205,7 +216,11 @@ class LoraAdapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Apply an adapter to each row of the network's passes on this thread."""
+        """Apply an adapter to each row of the network's passes on this thread, in the context.
+
+        Args:
+            fingerprints: The adapter of each row; empty for rows without an adapter.
+        """
         indices = [self._values[fingerprint].index for fingerprint in fingerprints]
         chosen = None
         if any(indices):
@@ -220,8 +235,9 @@ class LoraAdapters:
             _CHOSEN.reset(token)
 
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
-        """Return the output of a layer, with N entries, after adding the change of each row's
-        adapter.
+        """Add the change of each row's adapter to the output of a layer.
+
+        This is a forward hook. The output has N entries, the same number for each row.
         """
         chosen = _CHOSEN.get()
         if chosen is None:
@@ -243,10 +259,16 @@ class LoraAdapters:
 
 
 def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
-    """Return ups (n, out, r) after convolutions downs (n, r, in, h, w) of x (N, in, H, W), as
-    chosen for each entry.
+    """Return the change of a convolution's output, by the adapter of each entry.
 
-    The entries are groups of one convolution, whose other settings are those of the module.
+    The entries are groups of one convolution, which has the other settings of the module.
+
+    Args:
+        module: The convolution.
+        x: Its input, (N, in, H, W).
+        downs: A of each of n adapters, (n, r, in, h, w).
+        ups: B of each adapter, (n, out, r).
+        chosen: The index of the adapter of each entry, (N,).
     """
     from torch.nn.functional import conv2d
 
@@ -293,14 +315,12 @@ _KNOWN = {
     "task_type",
     "use_rslora",
 }
-# Other values also change the weights of the base.
+# Values of `init_lora_weights` that do not change the weights of the base.
 _INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")
 
 
 def base_of(folder: Path) -> str | None:
-    """Return the checkpoint that the adapter's training names as its base; None if it names
-    none.
-    """
+    """Return the checkpoint on which an adapter was trained; None if its settings name none."""
     base = _config(folder).get("base_model_name_or_path") or None
     if base is not None and not isinstance(base, str):
         raise ConfigError(
@@ -318,9 +338,9 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
         network: The torch module that the adapter changes.
 
     Returns:
-        For each layer that the adapter changes, by the name of its module: A (r, in), or (r, in,
-        height, width) of a convolution, B (out, r), or (out, r, 1, 1), both float32 in the memory
-        of the host, and the scale of B.
+        Name of the module of each changed layer -> A, B and the scale of B. A is (r, in), or (r,
+        in, height, width) for a convolution. B is (out, r), or (out, r, 1, 1). Both are float32 in
+        the memory of the host.
 
     Raises:
         ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or
@@ -343,9 +363,7 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
 
 
 def _config(folder: Path) -> dict[str, Any]:
-    """Return the settings of an adapter; raises `ConfigError` if they are not those of a plain
-    LoRA.
-    """
+    """Return the settings of an adapter; raises `ConfigError` unless it is a plain LoRA."""
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -376,12 +394,12 @@ def _config(folder: Path) -> dict[str, Any]:
 
 
 def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> None:
-    """Raise `ConfigError` unless the file holds pairs of A and B, and otherwise only unchanged
-    values of the network.
+    """Raise `ConfigError` unless a file contains pairs of A and B.
 
-    If the last layer of a language model has an adapter, PEFT also saves the whole layer.
+    It may also contain values of the network, if they are unchanged: if the last layer of a
+    language model has an adapter, PEFT also saves the whole layer.
     """
-    pairs: set[str] = set()  # the names of A and B of each layer that has at least one of them
+    pairs: set[str] = set()  # the names of A and B of each layer of which the file has one
     for key in saved:
         for suffix in (_DOWN, _UP):
             if key.endswith(suffix):
@@ -394,11 +412,8 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
     base_values = network.state_dict() if unpaired else {}
     for key in unpaired:
         value = base_values.get(key.removeprefix(_PREFIX).replace(_BASE, "."))
-        if (
-            value is None
-            or saved[key].shape != tuple(value.shape)
-            or not converted(saved[key], value).equal(value)
-        ):
+        has_same_shape = value is not None and saved[key].shape == tuple(value.shape)
+        if not has_same_shape or not converted(saved[key], value).equal(value):
             faults.append(key)
 
     if faults or not pairs:
@@ -410,9 +425,7 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
 
 
 def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless all layers of an adapter are linear ones and plain convolutions
-    of the network.
-    """
+    """Raise `ConfigError` unless an adapter changes only linear layers and plain convolutions."""
     unknown = sorted(name for name in names if name not in modules)
     if unknown:
         raise ConfigError(
@@ -436,8 +449,8 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
 def _is_adaptable(module: Any) -> bool:
     """Return whether a module is a linear layer or a plain convolution.
 
-    Derived classes do not count: some, as in torch's attention, are never called, and only their
-    weights are used.
+    The class must not be a derived one: some derived classes, as in torch's attention, are never
+    called, and only their weights are used.
     """
     from torch.nn import Conv2d, Linear
 
@@ -449,7 +462,15 @@ def _is_adaptable(module: Any) -> bool:
 def _layer(
     folder: Path, name: str, saved: Mapping[str, Any], config: Mapping[str, Any], weight: Any
 ) -> tuple[Any, Any, float]:
-    """Return A, B and the scale of a layer as `read_adapter` does; `weight` is the layer's."""
+    """Return A, B and the scale of a layer, as `read_adapter` does.
+
+    Args:
+        folder: The folder of the adapter, for errors.
+        name: The name of the layer's module.
+        saved: The values in the file of the adapter.
+        config: The settings of the adapter.
+        weight: The weights of the layer.
+    """
     from torch import empty, float32
 
     saved_down, saved_up = saved[f"{_PREFIX}{name}{_DOWN}"], saved[f"{_PREFIX}{name}{_UP}"]

@@ -28,8 +28,9 @@ class NoopConfig(BaseModel, extra="forbid"):
 
 
 class Noop(Agent):
-    """Returns zeros, (D,) or (chunk, D). A batch of B takes `base_ms + per_item_ms * B`, in a
-    single sleep.
+    """Returns zeros, (D,) or (chunk, D).
+
+    A batch of B takes `base_ms + per_item_ms * B` milliseconds, in a single sleep.
     """
 
     Config: ClassVar[type] = NoopConfig

@@ -33,11 +33,10 @@ class RandomConfig(BaseModel, extra="forbid"):
 
 
 class Random(Agent):
-    """Returns actions that are uniform in [low, high] and depend only on the seeds of the config
-    and the episode.
+    """Returns random actions, uniform in [low, high].
 
-    For an observation with `info["samples"] = N` it also returns its distribution, as RL
-    fine-tuning needs.
+    They depend only on the seeds of the config and of the episode. For an observation with
+    `info["samples"] = N`, the answer also contains the distribution, as RL fine-tuning needs.
     """
 
     Config: ClassVar[type] = RandomConfig
@@ -46,7 +45,7 @@ class Random(Agent):
     def __init__(self, config: RandomConfig | None = None) -> None:
         self.config = config or RandomConfig()
         self._rng: np.random.Generator | None = None
-        # Of samples, so that requesting them changes no action.
+        # The generator of samples, so that requesting them changes no action.
         self._draws: np.random.Generator | None = None
 
     @property

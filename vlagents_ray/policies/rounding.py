@@ -1,9 +1,8 @@
-"""Another rounding of the same computation, from which the noise of a checkpoint's own numbers is
-measured.
+"""The same computation with other rounding errors, to measure the numerical noise of a checkpoint.
 
-It is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16
-bits is moved by a random part of its last place, as another order of sums or another kernel would
-move it.
+This is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16
+bits is changed by a random fraction of its last digit. Another order of sums, or another kernel,
+changes it by a similar amount.
 """
 
 from __future__ import annotations
@@ -18,18 +17,20 @@ _ROUNDED = (torch.float16, torch.bfloat16)
 
 
 class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
-    """A context in which results of 16 bits are rounded another way; it draws from no generator
-    of the process.
+    """A context in which results of 16 bits are rounded differently.
+
+    It has its own random generators, so that those of the process are not changed.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.types: set[str] = set()  # of the results, such as "bfloat16"
-        self._generators: dict[Any, Any] = {}  # by device
+        self.types: set[str] = set()  # the types of the results, such as "bfloat16"
+        self._generators: dict[Any, Any] = {}  # device -> generator
 
     def run(self, function: Callable[..., Any], *tensors: Any) -> Any:
-        """Return the function's result; casts of weights by `autocast` are not cached, as they
-        are rounded here.
+        """Return the function's result.
+
+        Casts of weights by `autocast` are not cached, since they are also rounded differently.
         """
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)

@@ -102,7 +102,7 @@ class DiffusionPolicy(ModelPolicy):
             facts["state"] = {
                 part: StateSpec(width) for part, width in zip(state_parts, widths, strict=True)
             }
-        return self.stated(
+        return self.make_contract(
             self._cameras(network), state_parts, network.module.n_action_steps, **facts
         )
 

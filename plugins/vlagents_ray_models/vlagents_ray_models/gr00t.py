@@ -694,7 +694,7 @@ class Gr00t(ModelPolicy):
             facts["state"] = {
                 part: StateSpec(width) for part, width in widths.items() if part != GRIPPER
             }
-        return self.stated(self._cameras(robot), list(widths), robot.horizon, **facts)
+        return self.make_contract(self._cameras(robot), list(widths), robot.horizon, **facts)
 
     def load(self) -> Gr00tNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
@@ -727,7 +727,7 @@ class Gr00t(ModelPolicy):
         # Without a history, all offsets are 0.
         all_images = [images] * len(robot.offsets["video"])
         all_states = [state] * len(robot.offsets["state"])
-        inputs = network.read(all_images, all_states, self._begun().instruction)
+        inputs = network.read(all_images, all_states, self._current_episode().instruction)
         return Gr00tFrame(images, state, inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:

@@ -109,7 +109,7 @@ class Octo(ModelPolicy):
             return Contract(instruction=instruction, history=self.config.window)
 
         dim = len(network.statistics(self.config.dataset, "action")["mean"])
-        return self.stated(
+        return self.make_contract(
             self._cameras(network),
             self.config.state or (),
             network.head.action_horizon,
@@ -160,7 +160,7 @@ class Octo(ModelPolicy):
         goal = self._goal(obs, instruction)
         info = super().reset(obs, instruction, **kwargs)
         if goal is not None:
-            self._begun().memory[GOAL_IMAGE] = goal
+            self._current_episode().memory[GOAL_IMAGE] = goal
         return info
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:

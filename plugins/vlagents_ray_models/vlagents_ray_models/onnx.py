@@ -844,14 +844,14 @@ class Onnx(ModelPolicy):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode, and encode its instruction."""
         info = super().reset(obs, instruction, **kwargs)
-        self._begun().prompt = self.loaded().encode_instruction(instruction or "")
+        self._current_episode().prompt = self.loaded().encode_instruction(instruction or "")
         return info
 
     def observe(self, obs: Obs) -> None:
         """Add an observation, from which the model also computes its next memory."""
         super().observe(obs)
         if self.model.has_memory:
-            episode = self._begun()
+            episode = self._current_episode()
             frames = tuple(episode.frames)
             row = Row(frames, episode.instruction, episode.rng, memory=episode.memory)
             self.predict([row])
@@ -859,7 +859,7 @@ class Onnx(ModelPolicy):
     def perceive(self, obs: Obs) -> Frame:
         """Return the inputs that come from an observation and from the instruction."""
         network: Network = self.model
-        frame = Frame(dict(self._begun().prompt))
+        frame = Frame(dict(self._current_episode().prompt))
         for name, image in camera_images(obs, network.cameras).items():
             frame.values[name] = self._pixels(name, image)
         for name in network.vectors:

@@ -791,7 +791,7 @@ class OpenPi(ModelPolicy):
         state = {
             name: StateSpec(dim) for name, dim in dims.items() if name not in (GRIPPER, CLOSED)
         }
-        return self.stated(
+        return self.make_contract(
             robot.cameras,
             list(dims),
             self.model.horizon,
@@ -846,7 +846,7 @@ class OpenPi(ModelPolicy):
         """Convert an observation to openpi's form and to the model's inputs."""
         loaded = self.loaded()
         observation = loaded.robot.read(obs)
-        inputs = loaded.transforms.read(observation, self._begun().instruction)
+        inputs = loaded.transforms.read(observation, self._current_episode().instruction)
         return OpenPiFrame(observation, inputs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:

@@ -128,7 +128,9 @@ class Pi0(ModelPolicy):
         horizon = None if model is None else model.network.config.chunk_size
         action = ActionSpec(dim=None if model is None else len(model.processor.actions_mean))
         behaviour = self.offered(OFFERED if self.config.noise_level else ())
-        return self.stated(self.cameras, self.state, horizon, action=action, behaviour=behaviour)
+        return self.make_contract(
+            self.cameras, self.state, horizon, action=action, behaviour=behaviour
+        )
 
     @property
     def state_dim(self) -> int | None:
@@ -203,7 +205,7 @@ class Pi0(ModelPolicy):
         values = state_vector(obs, self.state, self.state_dim)
         state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
 
-        inputs = {**self._begun().prompt, **images, "state": state}
+        inputs = {**self._current_episode().prompt, **images, "state": state}
         staged: StagedRow = model.staging.stage(inputs)
         return staged
 
@@ -279,7 +281,7 @@ class Pi0(ModelPolicy):
                 f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it "
                 "stands for an image"
             )
-        self._begun().prompt = {name: array[0] for name, array in tokens.items()}
+        self._current_episode().prompt = {name: array[0] for name, array in tokens.items()}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """Compute the chunks of rows, in one pass for each step of the flow."""

@@ -599,7 +599,7 @@ class VJepa2Ac(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        return self.stated(
+        return self.make_contract(
             self._cameras,
             [*self._state, GRIPPER],
             self.config.rollout,
@@ -660,7 +660,7 @@ class VJepa2Ac(ModelPolicy):
                 f"info[{GOAL_IMAGE!r}]: got {description}, want (H, W, 3) uint8 RGB"
             )
 
-        pixels, memory = to_pixels(image, self.config.image_size), self._begun().memory
+        pixels, memory = to_pixels(image, self.config.image_size), self._current_episode().memory
         if _GOAL not in memory or not np.array_equal(pixels, memory[_GOAL].pixels):
             memory[_GOAL] = Goal(pixels)
 

@@ -379,7 +379,7 @@ def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
         lambda source: (LoraAdapter(source, "a", "a"), folder),
         lambda *_: None,
     )
-    with adapters.rows([adapters.named("tiny").fingerprint] * DIM):
+    with adapters.rows([adapters.find("tiny").fingerprint] * DIM):
         change = small["see"](x) - plain
     down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")
     np.testing.assert_allclose(change.detach().numpy(), (up @ down).T, atol=4e-3)

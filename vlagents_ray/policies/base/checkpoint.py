@@ -39,8 +39,9 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within
-    another replaces it.
+    """Yield a list of the paths that `find_checkpoint` finds in this context.
+
+    If a path is inside of an earlier one, it replaces that one.
     """
     paths: list[Path] = []
     token = _used.set(paths)
@@ -51,15 +52,14 @@ def used_checkpoints() -> Iterator[list[Path]]:
 
 
 def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
-    """Return the folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if
-    it is not cached.
+    """Return the folder or the file of a checkpoint, which is downloaded if necessary.
 
     Args:
-        name: The path, or a hub id, optionally with a commit, a tag or a branch:
+        name: A path on this machine; or a hub id, optionally with a commit, a tag or a branch:
             `org/name@REVISION`.
-        step: Replaces `{step}` in `name`, with leading zeros to six digits if only that path
+        step: Replaces `{step}` in `name`. It is padded with zeros to six digits if only that path
             exists.
-        needs: Files (or glob patterns) that a folder must hold.
+        needs: Files (or glob patterns) that a folder must contain.
 
     Raises:
         ConfigError: There is no such checkpoint, or a file is missing.
@@ -91,8 +91,9 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 
 
 def _holds(folder: Path, path: Path) -> bool:
-    """Return whether `path` is in the folder, or is the folder under another name, as behind a
-    link `last`.
+    """Return whether a path is in a folder, or is the folder itself.
+
+    Links are followed, such as a link `last` to a step.
     """
     if not folder.is_dir():
         return False
@@ -145,8 +146,13 @@ def find_adapter(
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
-    """Return whether the base that an adapter names is known to differ from `checkpoint`, at the
-    paths `base`.
+    """Return whether an adapter is known to have been trained on another base.
+
+    Args:
+        trained_on: The name of the base in the settings of the adapter.
+        checkpoint: The name of the policy's checkpoint.
+        base: The files and folders of that checkpoint.
+        digest_of_base: Their digest.
     """
     # Unlike the methods of Path, os.path raises neither for unknown users nor for folders that
     # are not visible here.
@@ -252,13 +258,13 @@ def _safetensors(folder: Path) -> list[Path]:
 
 
 def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless every parameter and saved buffer of `model` has the checkpoint's
-    value.
+    """Check that a model has the values of its checkpoint.
 
-    Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A
-    parameter that is tied to another one may be absent. Some libraries continue with random weights
-    if they cannot load the checkpoint's: the result looks like a bad policy, and is hard to
-    diagnose.
+    Some libraries continue with random weights if they cannot load those of the checkpoint. The
+    result looks like a bad policy, and is hard to diagnose.
+
+    The names and shapes of all parameters and saved buffers are compared, and 64 elements of each
+    tensor, in the model's dtype. A parameter that is tied to another one may be missing.
     """
     torch = require("torch")
     saved_names = set(saved)
@@ -289,11 +295,10 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
 
 
 def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
-    """Return `cls.from_pretrained(path, **options)`; raises `ConfigError` if a parameter is not in
-    the checkpoint.
+    """Load a model with transformers, `cls.from_pretrained(path, **options)`.
 
-    From version 5 on transformers renames parameters as it reads them, so `require_loaded`, which
-    compares names, cannot check its models; but transformers reports the parameters without values.
+    Since version 5, transformers renames parameters when it reads them. `require_loaded` compares
+    names, and cannot check such models. Instead, transformers reports parameters without values.
     """
     try:
         model, loading_info = cls.from_pretrained(path, output_loading_info=True, **options)
@@ -316,8 +321,7 @@ def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
 
 
 def require_filled(params: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes
-    in `expected`.
+    """Check that nested parameters have exactly the expected names and shapes.
 
     This check is for JAX, whose loaders return only values from the checkpoint.
     """

@@ -1,8 +1,7 @@
-"""Checks of a checkpoint's files without a model: whether they are complete, and which weights they
-hold.
+"""Checks of a checkpoint's files, without loading a model.
 
-`unfinished` examines only the files, and reports nothing in doubt. `weights_of` identifies weights
-by a digest that takes seconds, and by the commit on the hub.
+`unfinished` checks whether the files are complete; in doubt, it reports nothing. `weights_of`
+identifies the weights with a digest, which takes seconds, and with the commit on the hub.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-# Names that trainers give to files in progress: orbax' folders, and the usual suffixes.
+# Names that trainers give to unfinished files: orbax' folders, and the usual suffixes.
 TEMPORARY = (
     "*.orbax-checkpoint-tmp*",
     "*.tmp",
@@ -31,12 +30,12 @@ TEMPORARY = (
     ".tmp*",
 )
 
-# Written along with weights, and often before them.
+# Suffixes of files without weights, which are often written before the weights.
 _TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")
 
 METHOD = "sampled-sha256"
 _WHOLE = 2**20  # bytes; a file up to this size is read in full
-_BLOCK, _BLOCKS = 4096, 256
+_BLOCK, _BLOCKS = 4096, 256  # bytes of a block, and the number of blocks
 _LONGEST_HEADER = 10**8  # bytes; the limit of safetensors
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 # Files about a checkpoint, which do not affect its behaviour.
@@ -44,13 +43,18 @@ _BESIDE = (".md", ".gitattributes", ".log")
 
 
 def unfinished(path: Path) -> str | None:
-    """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no
-    sign.
+    """Return why a checkpoint is incomplete.
 
-    A .safetensors file must have the length in its header, an index may name only existing files,
-    JSON must be valid, and a zip file, as written by torch.save, must end with its directory. Files
-    of other kinds give no sign: the caller must also check that they no longer grow. A folder
-    without weights is incomplete.
+    A .safetensors file must have the length in its header. An index may name only existing files.
+    JSON must be valid. A zip file, as written by torch.save, must end with its directory. A folder
+    must contain weights. Other kinds of files are not checked: the caller must also check that they
+    no longer grow.
+
+    Args:
+        path: A file or a folder.
+
+    Returns:
+        The reason; None if nothing shows that the checkpoint is incomplete.
     """
     try:
         entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
@@ -73,9 +77,7 @@ def unfinished(path: Path) -> str | None:
 
 
 def _trouble(file: Path) -> str | None:
-    """Return the sign that a file is incomplete, by the check for its suffix; None if there is
-    none.
-    """
+    """Return why a file is incomplete, by the check for its suffix; None if it passes."""
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
@@ -85,6 +87,7 @@ def _trouble(file: Path) -> str | None:
 
 
 def _safetensors(file: Path) -> str | None:
+    """Return why a .safetensors file is incomplete; None if it has the length in its header."""
     size = file.stat().st_size
     with file.open("rb") as opened:
         length = int.from_bytes(opened.read(8), "little")
@@ -101,23 +104,25 @@ def _data_offsets(header: bytes) -> list[tuple[int, int]]:
     The file begins with 8 bytes, the length of the header.
     """
     entries = json.loads(header)
-    return [
-        tuple(entry["data_offsets"]) for name, entry in entries.items() if name != "__metadata__"
-    ]
+    entries.pop("__metadata__", None)
+    return [tuple(entry["data_offsets"]) for entry in entries.values()]
 
 
 def _index(file: Path) -> str | None:
+    """Return which files an index names that do not exist; None if there are none."""
     names = set(json.loads(file.read_text(encoding="utf-8"))["weight_map"].values())
     absent = sorted(name for name in names if not (file.parent / name).is_file())
     return f"names {absent}, which are missing" if absent else None
 
 
 def _json(file: Path) -> str | None:
+    """Return None; raises `ValueError` if the file is not JSON."""
     json.loads(file.read_text(encoding="utf-8"))
     return None
 
 
 def _zip(file: Path) -> str | None:
+    """Return why a file of torch.save is incomplete; None if nothing shows that."""
     with file.open("rb") as opened:
         first_bytes = opened.read(4)
     if not first_bytes:
@@ -139,29 +144,36 @@ _CHECKS: dict[str, Callable[[Path], str | None]] = {
 
 
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
-    """Return `Agent.weights_id` of files and folders, of which the first is the policy's own; None
-    if there are none.
+    """Return `Agent.weights_id` of a policy.
 
-    The digest covers all of them, the revision only the first: later ones, such as an encoder's,
-    may come from another repository.
+    The digest covers all files. The revision is that of the first path, since the others, such as
+    that of an encoder, may come from another repository.
+
+    Args:
+        paths: Files and folders; the first one is the policy's checkpoint.
+
+    Returns:
+        The digest and the revision; None if there are no paths.
     """
-    return {"digest": digest(paths), "revision": revision(paths[0])} if paths else None
+    if not paths:
+        return None
+    return {"digest": digest(paths), "revision": revision(paths[0])}
 
 
 def digest(paths: Iterable[Path]) -> str:
-    """Return `sampled-sha256:` and 64 hexadecimal digits, which are equal for equal files with
-    equal names.
+    """Return a digest of files, `sampled-sha256:` and 64 hexadecimal digits.
 
-    The digest covers the name and the size of each file, in a folder sorted by name, and part of
-    its content:
+    Equal files with equal names have equal digests. The digest covers the name and the size of each
+    file, and some of its content. The files of a folder are sorted by name.
 
-    - all of it up to 1 MiB;
-    - of a larger .safetensors file the header and 4 KiB in the middle of each tensor;
-    - of a zip file, as written by torch.save, the directory with the CRC-32 of each part;
-    - of any other file 256 blocks of 4 KiB at equal distances.
+    - A file of at most 1 MiB is read in full.
+    - Of a larger .safetensors file, the header and 4 KiB in the middle of each tensor are read.
+    - Of a zip file, as written by torch.save, the directory is read, which has the CRC-32 of each
+      entry.
+    - Of any other file, 256 blocks of 4 KiB at equal distances are read.
 
-    Different weights, statistics or settings therefore have different digests, but a deliberate
-    change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
+    Therefore, different weights, statistics or settings have different digests, but a deliberate
+    change of a few bytes may not be noticed. Hidden files and READMEs are not covered.
     """
     sha256 = hashlib.sha256()
     for path in paths:
@@ -178,24 +190,28 @@ def digest(paths: Iterable[Path]) -> str:
 
 
 def revision(path: Path) -> str | None:
-    """Return the commit of the hub's repository if `path` is in a snapshot of the hub's cache,
-    else None.
-    """
-    parts = path.absolute().parts
-    commits = [commit for folder, commit in itertools.pairwise(parts) if folder == "snapshots"]
-    return next((commit for commit in commits if _COMMIT.fullmatch(commit)), None)
+    """Return the commit of a path in a snapshot of the hub's cache; None for any other path."""
+    for folder, name in itertools.pairwise(path.absolute().parts):
+        if folder == "snapshots" and _COMMIT.fullmatch(name):
+            return name
+    return None
 
 
 def files_in(path: Path) -> list[Path]:
-    """Return the files of a checkpoint that count for its digest, in the order of their names."""
+    """Return the files of a checkpoint that its digest covers, sorted by name."""
     if path.is_file():
         return [path]
     return sorted(_below(path, frozenset()))
 
 
 def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
-    """Yield the files of a folder that count, following links as loaders do; `above` are the
-    folder's parents.
+    """Yield the files of a folder that a digest covers.
+
+    Links are followed, as loaders do.
+
+    Args:
+        folder: The folder.
+        above: The real paths of its parents, which are not entered again.
     """
     within = above | {os.path.realpath(folder)}
     with contextlib.suppress(OSError):  # The folder cannot be read, or is gone.
@@ -233,10 +249,11 @@ def _sampled_blocks(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
 
 
 def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
-    """Return the header of a .safetensors file, and the start and length of a block in the middle
-    of each tensor.
+    """Read the header of a .safetensors file.
 
-    Returns None if the file has another format.
+    Returns:
+        The header, and the start and the length of a block in the middle of each tensor; None if
+        the file has another format.
     """
     length = int.from_bytes(opened.read(8), "little")
     if length > _LONGEST_HEADER:

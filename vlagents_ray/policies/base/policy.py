@@ -1,5 +1,6 @@
-"""The base of policies that are models: sessions, history, chunks and samples around one forward
-pass.
+"""The base class of policies that are models.
+
+It has the sessions, histories, chunks and samples; a model family adds the forward pass.
 """
 
 from __future__ import annotations
@@ -99,20 +100,20 @@ class PolicyEpisode:
     frames: deque[Any]  # results of `perceive`, oldest first
     rng: np.random.Generator
     draws: np.random.Generator  # generator of samples, so that requesting them changes no action
-    plan: ChunkBuffer  # the actions still to be returned, where single ones are
+    plan: ChunkBuffer  # the actions that are still to be returned, if they are returned singly
     memory: dict[str, Any] = field(default_factory=dict)
-    adapter: str = ""  # fingerprint of its adapter; empty: none
-    # The instruction's tokens, of families that compute them when the episode begins.
+    adapter: str = ""  # fingerprint of the adapter; empty without an adapter
+    # The tokens of the instruction, if a family computes them when the episode begins.
     prompt: Any = None
 
 
 class ModelPolicy(Agent, abc.ABC):
-    """The base class of the model families. A family defines `load`, `perceive`, `predict` and its
-    contract.
+    """The base class of the model families.
 
-    The model computes one row for each observation, all sessions of a batch in one forward pass of
-    at most `config.rows` rows. A session's noise is drawn from its own generator, seeded by the
-    config's seed and the episode's.
+    A family defines `load`, `perceive`, `predict` and its contract. The model computes one row for
+    each observation, and all sessions of a batch in one forward pass of at most `config.rows` rows.
+    Each session draws its noise from a generator that is seeded with the seeds of the config and
+    of the episode.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
@@ -149,41 +150,47 @@ class ModelPolicy(Agent, abc.ABC):
 
     @property
     def most_rows(self) -> int:
-        """The largest number of rows of one forward pass: the config's, or fewer if more did not
-        fit into memory.
+        """The largest number of rows of a forward pass.
+
+        It is that of the config, or a smaller one if that did not fit into memory.
         """
         return min(self.config.rows, self.report.most_rows or self.config.rows)
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the model's state vector, once loaded; for the warm-up where its parts
-        may have any length.
+        """The length of the model's state vector, once the model is loaded.
+
+        The warm-up needs it if parts of the state may have any length.
         """
         return None
 
     def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
-        """Return the names for the contract's `behaviour`; None without any, or if an act is not
-        a whole chunk.
+        """Return the names for the contract's `behaviour`.
+
+        Returns:
+            The names; None if there are none, or if an answer is not a whole chunk.
         """
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
-        """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
-        return min(self.config.execute or horizon, horizon) if self.config.actions == "chunk" else 1
+        """Return, for the contract, the number of the model's `horizon` rows in an answer."""
+        if self.config.actions != "chunk":
+            return 1
+        return min(self.config.execute or horizon, horizon)
 
-    def stated(
+    def make_contract(
         self, cameras: Mapping[str, str], parts: Sequence[str], horizon: int | None, **facts: Any
     ) -> Contract:
         """Return the contract of a model.
 
         Args:
-            cameras: Its names of the cameras -> ours.
-            parts: The parts of its state vector, in order.
-            horizon: The rows of its chunks; None before they are known.
-            facts: Further fields of the contract, or other values of these.
+            cameras: The model's name of each camera -> the name in observations.
+            parts: The parts of the state vector, in order.
+            horizon: The number of rows of a chunk; None if it is not yet known.
+            facts: Further fields of the contract, which replace the usual ones.
         """
         usual: dict[str, Any] = {
-            # Of any size: families resize them.
+            # Images may have any size: families resize them.
             "cameras": {ours: CameraSpec() for ours in cameras.values()},
             "state": state_specs(parts, self.state_dim),
             "gripper": needs_gripper(parts),
@@ -199,25 +206,25 @@ class ModelPolicy(Agent, abc.ABC):
 
     @abc.abstractmethod
     def perceive(self, obs: Obs) -> Any:
-        """Convert and resize an observation for the history, as `Agent.prepare` does, whose rules
-        apply.
+        """Convert and resize an observation for the history.
 
-        `self` is the session's copy, in an episode. An error fails the request of that session
-        only.
+        The rules of `Agent.prepare` apply. `self` is the copy of a session that is in an episode.
+        An error is the result of that session's request alone.
         """
 
     @abc.abstractmethod
     def predict(self, rows: Sequence[Row]) -> Sequence[Prediction | Exception]:
-        """Compute one chunk for each row, all in one forward pass. A row's result must not
-        depend on the others.
+        """Compute a chunk for each row in one forward pass.
+
+        The result of a row must not depend on the other rows.
         """
 
     def initialize(self) -> None:
-        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's
-        cores for it.
+        """Load the checkpoint, and warm up.
 
-        Without `batch_sizes`, one row and a full batch run on an accelerator, so that a missing
-        kernel, or too little memory, is an error before a robot acts.
+        With `batch_sizes`, each size runs once, or the model's cores are compiled for it. Without
+        them, one row and a full batch run on an accelerator, so that a missing kernel or too little
+        memory is an error before a robot acts.
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
@@ -248,21 +255,21 @@ class ModelPolicy(Agent, abc.ABC):
             if cores:
                 self.compilation.add_size(size, partial(self._run_examples, size, seeds))
             elif self.config.batch_sizes and self.report.accelerated:
-                # This pass also loads kernels: only the duration of the next one counts.
+                # The first pass also loads kernels; only the duration of the second one is used.
                 self._run_examples(size, seeds)
             self._run_examples(size, seeds)
 
         if sizes:
-            free_memory()  # A full batch took it, and usual ones do not need it.
+            free_memory()  # memory of the full batch, which usual batches do not need
         for device in self.report.devices:
             if device["kind"] == "cuda" and cores:
                 device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
         self.report.timer = gpu_timer(self.report)
 
     def _decide_on_compiling(self) -> None:
-        """Set `compile` to what it means for the loaded model and its device."""
-        kinds = [device["kind"] for device in self.report.devices]
-        kind = next((kind for kind in kinds if kind != "cpu"), "cpu")
+        """Resolve the setting `compile` for the loaded model and its device."""
+        device_kinds = [device["kind"] for device in self.report.devices]
+        kind = next((kind for kind in device_kinds if kind != "cpu"), "cpu")
         mode = self.config.compile_on(kind)
         if self.config.compile == "auto":
             mode = mode if self.compilation.cores else False
@@ -283,42 +290,48 @@ class ModelPolicy(Agent, abc.ABC):
             self.config = self.config.with_sizes(self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named
-        `kwargs["adapter"]`.
+        """Begin an episode.
+
+        The options are `seed`, an int, by default 0, and `adapter`, the name of an adapter.
         """
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation(
                 "instruction: got none, want what the robot is to do, in words"
             )
-        adapter = self.adapters.named(kwargs.get(ADAPTER))
+        adapter = self.adapters.find(kwargs.get(ADAPTER))
         self._begin(instruction or "", int(kwargs.get("seed") or 0), adapter.fingerprint)
         self.notice(obs)
         return adapter.identity
 
     def notice(self, obs: Obs) -> None:
-        """Update the session's memory from an observation; called for each one, also if no chunk
-        is requested.
+        """Update the session's memory from an observation.
+
+        This is called for each observation, even if no chunk is requested.
         """
 
     def observe(self, obs: Obs) -> None:
         self.notice(obs)
-        self._begun().frames.append(self.perceive(obs))
+        self._current_episode().frames.append(self.perceive(obs))
 
     def prepare(self, obs: Obs) -> Any:
-        """Return the result of `perceive` on the observation; None if actions of an earlier
-        chunk may be left.
+        """Return the result of `perceive` for the observation.
+
+        Returns:
+            The result; None if actions of an earlier chunk may be left, which need no observation.
         """
-        return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
+        if self.config.actions == "queue" and self.history == 1:
+            return None
+        return self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for
-        all that need one.
+        """Return a chunk (H, D), or one action (D,), for each session.
+
+        All sessions that need a forward pass share one.
         """
-        rows_by_session = [
-            attempt(self._rows, session_obs, session)
-            for session_obs, session in zip(obs, sessions, strict=True)
-        ]
+        rows_by_session = []
+        for session_obs, session in zip(obs, sessions, strict=True):
+            rows_by_session.append(attempt(self._rows, session_obs, session))
 
         rows: list[Row] = []
         for session_rows in rows_by_session:
@@ -338,7 +351,7 @@ class ModelPolicy(Agent, abc.ABC):
     def sleep(self) -> None:
         """Free the captured graphs, and move the weights to the host if the policy has adapters."""
         self.compilation.drop_graphs()
-        if self.config.adapters:  # the server moves the trainable values alone
+        if self.config.adapters:  # the server moves only the trainable values
             to_host([named_values(attrgetter(self.network or "")(self))], self.adapters.moved)
 
     def wake(self) -> None:
@@ -363,18 +376,18 @@ class ModelPolicy(Agent, abc.ABC):
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Check the files beside an adapter in its folder, and keep the statistics that normalise
-        its rows.
+        """Check the other files in an adapter's folder, and keep the statistics of its rows.
 
         Args:
             adapter: The adapter's fingerprint, as in `Row.adapter`.
-            folder: The folder, of which the adapter itself has been read.
+            folder: The folder, from which the adapter itself has been read.
 
         Raises:
-            ConfigError: It is not of the base's inputs and actions.
+            ConfigError: The adapter has other inputs or actions than the base.
         """
 
     def _load_with_adapters(self) -> Any:
+        """Load the checkpoint and the adapters, and return the model."""
         with used_checkpoints() as base:
             self.model = self.load()
         weights = weights_of(base) or {}
@@ -390,7 +403,8 @@ class ModelPolicy(Agent, abc.ABC):
         return self.model
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        # Numpy accepts no negative seed; no two int64 share a number.
+        """Begin an episode in this session."""
+        # Numpy accepts no negative seed. Modulo 2**64, each int64 has a distinct number.
         seeds = [self.config.seed, seed % 2**64]
         self.episode = PolicyEpisode(
             instruction,
@@ -401,7 +415,8 @@ class ModelPolicy(Agent, abc.ABC):
             adapter=adapter,
         )
 
-    def _begun(self) -> PolicyEpisode:
+    def _current_episode(self) -> PolicyEpisode:
+        """Return the episode of this session; raises `NotReset` if there is none."""
         if self.episode is None:
             raise NotReset(
                 f"{type(self).__name__}: act before reset; call reset(obs, instruction) first"
@@ -409,10 +424,12 @@ class ModelPolicy(Agent, abc.ABC):
         return self.episode
 
     def _rows(self, obs: Obs, session: ModelPolicy) -> list[Row]:
-        """Return the rows to compute for a session: none while actions are left, else its chunk,
-        then its samples.
+        """Return the rows to compute for a session.
+
+        Returns:
+            The row of the chunk, and then those of the samples; empty while actions are left.
         """
-        episode = session._begun()
+        episode = session._current_episode()
         samples = wanted_samples(obs, self.config)
         want = wanted_behaviour(obs)
         session.notice(obs)
@@ -449,11 +466,15 @@ class ModelPolicy(Agent, abc.ABC):
     def _act(
         self, session: ModelPolicy, predictions: list[Prediction | Exception]
     ) -> Act | Exception:
-        """Return a session's answer: from its predictions, the chunk and then its samples, or
-        from its plan if there are none.
+        """Return the answer to a session.
+
+        Args:
+            session: The session.
+            predictions: Those of the chunk and of its samples. Without them, the answer is the next
+                action of the session's plan.
         """
-        episode = session._begun()
-        info = self.adapters.stated(episode.adapter)
+        episode = session._current_episode()
+        info = self.adapters.weights_info(episode.adapter)
         if not predictions:
             return Act(episode.plan.take().action, info=info)
 
@@ -464,7 +485,7 @@ class ModelPolicy(Agent, abc.ABC):
             computed.append(prediction)
 
         chunk_prediction, *samples = computed
-        chunk = self._used(chunk_prediction.actions)
+        chunk = self._executed_rows(chunk_prediction.actions)
         info |= chunk_prediction.info
         if chunk_prediction.behaviour:
             info[BEHAVIOUR] = chunk_prediction.behaviour
@@ -481,14 +502,15 @@ class ModelPolicy(Agent, abc.ABC):
         episode.plan.add(Chunk(0, episode.plan.executed, chunk))
         return Act(episode.plan.take().action, info=info)
 
-    def _used(self, actions: np.ndarray) -> np.ndarray:
+    def _executed_rows(self, actions: np.ndarray) -> np.ndarray:
+        """Return the first `execute` rows of a chunk, float32."""
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
     def _distribution(self, prediction: Prediction, samples: list[Prediction]) -> dict[str, Any]:
-        """Return the samples with their mean and deviation, or those that the model states."""
-        chunks = np.stack([self._used(sample.actions) for sample in samples])
-        mean = chunks.mean(0) if prediction.mean is None else self._used(prediction.mean)
-        std = chunks.std(0) if prediction.std is None else self._used(prediction.std)
+        """Return the samples, and the mean and deviation of the model or of the samples."""
+        chunks = np.stack([self._executed_rows(sample.actions) for sample in samples])
+        mean = chunks.mean(0) if prediction.mean is None else self._executed_rows(prediction.mean)
+        std = chunks.std(0) if prediction.std is None else self._executed_rows(prediction.std)
         return {
             "mean": mean,
             "std": std,
@@ -497,8 +519,10 @@ class ModelPolicy(Agent, abc.ABC):
         }
 
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """Compute all rows; if the memory of an accelerator is exhausted, in smaller forward
-        passes from then on.
+        """Compute all rows.
+
+        If the memory of an accelerator is exhausted, this and all later batches use smaller forward
+        passes.
         """
         while True:
             states_before = [row.rng.bit_generator.state for row in rows]
@@ -508,15 +532,21 @@ class ModelPolicy(Agent, abc.ABC):
                 if not is_out_of_memory(error) or not self._lower_rows(len(rows), error):
                     raise
 
-            # Only after the handler: its traceback refers to the tensors of the pass.
+            # Not in the handler, where the traceback still refers to the tensors of the pass.
             free_memory()
             # The next try draws the same noise.
             for row, state in zip(rows, states_before, strict=True):
                 row.rng.bit_generator.state = state
 
     def _lower_rows(self, rows: int, error: Exception) -> bool:
-        """Halve the largest forward pass after one of up to `rows` rows did not fit; return
-        whether it was over 1.
+        """Halve the size of the largest forward pass after one has not fit into memory.
+
+        Args:
+            rows: The number of rows of the batch.
+            error: The error of the pass.
+
+        Returns:
+            Whether a smaller pass is possible.
         """
         self.report.on_out_of_memory()
         tried = min(self.most_rows, self._size(rows))
@@ -542,7 +572,7 @@ class ModelPolicy(Agent, abc.ABC):
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
     def padded(self, items: list[T]) -> list[T]:
-        """Return the items of a batch, with its last one again up to the next of `batch_sizes`."""
+        """Return the items of a batch, whose last one is repeated up to the next batch size."""
         return items + items[-1:] * (self._size(len(items)) - len(items))
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
@@ -570,11 +600,11 @@ class ModelPolicy(Agent, abc.ABC):
         return predictions
 
     def _split(self, rows: int) -> list[int]:
-        """Return the numbers of rows of the passes for a batch: one, or several if it is too large
-        or they are faster.
+        """Return the number of rows of each forward pass for a batch.
 
-        With `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On
-        a CPU, where the time of a pass depends on what else runs, only the number of passes counts.
+        There are several passes if the batch is too large for one, or if several are faster. With
+        `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On a
+        CPU, the time of a pass depends on other processes, so that the fewest passes are used.
         """
         full_passes, remaining = divmod(rows, self.most_rows)
         split = [self.most_rows] * full_passes
@@ -588,6 +618,7 @@ class ModelPolicy(Agent, abc.ABC):
         return [*split, remaining]
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
+        """Run a forward pass with `size` random rows, and raise its first error."""
         rows = [self._example(next(seeds)) for _ in range(size)]
         for prediction in self._forward(rows):
             if isinstance(prediction, Exception):
@@ -598,14 +629,18 @@ class ModelPolicy(Agent, abc.ABC):
                 if observations >= size:
                     continue
                 samples = [drawn(rows[0], row.rng) for row in rows[observations:]]
-                # Not by `_forward`: the durations of these passes must not count.
+                # Not through `_forward`, which would record the durations of these passes.
                 self.predict([*rows[:observations], *samples])
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of
-        its observations.
+        """Return which rows to encode.
 
-        As many observations as rows are those of the rows: 0, 1, …, which needs no gathering.
+        If each row has its own observations, the results are 0, 1, …, so that the encoded
+        observations need not be gathered.
+
+        Returns:
+            The indices of the rows to encode, padded to one of `batch_sizes`; and for each row the
+            index of its observations among these.
         """
         firsts, owners = shared_frames(rows)
         firsts = self.padded(firsts)
@@ -615,8 +650,9 @@ class ModelPolicy(Agent, abc.ABC):
         return firsts, owners
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        """Return a row for the warm-up: random images, and a random state near zero, that fit
-        the contract.
+        """Return a row for the warm-up, whose observation fits the contract.
+
+        Images are random, and the state is random near zero.
         """
         rng = np.random.default_rng(seed)
         contract = self.contract or Contract()
@@ -643,8 +679,9 @@ class ModelPolicy(Agent, abc.ABC):
 
 
 def _stacked(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return one mapping for several of the same names: arrays get a first dimension, mappings
-    are mapped alike.
+    """Stack mappings with the same names into one.
+
+    Arrays get a new first dimension. Nested mappings are stacked in the same way.
     """
     stacked: dict[str, Any] = {}
     for name, first in mappings[0].items():
@@ -655,12 +692,12 @@ def _stacked(mappings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 @lru_cache(maxsize=256)
 def fastest_split(rows: int, pass_s: tuple[tuple[int, float], ...]) -> list[int]:
-    """Return the numbers of rows of the forward passes that take the shortest time together.
+    """Return the number of rows of each forward pass, so that their total time is the shortest.
 
     Args:
-        rows: The number of all rows, at most the largest size.
-        pass_s: The sizes of passes, to which smaller ones are padded, and how long each takes, s;
-            ascending by size.
+        rows: The total number of rows, at most the largest size.
+        pass_s: The sizes of passes, ascending, and the duration of each, s. Smaller passes are
+            padded to the next size.
     """
     # The shortest time for 0, 1, … rows, and the passes that take it.
     best: list[tuple[float, list[int]]] = [(0.0, [])]

@@ -19,8 +19,8 @@ from vlagents_ray.policies.reference.checkpoint import CAMERAS, WEIGHTS, Network
 from vlagents_ray.weights.safetensors import read_values
 
 _TIMES = 32  # frequencies of the flow's time, from 1 to 1000 rad
-_CONTRAST = 1e-2  # added to a patch's variance, so that the noise of an empty one is not made large
-# Of the attention to images: the score of a token that is exactly what a query asks for.
+_CONTRAST = 1e-2  # added to a patch's variance, so that noise in an empty patch is not amplified
+# Attention score of a token of an image whose key equals the query.
 _SHARPNESS = 12.0
 
 
@@ -35,10 +35,10 @@ def _inverse_norms(vectors: Tensor) -> Tensor:
 
 
 class _Eye(nn.Module):
-    """Turns the images of a camera into tokens, and those into keys and values for each look.
+    """Encodes the images of a camera as tokens, and these as keys and values for each look.
 
-    Patches are normalised before and after their projection (arXiv 2302.01327), as they differ by
-    few pixels.
+    Patches are normalised before and after their projection (arXiv 2302.01327), since they differ
+    in few pixels.
     """
 
     def __init__(self, sizes: NetworkSizes) -> None:
@@ -55,8 +55,11 @@ class _Eye(nn.Module):
         self.keys = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * sizes.looks * width))
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Return keys and values of each look, in turn, (P, tokens, width), for images (P, 3, S,
-        S).
+        """Encode images, (P, 3, S, S).
+
+        Returns:
+            The keys and then the values of the first look, then those of the next one, and so on,
+            each (P, tokens, width).
         """
         tokens = self.patches(self.cut(images).transpose(1, 2)) + self.places
         tokens = tokens + self.mix(tokens)
@@ -64,7 +67,7 @@ class _Eye(nn.Module):
 
 
 class _Look(nn.Module):
-    """Lets each query attend to the tokens of all cameras, and learn what is there and where."""
+    """Attention of each query to the tokens of all cameras and their positions."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
@@ -78,8 +81,12 @@ class _Look(nn.Module):
     def forward(
         self, queries: Tensor, cameras: Sequence[tuple[Tensor, Tensor]], grid: Tensor
     ) -> Tensor:
-        """Return the queries (P, queries, width) after a look at the keys and values of each
-        camera; `grid` has the positions of their tokens.
+        """Return the queries after they have attended to the images.
+
+        Args:
+            queries: (P, queries, width).
+            cameras: The keys and values of each camera, (P, tokens, width).
+            grid: The positions of the tokens, (tokens, 2).
         """
         answers = []
         camera_queries = self.ask(queries).chunk(len(cameras), -1)
@@ -109,12 +116,13 @@ class _Block(nn.Module):
 
 
 class ReferenceNetwork(nn.Module):
-    """Looks for what the instruction names, and turns noise into the actions towards it.
+    """The network of the reference policy, which computes the velocity of a flow.
 
-    Queries read the words, so that each stands for a thing or a deed that is named. They look at
-    the images twice: a query's attention to a camera's tokens gives what it found, and its place.
-    All of them and the robot's state make the context, from which a small network computes the
-    velocity of the flow (arXiv 2210.02747).
+    Queries attend to the words of the instruction, so that each of them represents an object or an
+    action that is named. They then attend to the images twice. The attention of a query to a
+    camera's tokens yields the content and the position of what it represents. All queries and the
+    robot's state are the context, from which a small network computes the velocity (arXiv
+    2210.02747).
     """
 
     def __init__(self, sizes: NetworkSizes) -> None:
@@ -140,8 +148,12 @@ class ReferenceNetwork(nn.Module):
         self.register_buffer("grid", positions, persistent=False)
 
     def encode(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
-        """Return the context (P, 2 * head) of words (P, L) int64, states (P, S) and images (P,
-        3, S, S) in [-1, 1].
+        """Return the context, (P, 2 * head).
+
+        Args:
+            tokens: The words of the instructions, (P, L) int64; 0 is no word.
+            state: (P, S).
+            images: The images of each camera, (P, 3, S, S) in [-1, 1].
         """
         words = self.words(tokens) + self.order
         keys, values = self.read(words).chunk(2, -1)
@@ -157,10 +169,15 @@ class ReferenceNetwork(nn.Module):
         return silu(self.context(torch.cat([queries.flatten(1), state], -1)))
 
     def velocity(self, context: Tensor, actions: Tensor, times: Tensor) -> Tensor:
-        """Return the velocity, noise minus actions, of noisy actions (B, H, D) at times (B,), 1
-        being noise.
+        """Return the velocity, noise minus actions, (B, H, D).
+
+        Args:
+            context: The context of each row, (B, 2 * head).
+            actions: The noisy actions, (B, H, D).
+            times: The flow times, (B,); 1 is noise.
         """
-        # Not a buffer: a network of bfloat16 would round it, the largest rate by several rad.
+        # The rates are not a buffer: a network of bfloat16 would round the largest one by several
+        # rad.
         angles = times[:, None].float() * torch.logspace(0, 3, _TIMES, device=times.device)
         when = torch.cat([angles.sin(), angles.cos()], -1).to(context.dtype)
         condition = silu(self.why(context) + self.when(when))
@@ -173,8 +190,7 @@ class ReferenceNetwork(nn.Module):
 def flow_velocity(
     network: ReferenceNetwork, inputs: Mapping[str, Tensor]
 ) -> Callable[[Tensor, float], Tensor]:
-    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs
-    are encoded once.
+    """Return the velocity of a flow, for a learner; the inputs are encoded once.
 
     Args:
         network: The network.
@@ -182,9 +198,12 @@ def flow_velocity(
             "state" (B, S).
     """
     context = network.encode(inputs["tokens"], inputs["state"], *inputs["images"].unbind(1))
-    return lambda actions, time: network.velocity(
-        context, actions, actions.new_full((len(actions),), time)
-    )
+
+    def velocity(actions: Tensor, time: float) -> Tensor:
+        """Return the velocity at noisy actions, (B, H, D), and one time."""
+        return network.velocity(context, actions, actions.new_full((len(actions),), time))
+
+    return velocity
 
 
 def read_network(sizes: NetworkSizes, folder: Path) -> ReferenceNetwork:

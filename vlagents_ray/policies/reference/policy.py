@@ -96,7 +96,9 @@ class Reference(ModelPolicy):
         behaviour = self.offered(OFFERED if self.config.noise_level else ())
         action = ActionSpec(**model.robot.action)
         horizon = model.checkpoint.sizes.horizon
-        return self.stated(model.cameras, self.state, horizon, action=action, behaviour=behaviour)
+        return self.make_contract(
+            model.cameras, self.state, horizon, action=action, behaviour=behaviour
+        )
 
     @property
     def state_dim(self) -> int | None:
@@ -140,7 +142,7 @@ class Reference(ModelPolicy):
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         super()._begin(instruction, seed, adapter)
         if self.model is not None:
-            self._begun().prompt = self.model.checkpoint.tokens(instruction)
+            self._current_episode().prompt = self.model.checkpoint.tokens(instruction)
 
     def _example(self, seed: int, instruction: str = "") -> Row:
         return super()._example(seed, instruction or self.loaded().checkpoint.words[0])
@@ -156,7 +158,7 @@ class Reference(ModelPolicy):
         state = model_inputs.state_vector(obs, self.state, self.state_dim)
         staged: StagedRow = model.staging.stage(
             {
-                "tokens": self._begun().prompt,
+                "tokens": self._current_episode().prompt,
                 "images": np.stack(resized),
                 "state": normalised(model.robot, state, sizes.state),
             }

@@ -98,7 +98,7 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         gripper = needs_gripper(self._state) or None
         behaviour = self.offered(prismatic.OFFERED if self.config.head == "tokens" else ())
         facts = {"action": self._action(), "gripper": gripper, "behaviour": behaviour}
-        return self.stated(self._cameras, self._state, self.config.horizon, **facts)
+        return self.make_contract(self._cameras, self._state, self.config.horizon, **facts)
 
     @property
     def state_dim(self) -> int | None:

@@ -61,7 +61,7 @@ class OpenVLA(prismatic.PrismaticPolicy):
             "gripper": None,
             "behaviour": self.offered(prismatic.OFFERED),
         }
-        return self.stated(self._cameras, (), 1, **facts)
+        return self.make_contract(self._cameras, (), 1, **facts)
 
     def load(self) -> TokenDecoder:
         """Read the checkpoint.

@@ -611,7 +611,7 @@ class PrismaticPolicy(ModelPolicy):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
         info = super().reset(obs, instruction, **kwargs)
-        episode = self._begun()
+        episode = self._current_episode()
         episode.memory[UNNORM_KEY] = self._requested_dataset(kwargs, episode.adapter)
         return info
 
@@ -672,8 +672,8 @@ class PrismaticPolicy(ModelPolicy):
             scale = entry.scale
             values, mean, spread, logprob, entropy, chosen = described[:, i, :, : scale.dim]
             available = {
-                "logprob": self._used(logprob),
-                "entropy": float(self._used(entropy).sum()),
+                "logprob": self._executed_rows(logprob),
+                "entropy": float(self._executed_rows(entropy).sum()),
                 "replay": {"tokens": chosen.astype(np.int64)},
             }
             prediction = Prediction(

@@ -110,7 +110,7 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
                 )
             assert np.array_equal(distribution["samples"], expected_distribution["samples"])
 
-        fingerprint = policy.adapters.named(name).fingerprint or policy.adapters.base
+        fingerprint = policy.adapters.find(name).fingerprint or policy.adapters.base
         assert act.info[POLICY] == {"version": 0, "fingerprint": fingerprint}
         assert fingerprint
         fingerprints[name] = fingerprint

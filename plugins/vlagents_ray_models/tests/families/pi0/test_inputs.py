@@ -125,7 +125,7 @@ def test_instructions_are_cleaned_as_the_training_did(folder: Path, words: str) 
         policy = made(folder, images=images)
         session = copy.copy(policy)
         session.reset(seen(0), text, seed=0)
-        prompt = session._begun().prompt
+        prompt = session._current_episode().prompt
         return list(prompt["input_ids"][prompt["attention_mask"] == 1])
 
     cleaned = words.strip().replace("_", " ").replace("\n", " ")  # openpi's tokenizer.py
