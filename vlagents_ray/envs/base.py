@@ -144,22 +144,26 @@ class EvalEnv(Environment):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        """Raise `UnknownEnv` if the task is not known, if that can be determined without the
-        simulator.
+        """Check that a task exists, as far as that is possible without the simulator.
 
         Args:
             task: The part of the env's name after the first slash; None if it has none.
+
+        Raises:
+            UnknownEnv: The task does not exist.
         """
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003 - for those that override it
-        """Return the contract of an environment before it is made; None if it requires the
-        simulator.
+        """Return the contract of an environment before it is made.
 
-        A mismatch with a policy is then an error before anything starts.
+        With it, a mismatch with a policy is an error before anything starts.
 
         Args:
             arguments: All arguments of the constructor by name, defaults included.
+
+        Returns:
+            The contract; None if only the simulator knows it.
         """
         return None
 
@@ -255,8 +259,7 @@ class BatchEnv(Environment):
 
 
 def make_env(name: str, **options: Any) -> EvalEnv:
-    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224,
-    height=224)`.
+    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224)`.
 
     Args:
         name: A registered name, with the task after a slash, or "module:Class".
@@ -355,8 +358,17 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
-    """Make several environments as `make_env` does, in one simulator if the suite supports that
-    with these options.
+    """Make several environments as `make_env` does.
+
+    They share one simulator if the suite supports that with these options.
+
+    Args:
+        name: As for `make_env`.
+        num_envs: The number of environments.
+        options: As for `make_env`.
+
+    Returns:
+        The environments, which the caller closes.
 
     Raises:
         ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of

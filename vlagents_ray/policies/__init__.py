@@ -1,3 +1,4 @@
-"""Policies, and what model families share; `vlagents_ray.registry` maps the names to the
-classes.
+"""Policies, and the code that model families share.
+
+`vlagents_ray.registry` maps the names of policies to their classes.
 """

@@ -14,9 +14,7 @@ from vlagents_ray.registry import named_class
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Settings of `Scripted`: the env to assume if a client names none, and an expert of the
-    user.
-    """
+    """Settings of `Scripted`: the env if a client names none, and the user's expert."""
 
     task: str | None = Field(
         default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'"
@@ -43,7 +41,7 @@ class Scripted(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of the env `kwargs["env"]`, or of the config's `task`."""
-        self._expert = None  # The previous episode's expert must not act if this fails.
+        self._expert = None  # the previous episode's expert must not act if this fails
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(

@@ -1,6 +1,4 @@
-"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and
-blocks.
-"""
+"""CALVIN: chains of five tasks in words, at a table with a drawer, a door, lights and blocks."""
 
 from __future__ import annotations
 
@@ -319,8 +317,9 @@ class Calvin(SimulatorEnv):
         return self._observe(look=True), self._info()
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """Execute an action; the reward is 1 if it solves a task, and a task that exceeds its
-        steps ends the chain.
+        """Execute an action; the reward is 1 if it solves a task.
+
+        The chain ends with a task that exceeds its steps.
         """
         env, chain = self._env, self._playing()
         if self._ended():

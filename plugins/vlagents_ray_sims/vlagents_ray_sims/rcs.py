@@ -1,8 +1,8 @@
-"""RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built
-on it.
+"""RCS, the Robot Control Stack, in MuJoCo, and DuoBench, a benchmark for two arms that uses it.
 
-Both need a separate Python environment, `vlagents-ray env make rcs`: their packages conflict with
-the simulators of this package's extras, and RCS is AGPL-3. See docs/benchmarks/other.md.
+Both need a separate Python environment, which `vlagents-ray env make rcs` makes: their packages
+conflict with the simulators of this package's extras, and the licence of RCS is AGPL-3. See
+docs/benchmarks/other.md.
 """
 
 from __future__ import annotations

@@ -44,8 +44,9 @@ class _Finder:
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return the spec of a module of `_FIXES`, whose loader applies the fix; None for any
-        other.
+        """Return the spec of a module of `_FIXES`, whose loader applies the fix.
+
+        It is None for any other module.
         """
         fix = _FIXES.get(name)
         if fix is None:
@@ -59,8 +60,9 @@ class _Finder:
 
 
 def _torchvision(execute: Execute, module: ModuleType) -> None:
-    """Declare the missing operators that the import looks up; calls of them still raise an
-    error.
+    """Declare the missing operators that the import looks up.
+
+    Calls of them still raise an error.
     """
     torch = importlib.import_module("torch")
     try:
@@ -120,8 +122,9 @@ def decode_frames(
     *_: object,
     **__: object,
 ) -> Any:
-    """Return the frames nearest to `timestamps`, s, as LeRobot's `decode_video_frames_torchvision`
-    does.
+    """Return the frames that are nearest to some timestamps, s.
+
+    This replaces LeRobot's `decode_video_frames_torchvision`.
 
     Returns:
         (N, 3, H, W) float32 in [0, 1].

@@ -1,8 +1,8 @@
-"""The inputs of rows on their way to the policy's device, where they are stacked into a batch.
+"""The transfer of rows' inputs to the policy's device, where they are stacked into a batch.
 
-On a GPU, the threads that prepare observations copy each row as soon as it is prepared, from pinned
-memory and on a stream of their own: the copies for the next batch run while a batch computes, and
-the policy's thread waits for none.
+On a GPU, the threads that prepare observations copy each row as soon as it is prepared. The copies
+are made from pinned memory and on a separate stream. Therefore, the rows of the next batch are
+copied while a batch is computed, and the policy's thread does not wait for them.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ _ALIGNED = 16
 
 
 class StagedRow(dict[str, np.ndarray]):
-    """The arrays of a row by name, with one copy of all of them on the device; a pickle has the
-    arrays alone.
+    """The arrays of a row by name, and a copy of all of them on the device.
+
+    A pickle contains only the arrays.
     """
 
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
         super().__init__({name: np.asarray(array, order="C") for name, array in arrays.items()})
-        self.block: Any = None  # (bytes,) uint8, on the device
-        self.copied: Any = None  # the event after the copy, on a GPU
+        self.block: Any = None  # the copy on the device, (bytes,) uint8
+        self.copied: Any = None  # on a GPU, the event at the end of the copy
 
     def __reduce__(self) -> tuple[type[StagedRow], tuple[dict[str, np.ndarray]]]:
         return StagedRow, (dict(self),)
 
     @property
     def layout(self) -> list[tuple[str, tuple[int, ...], np.dtype[Any]]]:
-        """Name, shape and type of each array in their order in the block."""
+        """Name, shape and type of each array, in the order of the block."""
         return [(name, array.shape, array.dtype) for name, array in self.items()]
 
 
@@ -48,8 +49,9 @@ class Staging:
         self._batch: Any = None  # (rows, bytes) uint8: the memory of the last batch on a CPU
 
     def upload(self, array: np.ndarray) -> Any:
-        """Return an array as a tensor on the device; on a GPU, the copy is part of the current
-        stream.
+        """Return an array as a tensor on the device.
+
+        On a GPU, the copy is made on the current stream.
         """
         tensor = require("torch").from_numpy(array)
         if self._stream is not None:
@@ -60,26 +62,28 @@ class Staging:
         """Begin to copy the arrays of one row to the device; several threads may call it.
 
         Args:
-            arrays: Arrays of numbers by name, of any shapes and types. They must not change later.
+            arrays: Arrays of numbers by name, of any shapes and types. They must not be changed
+                after this call.
         """
         row = StagedRow(arrays)
         try:
             self._copy(row)
         except RuntimeError as error:
-            # If memory is exhausted, `stack` copies the row, where a policy frees memory.
+            # If memory is exhausted, `stack` copies the row: its caller can free memory.
             if not is_out_of_memory(error):
                 raise
         return row
 
     def stack(self, rows: Sequence[StagedRow], *, keep: bool = False) -> dict[str, Any]:
-        """Return tensors (B, …) on the device by name, from B rows; called on the policy's thread.
-
-        On a CPU they are valid until the next call.
+        """Stack the rows of a batch; called on the policy's thread.
 
         Args:
-            rows: The rows of the batch.
-            keep: Whether later batches have them too, as those of a history; otherwise their copies
-                are freed, so that a GPU has those of waiting requests alone.
+            rows: The rows of the batch, B.
+            keep: Whether later batches also contain the rows, as those of a history. Otherwise
+                their copies are freed, so that a GPU has only copies for waiting requests.
+
+        Returns:
+            Tensors (B, …) on the device by name. On a CPU, they are valid until the next call.
 
         Raises:
             ValueError: The rows have arrays of different names, shapes or types.
@@ -90,7 +94,7 @@ class Staging:
                 raise ValueError(
                     f"stack: got rows of {layout} and {row.layout}, want the same arrays in each"
                 )
-            # The row is of an earlier batch, or of a session that another replica began.
+            # Its copy was freed after an earlier batch, or another replica has prepared it.
             if row.block is None:
                 self._copy(row)
 
@@ -98,7 +102,7 @@ class Staging:
             current = torch.cuda.current_stream(self.device)
             for row in rows:
                 current.wait_event(row.copied)
-                row.block.record_stream(current)  # The other stream allocated its memory.
+                row.block.record_stream(current)  # its memory was allocated on the other stream
         blocks = [row.block for row in rows]
         batch = torch.stack(blocks, out=self._memory(len(blocks), len(blocks[0])))
 
@@ -114,15 +118,21 @@ class Staging:
         return tensors
 
     def _memory(self, rows: int, size: int) -> Any:
-        """Return the memory of a batch of `rows` blocks of `size` bytes on a CPU, where fresh
-        memory costs more than the copies; None on other devices.
+        """Return the memory of a batch on a CPU, where new memory would cost more than the copies.
+
+        Args:
+            rows: The number of rows.
+            size: The bytes of a row.
+
+        Returns:
+            (rows, size) uint8; None on other devices.
         """
         if self.device.type != "cpu":
             return None
 
         torch = require("torch")
         if self._batch is None or self._batch.shape[1] != size or len(self._batch) < rows:
-            # Not an inference tensor, so that any later batch may be written to it.
+            # Later batches cannot be written into an inference tensor.
             with torch.inference_mode(False):
                 self._batch = torch.empty(rows, size, dtype=torch.uint8)
         return self._batch[:rows]
@@ -142,7 +152,7 @@ class Staging:
 
 
 def _starts(row: StagedRow) -> list[int]:
-    """Return the place of each array in the block, bytes, and the block's length."""
+    """Return the offset of each array in the block, bytes, and the length of the block."""
     starts = [0]
     for array in row.values():
         starts.append(starts[-1] + -(-array.nbytes // _ALIGNED) * _ALIGNED)

@@ -1,8 +1,7 @@
-"""The reference policy: a small vision-language-action model that is trained from nothing on two
-cores.
+"""The reference policy: a small vision-language-action model, trained from scratch on two cores.
 
-Its training is in the folder `examples/reference/` of a checkout. It is also the model of a family
-for authors of others: a checkpoint, a network in torch, and a `ModelPolicy` around both.
+Its training is in the folder `examples/reference/` of a checkout. It is also an example for authors
+of model families: it has a checkpoint, a network in torch, and a `ModelPolicy` that uses both.
 """
 
 from vlagents_ray.policies.reference.policy import Reference

@@ -64,20 +64,21 @@ class ReferenceConfig(ModelConfig):
 
 @dataclass(frozen=True)
 class LoadedReference:
-    """The network, and what its checkpoint states."""
+    """The network, and the facts of its checkpoint."""
 
     network: Any
     checkpoint: Checkpoint
     robot: Embodiment
-    cameras: dict[str, str]  # of CAMERAS, in their order -> the robot's
+    cameras: dict[str, str]  # name in CAMERAS, in their order -> the robot's name
     dtype: Any
     passes: ReferencePasses
     staging: Staging
 
 
 class Reference(ModelPolicy):
-    """The reference policy: chunks by flow matching, with one forward pass for all sessions of a
-    batch.
+    """The reference policy, which computes chunks with flow matching.
+
+    All sessions of a batch share one forward pass.
     """
 
     Config: ClassVar[type] = ReferenceConfig

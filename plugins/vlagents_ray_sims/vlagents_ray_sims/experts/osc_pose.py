@@ -38,9 +38,7 @@ class PickPhase:
 
 
 class PickExpert(ABC):
-    """Moves the hand through a sequence of poses, each of which is computed when its phase
-    begins.
-    """
+    """Moves the hand through a sequence of poses; each pose is computed when its phase begins."""
 
     units_per_m: ClassVar[float] = 10.0
     """Units of the action for each metre of the remaining distance; 20 command all of it."""
