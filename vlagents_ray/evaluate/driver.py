@@ -31,7 +31,7 @@ class Consumer(ABC):
 
     @abstractmethod
     def described(self, job: Job, report: Report) -> None:
-        """Note what a report says about the policy, the environment and the worker."""
+        """Note the policy, the environment and the worker, if a report describes new ones."""
 
     def is_needed(self, job: Job) -> bool:
         """Return whether a failed attempt at this episode may be repeated."""
@@ -49,7 +49,7 @@ class Consumer(ABC):
 
 
 class Driver:
-    """The jobs of a plan that are not finished, and what is done with each report about one.
+    """Hands the unfinished jobs of a plan to workers, and handles the report about each.
 
     It has no thread and no loop: its owner calls `hand_out`, waits for reports of the workers, and
     passes each to `take`.

@@ -185,7 +185,7 @@ def check_results(plan: ResolvedPlan) -> None:
 
 
 class _Run(Consumer):
-    """The driver's side of one run: its results, and what its user is shown."""
+    """Writes the results of one run, and shows its progress."""
 
     policy_cure = "mend the policy and evaluate it with a new --out, or raise abort_after"
     loss_cure = "resume when this is mended (--resume)"
