@@ -1,0 +1,131 @@
+"""The driver of evaluations and rollouts: what becomes of each report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from vlagents_ray.errors import ConfigError, EnvFailed, PolicyFailed
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts
+from vlagents_ray.evaluate.driver import Consumer, Driver
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import Job, plan_jobs
+from vlagents_ray.evaluate.plan.resolved import resolve
+from vlagents_ray.evaluate.workers.rollout import Report
+
+Config = Callable[..., EvalConfig]
+BROKEN = Failure("worker", EnvFailed.code, "the simulator exploded")
+
+
+class Collected(Consumer):
+    """Keeps the results of episodes, and whether each failed attempt was repeated."""
+
+    policy_cure, loss_cure = "mend the policy", "mend the simulator"
+
+    def __init__(self, *, needed: bool = True) -> None:
+        self.results: list[EpisodeResult] = []
+        self.repeated: list[bool] = []
+        self._needed = needed
+
+    def began(self, jobs: tuple[Job, ...]) -> None:
+        pass
+
+    def described(self, job: Job, report: Report) -> None:
+        pass
+
+    def is_needed(self, job: Job) -> bool:
+        return self._needed
+
+    def attempt_failed(self, job: Job, failure: Failure, *, repeated: bool) -> None:
+        self.repeated.append(repeated)
+
+    def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
+        self.results.append(result)
+
+    @property
+    def statuses(self) -> list[str]:
+        return [result.status for result in self.results]
+
+
+def driver_of(config: EvalConfig, consumer: Consumer) -> tuple[Driver, list[Job]]:
+    """A driver whose queue is empty, as if all its jobs were being played."""
+    plan = resolve(config)
+    return Driver(plan, [], consumer), plan_jobs(plan.cases)
+
+
+def next_job(driver: Driver, job: Job) -> Job:
+    [taken] = driver.queue.take(job.case.kind, None, {})
+    return taken
+
+
+def test_a_failed_attempt_is_repeated_until_its_episode_is_lost(config: Config) -> None:
+    consumer = Collected()
+    driver, [job, *_] = driver_of(config(retries=1), consumer)
+    driver.take(job, Report(failure=BROKEN))
+    again = next_job(driver, job)
+    assert (again.key, again.attempt, again.alone) == (job.key, 2, False)
+    driver.take(again, Report(failure=BROKEN))
+    assert consumer.repeated == [True, False]
+    assert consumer.statuses == ["infra_failed"]
+    assert consumer.results[0].error == "env_failed: the simulator exploded"
+    assert not len(driver.queue)
+
+
+def test_an_episode_that_may_have_broken_others_is_played_alone(config: Config) -> None:
+    driver, [job, *_] = driver_of(config(), Collected())
+    driver.take(job, Report(failure=replace(BROKEN, names_no_episode=True)))
+    assert next_job(driver, job).alone
+
+
+def test_an_attempt_that_is_no_longer_needed_is_neither_repeated_nor_lost(config: Config) -> None:
+    consumer = Collected(needed=False)
+    driver, [job, *_] = driver_of(config(), consumer)
+    driver.take(job, Report(failure=BROKEN))
+    assert (consumer.repeated, consumer.results, len(driver.queue)) == ([False], [], 0)
+
+
+@pytest.mark.parametrize(
+    ("digests", "statuses"), [(["a", "a"], ["policy_error"]), (["a", "b"], []), (["a"], [])]
+)
+def test_a_simulation_that_diverges_twice_under_the_same_actions_is_an_error_of_the_policy(
+    config: Config, digests: list[str], statuses: list[str]
+) -> None:
+    consumer = Collected()
+    driver, [job, *_] = driver_of(config(), consumer)
+    for digest in digests:
+        result = EpisodeResult(job.key, "policy_error", steps=3, actions_sha256=digest)
+        driver.take(job, Report(failure=replace(BROKEN, diverged=result)))
+    assert consumer.statuses == statuses
+
+
+def test_a_mistake_of_the_user_ends_it_at_once(config: Config) -> None:
+    consumer = Collected()
+    driver, [job, *_] = driver_of(config(), consumer)
+    with pytest.raises(ConfigError, match="no such option"):
+        driver.take(job, Report(failure=Failure("user", ConfigError.code, "no such option")))
+    assert consumer.repeated == [False]
+
+
+def test_losses_in_a_row_end_it_and_a_played_episode_between_them_does_not_count(
+    config: Config,
+) -> None:
+    driver, [job, *_] = driver_of(config(retries=0, abort_after=2), Collected())
+    driver.take(job, Report(failure=BROKEN))
+    driver.take(job, Report(result=EpisodeResult(job.key, "done", False, False)))
+    driver.take(job, Report(failure=BROKEN))
+    with pytest.raises(EnvFailed, match=r"2 episodes in a row lost to .*; mend the simulator: the"):
+        driver.take(job, Report(failure=BROKEN))
+
+
+def test_errors_of_the_policy_in_a_row_end_it_with_their_cure(config: Config) -> None:
+    consumer = Collected()
+    driver, [job, *_] = driver_of(config(abort_after=2), consumer)
+    failed = Report(result=EpisodeResult(job.key, "policy_error", error="got NaN"))
+    driver.take(job, failed)
+    with pytest.raises(PolicyFailed, match=r"2 episodes in a row .*got NaN; mend the policy"):
+        driver.take(job, failed)
+    assert consumer.statuses == ["policy_error"] * 2
