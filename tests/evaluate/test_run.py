@@ -26,7 +26,7 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.resolved import resolve
+from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.workers import pool, rollout
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
@@ -103,10 +103,10 @@ class TestOnACluster:
         found: list[str] = []  # when Ray is left, which takes long if it is being stopped as well
 
         @contextlib.contextmanager
-        def looking(settings: EvalConfig) -> Iterator[None]:
-            with ray_cluster(resolve(settings)):
+        def looking(plan: ResolvedPlan) -> Iterator[None]:
+            with ray_cluster(plan):
                 yield
-                found.append(json.loads((settings.out / "summary.json").read_text())["state"])
+                found.append(json.loads((plan.out / "summary.json").read_text())["state"])
 
         monkeypatch.setattr("vlagents_ray.evaluate.workers.cluster.ray_cluster", looking)
 
