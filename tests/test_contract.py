@@ -154,7 +154,7 @@ def test_only_what_the_contract_offers_may_be_wanted(
     if error is None:
         check_observation(obs, policy)
         return
-    with pytest.raises(error, match="info\\['want'\\]: got "):
+    with pytest.raises(error, match="info\\['want'\\]: expected "):
         check_observation(obs, policy)
     with pytest.raises(InvalidObservation):
         check_observation(obs, None)
@@ -252,7 +252,7 @@ def test_a_number_that_is_too_large_for_any_unit_is_found_wherever_it_is(
         check_action(action, None)
         action[at] = sign * 1e30
         with pytest.raises(
-            InvalidAction, match=r"got a number of size 1e\+30, want at most 1e\+09"
+            InvalidAction, match=r"expected numbers of at most 1e\+09, got one of size 1e\+30"
         ):
             check_action(action, None)
 
@@ -324,7 +324,7 @@ class TestAPolicyOfSeveralPartsServedAsOne:
 @pytest.mark.parametrize(
     ("cls", "wrong", "said"),
     [
-        (CameraSpec, "hight", "CameraSpec: got ['hight'], want some of ['height', 'width'];"),
+        (CameraSpec, "hight", "CameraSpec: expected some of ['height', 'width'], got ['hight'];"),
         (ActionSpec, "horizon", "the rows of a chunk are Contract(chunk=…)"),
         (Contract, "control_hertz", "did you mean 'control_hz'?"),
     ],
@@ -347,5 +347,5 @@ def test_a_tensor_that_numpy_cannot_read_is_no_action() -> None:
         def __array__(self, *_: object, **__: object) -> np.ndarray:
             raise RuntimeError("Can't call numpy() on Tensor that requires grad")
 
-    with pytest.raises(InvalidAction, match="got RequiresGrad, want"):
+    with pytest.raises(InvalidAction, match=r"expected .*, got RequiresGrad"):
         check_action(RequiresGrad(), None)

@@ -170,9 +170,9 @@ def test_a_format_of_a_plugin_has_the_settings_of_its_function(
         "columns": ["env"],
     }
     wrong = {
-        "limt=2": "limt: there is no such setting; want one of .*; did you mean 'limit'",
-        "limit=many": "limit: got 'many', want a valid integer",
-        "columns=env": r"columns: got 'env', want a valid list, such as \[env\]",
+        "limt=2": "limt: there is no such setting; expected one of .*; did you mean 'limit'",
+        "limit=many": "limit: expected a valid integer, got 'many'",
+        "columns=env": r"columns: expected a valid list, such as \[env\], got 'env'",
         "limit=2": "columns: is missing; give --set columns=",
     }
     for setting, message in wrong.items():
@@ -286,7 +286,7 @@ def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon()
     assert vars(robot_factory("--robot", "arm:left")()) == {"name": "left"}
     with pytest.raises(
         ConfigError,
-        match="--robot lamp:left: lacks observe, apply, stop; want a class with observe",
+        match=r"--robot lamp:left: expected a class with observe.*, got one without observe, apply, stop",
     ):
         robot_factory("--robot", "lamp:left")
 

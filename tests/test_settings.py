@@ -60,15 +60,15 @@ def test_what_fits_is_taken(cls: type, given: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("cls", "given", "said"),
     [
-        (Annotated, {"gain": "high"}, "policy P: gain: got 'high', want float"),
-        (Annotated, {"steps": 2.5}, "steps: got 2.5, want int"),
-        (Annotated, {"steps": True}, "steps: got True, want int"),
-        (Annotated, {"name": 7}, "name: got 7, want str or None"),
-        (Annotated, {"fast": "maybe"}, "fast: got 'maybe', want bool"),
-        (Bare, {"gain": "high"}, "gain: got 'high', want float"),
-        (Bare, {"mode": 3}, "mode: got 3, want str"),
-        (Bare, {"fast": 1}, "fast: got 1, want bool"),
-        (Broken, {"gain": "high"}, "gain: got 'high', want float"),
+        (Annotated, {"gain": "high"}, "policy P: gain: expected float, got 'high'"),
+        (Annotated, {"steps": 2.5}, "steps: expected int, got 2.5"),
+        (Annotated, {"steps": True}, "steps: expected int, got True"),
+        (Annotated, {"name": 7}, "name: expected str or None, got 7"),
+        (Annotated, {"fast": "maybe"}, "fast: expected bool, got 'maybe'"),
+        (Bare, {"gain": "high"}, "gain: expected float, got 'high'"),
+        (Bare, {"mode": 3}, "mode: expected str, got 3"),
+        (Bare, {"fast": 1}, "fast: expected bool, got 1"),
+        (Broken, {"gain": "high"}, "gain: expected float, got 'high'"),
     ],
 )
 def test_what_does_not_is_told_before_it_is_used(

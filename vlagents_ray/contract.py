@@ -182,7 +182,7 @@ def _specs(spec: type[_Spec], data: object, where: str) -> dict[str, _Spec] | No
     if data is None:
         return None
     if not isinstance(data, dict):
-        raise MalformedMessage(f"{where}: got {type(data).__name__}, want an object")
+        raise MalformedMessage(f"{where}: expected an object, got {type(data).__name__}")
 
     specs = {}
     for name, values in data.items():
@@ -195,7 +195,7 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
     if isinstance(value, (list, tuple)) and all(isinstance(name, str) for name in value):
         return tuple(value)
     if value is not None:
-        raise MalformedMessage(f"{where}: got {value!r}, want a list of names")
+        raise MalformedMessage(f"{where}: expected a list of names, got {value!r}")
     return None
 
 
@@ -405,17 +405,19 @@ def closed(
             it is of the class `error`.
     """
     if not isinstance(data, Mapping):
-        raise error(f"{where}: got {type(data).__name__}, want an object")
+        raise error(f"{where}: expected an object, got {type(data).__name__}")
 
     type_names = {field.name: str(field.type) for field in fields(cls)}
     unknown = sorted(str(key) for key in data if key not in type_names)
     if unknown:
-        raise error(f"{where}: unknown keys {unknown}, want some of {sorted(type_names)}")
+        raise error(
+            f"{where}: expected some of {sorted(type_names)}, got {unknown}; leave these out"
+        )
 
     for name, value in data.items():
         is_of_type = _TYPE_CHECKS.get(type_names[name])
         if is_of_type is not None and not is_of_type(value):
-            raise error(f"{where}.{name}: got {repr(value)[:80]}, want {type_names[name]}")
+            raise error(f"{where}.{name}: expected {type_names[name]}, got {repr(value)[:80]}")
     return dict(data)
 
 

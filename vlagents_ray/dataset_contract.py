@@ -183,8 +183,8 @@ def state_parts(
         is_divided = not unknown and remaining == 0
     if not is_divided:
         raise ConfigError(
-            f"observation.state: got {width} numbers, want them divided into {names} of the "
-            f"policy, of which the sizes are {dims}; name the parts in their order: {option}"
+            f"observation.state: expected {names} of the policy, with the sizes {dims}, got "
+            f"{width} numbers without a division; name the parts in their order: {option}"
         )
     return [(name, dim or 0) for name, dim in dims.items()]
 

@@ -484,8 +484,8 @@ def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
             )
         known = names(kind)
         raise unknown(
-            f"{name!r} is not registered: want one of {sorted(known)}, or "
-            f"'module:Class'{did_you_mean(name, known)}"
+            f"expected one of {sorted(known)}, or 'module:Class', got {name!r}, which is not "
+            f"registered{did_you_mean(name, known)}"
         )
     return target
 
@@ -528,7 +528,7 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
         raise unknown(f"{name!r}: expected 'module:Class'")
     if module.endswith(".py"):
         raise unknown(
-            f"{name!r} names a file: want an importable module, as in 'my_policies:{attribute}'"
+            f"expected an importable module, as in 'my_policies:{attribute}', got the file {name!r}"
         )
     try:
         loaded = importlib.import_module(module)

@@ -29,7 +29,7 @@ _SPELLINGS = {
     ("string_type", bool): "; put the word in quotation marks",
     ("string_type", datetime.date): "; put it in quotation marks",
 }
-_WANT = "Input should be "  # pydantic's wording
+_EXPECTED = "Input should be "  # pydantic's wording
 # The types of values that a plain type allows: numpy's are allowed, and whole numbers for a float,
 # since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
@@ -86,7 +86,7 @@ def require_arguments(
             expected = " or ".join(
                 "None" if kind is type(None) else kind.__name__ for kind in kinds
             )
-            raise ConfigError(f"{subject}: {name}: got {value!r}, want {expected}")
+            raise ConfigError(f"{subject}: {name}: expected {expected}, got {value!r}")
 
 
 def _type_of_default(default: object) -> Any:
@@ -135,22 +135,23 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
         message = message.partition(", unable to")[0]
         if kind in ("list_type", "sequence_str"):
             message += f", such as [{value[:40]}]"
+    hint = _SPELLINGS.get((kind, type(value)), "")
     # A word in place of one of a list is no secret, either.
     if kind == "literal_error" and isinstance(value, str):
         value_text = shown(value)
-        message += did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
+        hint = did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
 
-    if message.startswith(_WANT):
-        spelling = _SPELLINGS.get((kind, type(value)), "")
-        message = f"got {value_text}, want {message.removeprefix(_WANT)}{spelling}"
+    if message.startswith(_EXPECTED):
+        message = f"expected {message.removeprefix(_EXPECTED)}, got {value_text}{hint}"
     if kind == "path_type":
-        message = f"got {value_text}, want a path"
+        message = f"expected a path, got {value_text}"
 
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         accepted = sorted(_fields(model, item["loc"]))
-        message = f"got {value_text}, want a mapping"
+        message = "expected a mapping"
         if accepted:
             message += f" with some of {accepted}"
+        message += f", got {value_text}"
         message += did_you_mean(name, siblings.keys() - {name})
     elif kind == "missing":
         example = next(iter(getattr(siblings.get(name), "examples", None) or ()), "…")
@@ -162,7 +163,7 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
         if ":" in name:
             message += " (write a space after the colon)"
         if accepted:
-            message += f"; want one of {accepted}{did_you_mean(name, accepted)}"
+            message += f"; expected one of {accepted}{did_you_mean(name, accepted)}"
     return f"{where}: {message}" if where else message
 
 

@@ -58,21 +58,21 @@ def require_wireable(value: object, where: str) -> None:
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "biuf":
             raise ContractViolation(
-                f"{where}: got an array of {value.dtype}, want numbers or bools"
+                f"{where}: expected numbers or bools, got an array of {value.dtype}"
             )
     elif isinstance(value, dict):
         for key, item in value.items():
             if not isinstance(key, str):
-                raise ContractViolation(f"{where}: got the key {key!r}, want only str keys")
+                raise ContractViolation(f"{where}: expected keys that are str, got {key!r}")
             require_wireable(item, f"{where}[{key!r}]")
     elif isinstance(value, list):
         for i, item in enumerate(value):
             require_wireable(item, f"{where}[{i}]")
     else:
         raise ContractViolation(
-            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message "
-            "cannot carry; want None, bool, int, float, str, bytes, numpy arrays, lists and dicts "
-            "of them"
+            f"{where}: expected None, bool, int, float, str, bytes, numpy arrays, lists and dicts "
+            f"of them, got {type(value).__module__}.{type(value).__qualname__}, which a message "
+            "cannot carry"
         )
 
 
@@ -197,13 +197,16 @@ def check_agent(
     """
     if not isinstance(agent, Agent):
         raise ContractViolation(
-            f"agent: got {agent!r}, want an object of a class that derives from vlagents_ray.Agent"
+            "agent: expected an object of a class that derives from vlagents_ray.Agent, got "
+            f"{agent!r}"
         )
 
     agent.initialize()
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
-        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
+        raise ContractViolation(
+            f"contract: expected a Contract or None, got {type(contract).__name__}"
+        )
 
     views = [obs] if isinstance(obs, Obs) else list(obs or ())
     views = views or [random_observation(contract, seed) for seed in range(_SESSIONS)]
@@ -329,7 +332,7 @@ class _AgentSuite:
             info = session.reset(obs, self._instructions[i], seed=i, **self._reset_kwargs)
         require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
         if not isinstance(info, dict):
-            raise ContractViolation(f"reset: got {type(info).__name__}, want a dict")
+            raise ContractViolation(f"reset: expected a dict, got {type(info).__name__}")
         require_wireable(info, "reset: info")
         return session
 
@@ -372,7 +375,9 @@ class _AgentSuite:
         )
         if not isinstance(acts, list) or len(acts) != len(sessions):
             result = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
-            raise ContractViolation(f"act_batch: got {result}, want a list of {len(sessions)} acts")
+            raise ContractViolation(
+                f"act_batch: expected a list of {len(sessions)} Acts, got {result}"
+            )
         return [self._checked(act, "act_batch") for act in acts]
 
     @contextmanager
@@ -381,10 +386,11 @@ class _AgentSuite:
         try:
             yield
         except Exception as error:
-            event = f"{method}: raised {error!r} for the instruction {self._instructions[i]!r}"
+            event = f"{method}: expected no error, got {error!r} for the instruction "
+            event += repr(self._instructions[i])
             if method != "reset":
                 event += f" and the observation of session {i}"
-            raise ContractViolation(f"{event}, want no error; {self.cure}") from error
+            raise ContractViolation(f"{event}; {self.cure}") from error
 
     def _checked(self, act: object, where: str) -> Act:
         """Return the result of `act`; raise `ContractViolation` if it is no valid `Act`."""
@@ -393,11 +399,13 @@ class _AgentSuite:
                 f"{where}: failed with {act!r} for an observation that `act` takes"
             ) from act
         if not isinstance(act, Act):
-            raise ContractViolation(f"{where}: got {type(act).__name__}, want an Act")
+            raise ContractViolation(f"{where}: expected an Act, got {type(act).__name__}")
         if not isinstance(act.action, np.ndarray) or act.action.dtype != np.float32:
             is_array = isinstance(act.action, np.ndarray)
             kind = act.action.dtype if is_array else type(act.action).__name__
-            raise ContractViolation(f"{where}: the action is {kind}, want a numpy array of float32")
+            raise ContractViolation(
+                f"{where}: expected the action as a numpy array of float32, got {kind}"
+            )
 
         try:
             check_action(act.action, self._contract)
@@ -410,7 +418,9 @@ class _AgentSuite:
                 f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}"
             )
         if type(act.done) is not bool:
-            raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
+            raise ContractViolation(
+                f"{where}: expected done to be a bool, got {type(act.done).__name__}"
+            )
         require_wireable(act.info, f"{where}: info")
         return act
 
@@ -478,21 +488,22 @@ def check_env(
     """
     if not isinstance(env, EvalEnv):
         raise ContractViolation(
-            f"env: got {env!r}, want an EvalEnv; make one of Gymnasium by make_env('gymnasium/ID')"
+            f"env: expected an EvalEnv, got {env!r}; make one from Gymnasium's with "
+            "make_env('gymnasium/ID')"
         )
 
     contract = env.contract
     if not isinstance(contract, Contract):
-        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
+        raise ContractViolation(f"contract: expected a Contract, got {type(contract).__name__}")
     if contract.action.dim is None:
         raise ContractViolation(
-            "contract.action.dim: got None, want the number of components of an action"
+            "contract.action.dim: expected the number of components of an action, got None"
         )
     if type(env.max_steps) is not int or env.max_steps < 1:
-        raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
+        raise ContractViolation(f"max_steps: expected an int of at least 1, got {env.max_steps!r}")
     require_wireable(env.describe(), "describe()")
     if not all(isinstance(name, str) for name in env.tasks()):
-        raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
+        raise ContractViolation(f"tasks(): expected a list of names, got {env.tasks()!r}")
 
     suite = _EnvSuite(env, contract, options)
     actions = suite.random_actions(steps)
@@ -570,16 +581,16 @@ class _EnvSuite:
         """Begin an episode, check the results, and return the first observation."""
         result = self._env.reset(seed=seed, options=self._options)
         if not isinstance(result, tuple) or len(result) != 2:
-            raise ContractViolation(f"reset: got {kind_of(result)}, want (Obs, info)")
+            raise ContractViolation(f"reset: expected (Obs, info), got {kind_of(result)}")
         obs, info = result
         _check_obs(obs, self._contract, "reset")
         if not isinstance(info, dict):
-            raise ContractViolation(f"reset: info is {kind_of(info)}, want a dict")
+            raise ContractViolation(f"reset: expected the info as a dict, got {kind_of(info)}")
         require_wireable(info, "reset: info")
 
         instruction = self._env.instruction
         if not isinstance(instruction, str):
-            raise ContractViolation(f"instruction: got {kind_of(instruction)}, want a str")
+            raise ContractViolation(f"instruction: expected a str, got {kind_of(instruction)}")
         if self._contract.instruction and not instruction:
             raise ContractViolation(
                 "instruction: is empty, but the contract states that the env has one"
@@ -595,7 +606,7 @@ class _EnvSuite:
         require_same(action, sent, "the action", "step must leave the caller's array as it is")
         if not isinstance(result, tuple) or len(result) != 5:
             raise ContractViolation(
-                f"step: got {kind_of(result)}, want (Obs, reward, terminated, truncated, info)"
+                f"step: expected (Obs, reward, terminated, truncated, info), got {kind_of(result)}"
             )
 
         obs, *outcome, info = result
@@ -603,12 +614,14 @@ class _EnvSuite:
         kinds = (("reward", float), ("terminated", bool), ("truncated", bool))
         for (name, kind), value in zip(kinds, outcome, strict=True):
             if type(value) is not kind:
-                raise ContractViolation(f"step: {name} is {kind_of(value)}, want a {kind.__name__}")
+                raise ContractViolation(
+                    f"step: expected {name} to be a {kind.__name__}, got {kind_of(value)}"
+                )
         if not isinstance(info, dict):
-            raise ContractViolation(f"step: info is {kind_of(info)}, want a dict")
+            raise ContractViolation(f"step: expected the info as a dict, got {kind_of(info)}")
         if type(info.get("success")) is not bool:
             raise ContractViolation(
-                f"step: info['success'] is {kind_of(info.get('success'))}, want a bool"
+                f"step: expected info['success'] to be a bool, got {kind_of(info.get('success'))}"
             )
         require_wireable(info, "step: info")
         return obs, [*outcome, info["success"]]
@@ -651,10 +664,11 @@ class _EnvSuite:
                 continue
             except Exception as error:
                 raise ContractViolation(
-                    f"step: an action {description} raised {error!r}, want InvalidAction"
+                    f"step: expected InvalidAction for an action {description}, got {error!r}"
                 ) from error
             raise ContractViolation(
-                f"step: an action {description} was executed, want InvalidAction"
+                f"step: expected InvalidAction for an action {description}, got none: it was "
+                "executed"
             )
         self.step(valid_action)
 
@@ -675,7 +689,7 @@ class _EnvSuite:
 def _check_obs(obs: object, contract: Contract, where: str) -> None:
     """Raise `ContractViolation` if an observation is invalid or differs from the contract."""
     if not isinstance(obs, Obs):
-        raise ContractViolation(f"{where}: the observation is {kind_of(obs)}, want an Obs")
+        raise ContractViolation(f"{where}: expected an Obs as the observation, got {kind_of(obs)}")
     try:
         check_observation(obs, contract)
     except InvalidObservation as error:
@@ -683,7 +697,9 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
 
     for name, values in obs.state.items():
         if values.dtype != np.float32:
-            raise ContractViolation(f"{where}: state {name!r} is {values.dtype}, want float32")
+            raise ContractViolation(
+                f"{where}: state {name!r}: expected float32, got {values.dtype}"
+            )
     for kind, names, expected in (
         ("cameras", obs.cameras, contract.cameras),
         ("state", obs.state, contract.state),

@@ -33,26 +33,28 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
             or image.dtype != _UINT8
         ):
             raise InvalidObservation(
-                f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB"
+                f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}"
             )
         if not image.size:
             raise InvalidObservation(
-                f"camera {name!r}: got {described(image)}, want one pixel at least"
+                f"camera {name!r}: expected at least one pixel, got {described(image)}"
             )
     if "" in obs.cameras or "" in obs.state:
         raise InvalidObservation(
-            "observation: got a camera or state without a name (''), want a name for each"
+            "observation: expected a name for each camera and state, got an empty one ('')"
         )
     for name, values in obs.state.items():
         if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
-            raise InvalidObservation(f"state {name!r}: got {described(values)}, want (D,) float32")
+            raise InvalidObservation(
+                f"state {name!r}: expected (D,) float32, got {described(values)}"
+            )
         if not _finite(values):
             raise InvalidObservation(
-                f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor"
+                f"state {name!r}: expected finite numbers, got NaN or infinity; check the sensor"
             )
     if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
         raise InvalidObservation(
-            f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open"
+            f"gripper: expected a number in [0, 1] where 1 = open, got {obs.gripper}"
         )
 
     if WANT in obs.info:
@@ -60,13 +62,13 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
         offered = (contract and contract.behaviour) or ()
         if not isinstance(requested, list) or not all(isinstance(name, str) for name in requested):
             raise InvalidObservation(
-                f"info[{WANT!r}]: got {described(requested)}, want a list of names"
+                f"info[{WANT!r}]: expected a list of names, got {described(requested)}"
             )
         unknown = sorted(set(requested) - set(offered))
         if unknown:
             raise NotOffered(
-                f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` "
-                "of the policy's contract; take a policy that returns it, or leave it out"
+                f"info[{WANT!r}]: expected some of {sorted(offered)}, the `behaviour` of the "
+                f"policy's contract, got {unknown}; leave it out, or use a policy that returns it"
             )
 
     if contract is not None and (contract.cameras or contract.state or contract.gripper):
@@ -81,7 +83,7 @@ def _check_needs(obs: Obs, contract: Contract) -> None:
         height, width = obs.cameras[name].shape[:2]
         if _differ(camera.height, height) or _differ(camera.width, width):
             raise InvalidObservation(
-                f"camera {name!r}: got {height}x{width}, want {camera.height}x{camera.width}; "
+                f"camera {name!r}: expected {camera.height}x{camera.width}, got {height}x{width}; "
                 "resize before sending"
             )
     for name, spec in (contract.state or {}).items():
@@ -89,11 +91,14 @@ def _check_needs(obs: Obs, contract: Contract) -> None:
             raise MissingState(name, have=obs.state)
         if _differ(spec.dim, obs.state[name].shape[0]):
             raise InvalidObservation(
-                f"state {name!r}: got {obs.state[name].shape}, want ({spec.dim},); see the "
-                "policy's contract"
+                f"state {name!r}: expected shape ({spec.dim},), got {obs.state[name].shape}; see "
+                "the policy's contract"
             )
     if contract.gripper and obs.gripper is None:
-        raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+        raise InvalidObservation(
+            "gripper: expected a number in [0, 1] where 1 = open, got None; set it in the "
+            "observation"
+        )
 
 
 def check_action(action: object, contract: Contract | None) -> np.ndarray:
@@ -105,21 +110,25 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError) as error:
         # A torch tensor that requires grad raises RuntimeError.
         raise InvalidAction(
-            f"action: got {described(action)}, want (D,) or (H, D) float32"
+            f"action: expected (D,) or (H, D) float32, got {described(action)}"
         ) from error
     if array.ndim not in (1, 2) or array.size == 0:
-        raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
+        raise InvalidAction(f"action: expected (D,) or (H, D) float32, got {described(action)}")
 
     largest = _largest(array)
     if not largest <= LARGEST_ACTION:
         if not math.isfinite(largest):
-            raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
+            raise InvalidAction(
+                "action: expected finite numbers, got NaN or infinity; check the policy's output"
+            )
         raise InvalidAction(
-            f"action: got a number of size {largest:.3g}, want at most {LARGEST_ACTION:g}; "
-            f"the policy's output is broken"
+            f"action: expected numbers of at most {LARGEST_ACTION:g}, got one of size "
+            f"{largest:.3g}; check the policy's output"
         )
     if contract is not None and contract.action.dim not in (None, array.shape[-1]):
-        raise InvalidAction(f"action: got {array.shape}, want {contract.action.dim} numbers a row")
+        raise InvalidAction(
+            f"action: expected {contract.action.dim} numbers a row, got shape {array.shape}"
+        )
     return array
 
 

@@ -100,7 +100,7 @@ class RerunRecordings:
         is_live = target == "live" or target.startswith("rerun+")
         if "://" in target and not is_live:
             raise ConfigError(
-                f"rerun: got {target!r}, want a folder, 'live', or an address such as {LIVE}"
+                f"rerun: expected a folder, 'live', or an address such as {LIVE}, got {target!r}"
             )
         self.target = LIVE if target == "live" else target
         self._rerun = require("rerun")
@@ -116,7 +116,7 @@ class RerunRecordings:
                 self._folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise ConfigError(
-                    f"viewer {target}: {error}; want a folder that can be written to"
+                    f"viewer {target}: expected a folder that can be written to, got {error}"
                 ) from error
 
     def _require_listener(self) -> None:

@@ -93,7 +93,7 @@ def test_a_tick_that_two_chunks_have_a_row_for_is_merged_as_chosen(
     plan.add(chunk(0, 0, [1, 2]))
     plan.add(chunk(1, 1, [20, 30]))
     assert values(plan, 3) == pytest.approx(expected)
-    with pytest.raises(ConfigError, match="want one of"):
+    with pytest.raises(ConfigError, match="expected one of"):
         ChunkBuffer("median")
 
 

@@ -30,10 +30,14 @@ def test_the_contract_decides(spec: ActionSpec, expected: object) -> None:
     [
         ("auto", ActionSpec(), r"relative or absolute.*safe='hold'"),
         ("zero", ActionSpec(), r"relative or absolute.*safe='hold'"),
-        ("zero", ActionSpec(delta=False), "safe='hold'"),
-        ("hold", ActionSpec(delta=True), "safe='zero'"),
-        ("hold", ActionSpec(space="joint_velocity", delta=False), "safe='zero'"),
-        ("freeze", ActionSpec(), "want one of"),
+        ("zero", ActionSpec(delta=False), "expected 'hold' or 'auto', got 'zero'"),
+        ("hold", ActionSpec(delta=True), "expected 'zero' or 'auto', got 'hold'"),
+        (
+            "hold",
+            ActionSpec(space="joint_velocity", delta=False),
+            "expected 'zero' or 'auto', got 'hold'",
+        ),
+        ("freeze", ActionSpec(), "expected one of"),
     ],
 )
 def test_a_choice_that_would_or_might_move_the_robot_is_refused(

@@ -314,7 +314,7 @@ def test_the_first_action_is_compared_with_the_measured_pose(playing: Playing) -
         Counting(gated=True), mode="async", check=Guard(max_step=0.15, measure=pose)
     )
     act = player.act(obs(0))
-    assert "larger step than max_step" in act.info["safe"]
+    assert "expected a step of at most max_step" in act.info["safe"]
     assert act.action.tolist() == [5, 5]  # where it stands
     pose.at = 1.0
     assert "safe" in player.act(obs(1)).info  # nothing is planned any more

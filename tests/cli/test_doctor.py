@@ -160,7 +160,7 @@ JAX = {"version": "0.5.3", "cuda": "12", "device": None, "why": "no platforms ar
             TORCH,
             "570.124.06",
             "warn",
-            "needs driver 580 or newer; got 570.124.06",
+            "expected driver 580 or newer, got 570.124.06",
             "env make",
         ),
         ("torch", TORCH | {"cuda": "12.8"}, "570.124.06", "warn", "cannot use the GPU", "dmesg"),
@@ -181,7 +181,14 @@ JAX = {"version": "0.5.3", "cuda": "12", "device": None, "why": "no platforms ar
             ("0.5.3, for CUDA 12, uses NVIDIA H100"),
             "",
         ),
-        ("jax", JAX, "470.1", "warn", "needs driver 525 or newer; got 470.1", "update the driver"),
+        (
+            "jax",
+            JAX,
+            "470.1",
+            "warn",
+            "expected driver 525 or newer, got 470.1",
+            "update the driver",
+        ),
         ("jax", JAX | {"cuda": None}, "535.1", "warn", "for CPUs only", "'jax[cuda12]==0.5.3'"),
     ],
 )
@@ -223,7 +230,7 @@ class TestAPolicysPython:
         )
         monkeypatch.setattr(doctor, "guarded", lambda _: Check("ok", ""))
         found = dict(doctor.checks())
-        assert "needs driver 580 or newer; got 570.1" in found["torch in .venv-hf"].detail
+        assert "expected driver 580 or newer, got 570.1" in found["torch in .venv-hf"].detail
         assert found["C compiler for Triton in .venv-hf"].status == "warn"
         assert not [name for name in found if "other" in name]
         named = dict(doctor.checks(pythons=[other]))

@@ -137,7 +137,7 @@ def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> 
     )
     file = tmp_path / "two.yaml"
     file.write_text(f"applications: [{app_of.format('a')}, {app_of.format('b')}]")
-    assert "want one application" in said(
+    assert "expected one application" in said(
         "eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out")
     )
 
@@ -219,8 +219,8 @@ def test_only_what_was_asked_for_now_is_missed(
         (["--end-at", "soon"], "2027-01-31T18:30"),
         (["--end-at", "1", "--watch", "."], "exclude each other"),
         (["--replica-per-gpu", "--policy", "http://127.0.0.1:9"], "--address"),
-        (["--live-at", "8050"], "want HOST:PORT"),
-        (["--live-at", "127.0.0.1:many"], "want HOST:PORT"),
+        (["--live-at", "8050"], "expected HOST:PORT"),
+        (["--live-at", "127.0.0.1:many"], "expected HOST:PORT"),
         (["--live-at", "0.0.0.0:8050"], "without keys all cameras would be public"),
         (["--live", "--dry-run"], "nothing is played"),
     ],

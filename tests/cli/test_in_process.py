@@ -113,11 +113,15 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
 
 
 REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
-    "cluster": ({"url": "serve://pi0"}, [], "serve://pi0 is inside a Ray cluster; want 1 or more"),
+    "cluster": (
+        {"url": "serve://pi0"},
+        [],
+        "expected 1 or more, as serve://pi0 is inside a Ray cluster",
+    ),
     "address": (
         {"source": "noop"},
         ["--address", "auto"],
-        "got 0 with --address, want 1 or more in a cluster",
+        "expected 1 or more with --address, got 0",
     ),
     "packages": (
         {"source": "packages.yaml"},

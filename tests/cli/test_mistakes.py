@@ -157,7 +157,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist"]),
     "file with options of suites": (
         ["eval", run(), "--episodes", "3"],
-        ["episodes", "write that there"],
+        ["episodes", "write them in the file"],
     ),
     "file empty": (["eval", " "], ["a mapping with", "policies"]),
     "file a list": (["eval", "- 1"], ["list", "a mapping with"]),
@@ -179,25 +179,25 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "entries without a dash": (
         ["eval", run(policies=POLICY)],
-        ["policies: got dict", "begin each of its entries"],
+        ["policies: expected a valid list, got dict", "begin each of its entries"],
     ),
     "a word that YAML reads as a boolean": (
         ["eval", run(policies=[{"source": False}])],
-        ["source: got False", "quotation marks"],
+        ["source: expected a valid string, got False", "quotation marks"],
     ),
     "a date": (
         ["eval", run().replace("source: noop", "source: 2026-01-01")],
-        ["source: got date", "quotation marks"],
+        ["source: expected a valid string, got date", "quotation marks"],
     ),
-    "a list as a path": (["eval", run(out=["a"])], ["out: got list, want a path"]),
-    "a number as a path": (["eval", run(out=5)], ["out: got 5, want a path"]),
+    "a list as a path": (["eval", run(out=["a"])], ["out: expected a path, got list"]),
+    "a number as a path": (["eval", run(out=5)], ["out: expected a path, got 5"]),
     "an anchor at the top": (
         ["eval", "a: &a [tabletop]\n" + run()],
         ["a: there is no such setting"],
     ),
     "an anchor in itself": (
         ["eval", "policies: &a [*a]\n"],
-        ["policies.0: got list", "want a mapping"],
+        ["policies.0: expected a mapping", "got list"],
     ),
     "several documents": (["eval", run() + "---\n" + run()], ["not YAML", "document"]),
     "a tag of Python": (
@@ -206,7 +206,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "nested too deeply": (["eval", "policies: " + "[" * 3000], ["not YAML", "nested too deeply"]),
     "no entries": (["eval", run(policies=[])], ["policies", "at least 1"]),
-    "an empty key": (["eval", run(suites=None)], ["suites: got NoneType", "list"]),
+    "an empty key": (["eval", run(suites=None)], ["suites: expected a valid list, got NoneType"]),
     "a number as a key": (["eval", "1: 2\n" + run()], ["1: ", "string"]),
     "a folder as a file": (["eval", "folder.yaml"], ["expected a file, got a folder"]),
     "slurm: setup absent": (
@@ -245,7 +245,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "serve: half of TLS": (["serve", "noop", "--tls-cert", "x.pem"], ["--tls-key"]),
     "serve: text for a port": (
         ["serve", "noop", "--port", "80x"],
-        ["--port", "got '80x', want a valid integer"],
+        ["--port", "expected a valid integer, got '80x'"],
     ),
     "serve: port beyond the last": (
         ["serve", "noop", "--port", "99999"],
@@ -289,7 +289,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "report: text as database": (["report", "texted"], ["results.db"]),
     "eval: tracker": (
         ["eval", "tabletop", "--policy", "noop", "--track", "wandbb", "--dry-run", "--out", "o"],
-        ["'wandbb' is not registered", "'wandb'"],
+        ["got 'wandbb', which is not registered", "'wandb'"],
     ),
     "export: kind": (["export", "nowhere", "--out", "x.csv", "--to", "xlsx"], ["'xlsx'", "csv"]),
     "export: setting": (
@@ -336,7 +336,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["own.py", "requirements file"],
     ),
     "replay: nothing there": (["replay", "nowhere"], ["nowhere", "results.db"]),
-    "replay: no episode": (["replay", "done"], ["got no episode, want a key as ['tabletop#0@0:"]),
+    "replay: no episode": (["replay", "done"], ["expected a key such as ['tabletop#0@0:"]),
     "replay: a dataset": (["replay", "dataset"], ["dataset", "vlagents-ray open-loop dataset"]),
     "open-loop: nothing there": (
         ["open-loop", "nowhere", "--policy", "noop"],

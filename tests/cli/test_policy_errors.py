@@ -66,7 +66,7 @@ def eval_of(
 
 
 WORDS = {
-    "nan": "action: got NaN or infinity; the policy's output is broken",
+    "nan": "action: expected finite numbers, got NaN or infinity; check the policy's output",
     "key": "policy act: KeyError: 'masst0'",
 }
 
@@ -144,7 +144,9 @@ def test_an_action_of_another_size_than_the_first_is_an_error_of_the_policy() ->
     )
     assert isinstance(result, EpisodeResult)
     assert (result.status, bool(result.success_at_end)) == ("policy_error", False)
-    assert "got (1, 3), want 5 numbers a row" in (result.error or "")
+    assert "expected 5 numbers a row, as in the first action, got shape (1, 3)" in (
+        result.error or ""
+    )
 
 
 @pytest.mark.parametrize("text", ["@handle", "%2", "`x`", "*all", "a: b: c", "!tag"])

@@ -66,5 +66,5 @@ def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: 
 def test_what_is_no_folder_of_results_or_more_than_one_to_watch_is_refused(tmp_path: Path) -> None:
     done = report(str(tmp_path))
     assert done.exit_code == 2
-    assert "want a folder that an evaluation wrote its results to" in done.stderr
-    assert "want one FOLDER" in report(str(tmp_path), str(tmp_path), "--live").stderr
+    assert "expected a folder that an evaluation wrote" in done.stderr
+    assert "expected one FOLDER" in report(str(tmp_path), str(tmp_path), "--live").stderr

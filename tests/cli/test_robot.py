@@ -197,11 +197,11 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "cure"),
     [
-        ([], "want one of them"),
+        ([], "expected a URL or --env, got neither"),
         (["--leader", "pedals"], "keyboard"),
         (["--leader", "keyboard"], "no terminal"),
         (["scripted", "--mode", "often"], "open_loop"),
-        (["http://127.0.0.1:9", "--set", "a=1"], "has its settings already"),
+        (["http://127.0.0.1:9", "--set", "a=1"], "expected no settings"),
     ],
 )
 def test_wrong_settings_are_refused_with_the_cure(words: list[str], cure: str) -> None:
@@ -451,18 +451,18 @@ SIMULATED = "vlagents_ray.robot.simulated:SimulatedRobot"
         (
             RELATIVE,
             [*SHORT, "--safe", "hold"],
-            "ConfigError: safe: got 'hold', which .*give safe='zero', or 'auto'",
+            "ConfigError: safe: expected 'zero' or 'auto', got 'hold', which",
         ),
         (
             RELATIVE,
             [*SHORT, "--measure", "joints"],
-            "ConfigError: measure: got one for relative actions",
+            "ConfigError: measure: expected none for relative actions",
         ),
         (None, ["http://nowhere", "--robot", SIMULATED], "safe='hold'"),
         (
             None,
             [*SHORT, "--robot", "builtins:dict"],
-            "--robot builtins:dict: lacks observe, apply, stop; want a class",
+            "--robot builtins:dict: expected a class .*, got one without observe, apply, stop",
         ),
     ],
 )
@@ -483,17 +483,17 @@ def test_what_does_not_fit_ends_the_command_before_anything_is_timed(
 @pytest.mark.parametrize(
     ("options", "wanted"),
     [
-        (["--hz", "0"], "argument --hz: got '0', want a number above 0"),
-        (["--hz", "nan"], "argument --hz: got 'nan', want a number above 0"),
-        (["--seconds", "-1"], "argument --seconds: got '-1', want a number above 0"),
-        (["--execute", "0"], "argument --execute: got '0', want a whole number from 1"),
-        (["--horizon", "1.5"], "argument --horizon: got '1.5', want a whole number from 1"),
-        (["--max-age-s", "0"], "argument --max-age-s: got '0', want a number above 0"),
-        (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
-        (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
+        (["--hz", "0"], "argument --hz: expected a number above 0, got '0'"),
+        (["--hz", "nan"], "argument --hz: expected a number above 0, got 'nan'"),
+        (["--seconds", "-1"], "argument --seconds: expected a number above 0, got '-1'"),
+        (["--execute", "0"], "argument --execute: expected a whole number from 1, got '0'"),
+        (["--horizon", "1.5"], "argument --horizon: expected a whole number from 1, got '1.5'"),
+        (["--max-age-s", "0"], "argument --max-age-s: expected a number above 0, got '0'"),
+        (["--deadline-ms", "-1"], "argument --deadline-ms: expected a number from 0, got '-1'"),
+        (["--silent-s", "soon"], "argument --silent-s: expected a number above 0, got 'soon'"),
         (
             ["--mode", "open_loop", "--rtc"],
-            "--merge and --rtc: got one of them with --mode open_loop",
+            "--merge and --rtc: expected --mode async with them, got --mode open_loop",
         ),
         (
             ["--leader", "elsewhere:Pedal"],
@@ -524,7 +524,7 @@ def test_options_are_checked_before_a_server_is_asked(
 
 def test_an_address_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert drive(["nonsense"]) == 2
-    assert "want http(s)://" in capsys.readouterr().err
+    assert "expected http(s)://" in capsys.readouterr().err
 
 
 ON_AN_ARM = """
@@ -665,8 +665,8 @@ ARM = ["--robot", SIMULATED]
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--hz", "1e9"], "--hz: got '1e9', want at most 10000"),
-        (["--hz", "inf"], "--hz: got 'inf', want at most 10000"),
+        (["--hz", "1e9"], "--hz: expected a number of at most 10000, got '1e9'"),
+        (["--hz", "inf"], "--hz: expected a number of at most 10000, got 'inf'"),
         (["--robots", "x:Y"], "--robots x:Y; did you mean '--robot'"),
         (["--robots=x:Y"], "--robots=x:Y; did you mean '--robot'"),
         (["--recrd", "x"], "did you mean '--record'"),
@@ -677,20 +677,23 @@ ARM = ["--robot", SIMULATED]
             ["--api-key", "vlr_secret"],
             "read from a variable: export VLAGENTS_RAY_API_KEY=vlr_...\n$",
         ),
-        (["--robot-set", "foo=1"], "--robot-set without --robot; name the robot"),
+        (
+            ["--robot-set", "foo=1"],
+            "--robot-set: expected --robot with it, got none; name the robot",
+        ),
         (["--robot", "{here}:FaultyArn"], "has no 'FaultyArn'; did you mean 'FaultyArm'"),
         (["--robot", "json:Armature"], "has no 'Armature'; write the name of a class"),
-        (["--robot", "nope"], "'nope', want module:Class, as in my_arm:MyArm"),
-        (["--safe", "holdd"], "'holdd', want one of .*did you mean 'hold'"),
+        (["--robot", "nope"], "expected module:Class, as in my_arm:MyArm, got 'nope'"),
+        (["--safe", "holdd"], "expected one of .*, got 'holdd'.*did you mean 'hold'"),
         (["--mode", "open-loop"], "did you mean 'open_loop'"),
         (["--merge", "newst"], "did you mean 'newest'"),
         (["--transport", "smh"], "did you mean 'shm'"),
         (["--restart", "autom"], "did you mean 'auto'"),
         (["--leader", "keybord"], "did you mean 'keyboard'"),
-        (["--seconds", "inf"], "--seconds: got 'inf', want at most"),
-        (["--silent-s", "inf"], "--silent-s: got 'inf', want at most"),
-        (["--timeout-s", "1e300"], "want at most"),
-        (["--execute", "99999999999"], "want at most"),
+        (["--seconds", "inf"], "--seconds: expected a number of at most .*, got 'inf'"),
+        (["--silent-s", "inf"], "--silent-s: expected a number of at most .*, got 'inf'"),
+        (["--timeout-s", "1e300"], "expected a number of at most"),
+        (["--execute", "99999999999"], "expected a number of at most"),
         (["--record", "/proc/x"], "recorder /proc/x: .*record into a new folder"),
         (["--record", "{file}"], "recorder .*record into a new folder"),
         (["--record", "{file}/below"], "recorder .*record into a new folder"),
@@ -703,12 +706,12 @@ ARM = ["--robot", SIMULATED]
         (["--robot", "ros:{folder}"], "cannot be read as a file of ROS topics"),
         (["--robot", "ros:/nowhere.yaml"], "cannot be read as a file of ROS topics"),
         ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it takes"),
-        ([*ARM, "--robot-set", "foo"], "want KEY=VALUE"),
+        ([*ARM, "--robot-set", "foo"], "expected KEY=VALUE"),
         (
             ["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"],
             "could not be made: OSError: .*port /dev/x",
         ),
-        (["--robot", "{here}:FaultyArm", "--robot-set", "port=3"], "port: got 3, want str"),
+        (["--robot", "{here}:FaultyArm", "--robot-set", "port=3"], "port: expected str, got 3"),
         (["--robot", "broken_syntax:Arm"], "SyntaxError: .*correct the module 'broken_syntax'"),
         (
             ["--robot", "raising_module:Arm"],
@@ -718,12 +721,12 @@ ARM = ["--robot", SIMULATED]
         (["--robot", ":Arm"], "--robot :Arm"),
         (["--robot", "a..b:Arm"], "--robot a..b:Arm"),
         (["--leader", "{here}:Unmade"], "--leader .*could not be made: TypeError"),
-        (["--leader", "builtins:dict"], "lacks engaged, action"),
+        (["--leader", "builtins:dict"], "got one without engaged, action"),
         (["--leader", "broken_syntax:Leader"], "SyntaxError"),
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
         (
             ["--measure", "jonts", *ARM],
-            "--measure: got 'jonts', want a part of the robot's state, one of .*'joints'",
+            "--measure: expected a part of the robot's state, one of .*'joints'.*, got 'jonts'",
         ),
     ],
 )

@@ -130,7 +130,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop/lft", *EVAL, "scripted"),
-            "tabletop has no task 'lft': want one of .*did you mean 'lift'",
+            "tabletop: expected a task of .*, got 'lft'.*did you mean 'lift'",
         ),
         (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'"),
         (
@@ -139,11 +139,11 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),
-            "a worker wants 0.5 GPUs, this",
+            "got 0.5 for a worker",
         ),
         (
             ("eval", "tabletop", *EVAL, "scripted", "--video", "alll"),
-            "video: got 'alll', want 'none', 'failures' or 'all'; did you mean 'all'",
+            "video: expected 'none', 'failures' or 'all', got 'alll'; did you mean 'all'",
         ),
         (
             ("eval", "my_policies:Reach", *EVAL, "scripted"),
@@ -151,7 +151,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("serve", "runs/act/last"),
-            "want a policy or a deployment file; .*lerobot.yaml --set checkpoint=runs/act/last",
+            "expected a policy or a deployment file, .*lerobot.yaml --set checkpoint=runs/act/last",
         ),
         (
             ("eval", "tabletop", *EVAL, "./typ.yaml"),
@@ -163,18 +163,18 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "tabletop", "--policy", "scripted"),
-            "error got no --out, want --out; or a file of runs",
+            "error expected --out, got none; add them, or give a plan",
         ),
         (
             ("eval", "tabletop", "--out", "runs/x"),
-            "error got no --policy, want --policy; or a file of runs",
+            "error expected --policy, got none; add them, or give a plan",
         ),
         (("eval", "absent.yaml"), "'absent.yaml' does not exist"),
         (
             ("eval", "typo.yaml"),
-            "worker: got 2, want a mapping with some of .'cpus', .*did you mean 'workers'",
+            "worker: expected a mapping with some of .'cpus', .*, got 2; did you mean 'workers'",
         ),
-        (("eval", "low.yaml"), "workers: got -1, want greater than or equal to 0"),
+        (("eval", "low.yaml"), "workers: expected greater than or equal to 0, got -1"),
         (
             ("eval", "listed.yaml"),
             "suites.0.episods: there is no such setting; .*did you mean 'episodes'",
@@ -183,7 +183,10 @@ EVAL = ("--out", "runs/x", "--policy")
             ("serve", "my_policies:Loaded"),
             "policy Loaded: checkpoint: is missing; give --set checkpoint=…",
         ),
-        (("serve", "my_policies:Reach", "--set", "gain"), "got 'gain', want KEY=VALUE"),
+        (
+            ("serve", "my_policies:Reach", "--set", "gain"),
+            "expected KEY=VALUE, as in batch.max_size=8, got 'gain'",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_at_once_in_one_line_and_with_what_was_meant(

@@ -32,8 +32,12 @@ FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
 @pytest.mark.parametrize(
     ("policies", "file", "text"),
     [
-        ([FIXED], None, "in the checkpoints of 0 policies, want it in that of one"),
-        ([SWEPT, SWEPT | {"name": "other"}], None, "in the checkpoints of 2 policies"),
+        ([FIXED], None, r"expected \{step\} in the checkpoint of one policy, .*, got it in 0"),
+        (
+            [SWEPT, SWEPT | {"name": "other"}],
+            None,
+            r"expected \{step\} in the checkpoint of one policy, .*, got it in 2",
+        ),
         ([SWEPT | {"steps": [10]}], None, "--watch finds its steps; leave `steps` out"),
         ([SWEPT], "runs/training_finished", "ended without a checkpoint"),
         ([SWEPT], "results.db", "resume them"),

@@ -41,7 +41,7 @@ def test_the_url_and_the_option_decide_or_are_refused_at_once(
 def test_what_is_wrong_without_a_server_needs_none() -> None:
     with pytest.raises(
         InvalidInput,
-        match=r"got 'webp', want one of \['auto', 'exact', 'raw', 'lossless', 'jpeg'\]",
+        match=r"expected one of \['auto', 'exact', 'raw', 'lossless', 'jpeg'\], got 'webp'",
     ):
         RemoteAgent("http://gpu-box:8000", codec="webp")
     with pytest.raises(NotReset):

@@ -46,7 +46,7 @@ def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
     inbox.receive(told(do, text="fold the cloth"))
     assert inbox.apply(control) == []
     assert (control.stopped, control.reason, control.over) == (True, "by the operator", False)
-    assert "no such command" in inbox.with_outcomes(Obs()).info[COMMANDED][f"id of {do}"]
+    assert "expected a command of" in inbox.with_outcomes(Obs()).info[COMMANDED][f"id of {do}"]
 
 
 def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> None:

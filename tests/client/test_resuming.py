@@ -452,13 +452,13 @@ def test_one_session_that_fails_leaves_its_neighbours_alone(
     acts = agent.act_batch([obs(1), bad, obs(2)], envs)
     assert isinstance(acts[0], Act)
     assert isinstance(acts[1], Exception)
-    assert "want (H, W, 3) uint8" in str(acts[1])
+    assert "expected (H, W, 3) uint8" in str(acts[1])
     assert isinstance(acts[2], Act)
     infos = agent.reset_batch([obs(0)], [None], [envs[0]], fail=True)
     assert isinstance(infos[0], PolicyFailed)
     with pytest.raises(NotReset):
         envs[0].act(obs(0))
-    with pytest.raises(ConfigError, match="observations for"):
+    with pytest.raises(ConfigError, match="observations, one for each session"):
         agent.act_batch([obs(0)], envs)
     stranger = served.agent()
     with pytest.raises(ConfigError, match="share its connection"):

@@ -100,7 +100,7 @@ def test_an_unusable_action_is_refused_before_any_environment_moves(batch: Batch
 
 def test_seeds_need_an_environment_each(batch: BatchEnv) -> None:
     for seeds in ([], [1, 2, 3, 4]):
-        with pytest.raises(ConfigError, match="want 1 to 3"):
+        with pytest.raises(ConfigError, match="expected 1 to 3 seeds"):
             batch.reset(seeds=seeds)
     with pytest.raises(ConfigError, match="num_envs is 0"):
         make_batch("tabletop", 0)

@@ -218,7 +218,7 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
         ("VlaArm-v0", {"state": {"joints": "robot/qpos[7:9]"}}, ConfigError, "empty"),
         ("VlaArm-v0", {"state": {"joints": "robot[a]"}}, ConfigError, "range"),
         ("VlaArm-v0", {"cameras": {"front": "robot/qpos"}}, ConfigError, "uint8"),
-        ("VlaArm-v0", {"gripper": "robot/qpos"}, ConfigError, "want one"),
+        ("VlaArm-v0", {"gripper": "robot/qpos"}, ConfigError, "expected one number"),
         (
             "VlaArm-v0",
             {"gripper": "robot/qpos[3:]", "gripper_range": (1.0, 1.0)},

@@ -109,7 +109,7 @@ def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
 
 
 def test_several_environments_share_a_simulator_only_on_a_gpu() -> None:
-    with pytest.raises(ConfigError, match="want physx_cuda"):
+    with pytest.raises(ConfigError, match="use physx_cuda"):
         ManiSkillBatch("PushCube-v1", num_envs=2, sim_backend="physx_cpu")
     with make_batch("maniskill/PushCube-v1", 2, **SMALL) as batch:
         assert isinstance(batch, SequentialBatch)

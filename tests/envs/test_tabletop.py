@@ -165,17 +165,17 @@ def test_what_there_is_not_is_refused() -> None:
     with pytest.raises(NotReset):
         Tabletop().step(Act(np.zeros(4, np.float32)))
     for task, option, value, text in (
-        ("lift", "width", 3, "want at least 32"),
-        ("lift", "pucks", 0, "want 1 to 4 in 'lift'"),
-        ("lift", "pucks", 5, "want 1 to 4 in 'lift'"),
-        (None, "pucks", 1, "want 2 to 4 in 'mixed'"),
-        (None, "disturbance", 2.0, "want 0 to 1 in 'mixed'"),
+        ("lift", "width", 3, "at least 32"),
+        ("lift", "pucks", 0, "1 to 4 in 'lift'"),
+        ("lift", "pucks", 5, "1 to 4 in 'lift'"),
+        (None, "pucks", 1, "2 to 4 in 'mixed'"),
+        (None, "disturbance", 2.0, "0 to 1 in 'mixed'"),
     ):
-        with pytest.raises(ConfigError, match=f"{option} is {value}, {text}"):
+        with pytest.raises(ConfigError, match=f"{option}: expected {text}, got {value}"):
             Tabletop(task, **{option: value})
 
     with pytest.raises(
-        ConfigError, match=r"no camera \['top'\]: want some of \['front', 'wrist'\]"
+        ConfigError, match=r"expected cameras of \['front', 'wrist'\], got \['top'\]"
     ):
         Tabletop(cameras=("top",))
 

@@ -201,14 +201,14 @@ def test_an_episode_is_found_by_its_key_and_by_env_and_number_if_it_is_the_only_
         == results.cases[1].episodes[1]
     )
     for name in (LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"):
-        with pytest.raises(ConfigError, match="has no episode"):
+        with pytest.raises(ConfigError, match="which no episode has"):
             find(results, name)
 
 
 def test_seeds_are_not_guessed_and_episodes_beyond_the_point_of_stopping_are_found(
     config: Config, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=r"stands for 2 episodes; want one of the keys .*@0.*@10"):
+    with pytest.raises(ConfigError, match=r"which 2 episodes have; use one of the keys .*@0.*@10"):
         find(play(config(episodes=1, seeds=[0, 10], out=tmp_path / "seeds")), f"{LINE}#0")
     results = play(config(episodes=30, stop={"target": 0.3}))
     assert not (last := results.cases[0].episodes[-1]).counts

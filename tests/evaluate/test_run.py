@@ -167,7 +167,7 @@ class TestOnACluster:
 
 def test_settings_can_be_checked_before_anything_is_served(config: Config) -> None:
     for refuse in (here, check):
-        with pytest.raises(UnknownEnv, match="'nowhere' is not registered"):
+        with pytest.raises(UnknownEnv, match="'nowhere', which is not registered"):
             refuse(config(envs=["nowhere"]))
         assert not config().out.exists()
     check(config())
@@ -178,7 +178,7 @@ def test_settings_can_be_checked_before_anything_is_served(config: Config) -> No
 
 
 def test_a_policy_must_be_somewhere(config: Config) -> None:
-    with pytest.raises(ConfigError, match="policy 'policy': got no url"):
+    with pytest.raises(ConfigError, match="policy 'policy': expected the `url` of its server"):
         evaluate(config())
 
 

@@ -183,6 +183,10 @@ def test_an_unknown_tracker_is_an_error_with_the_registered_ones_before_anything
 ) -> None:
     for use in (resolve, check):
         with pytest.raises(
-            ConfigError, match=r"'listner' is not registered: want one of .*did you mean 'listener'"
+            ConfigError,
+            match=(
+                r"expected one of .*, got 'listner', which is not registered; did you mean "
+                r"'listener'"
+            ),
         ):
             use(config(track=["listner"]))

@@ -93,7 +93,7 @@ def test_a_png_that_declares_too_much_or_unpacks_to_more_than_that_is_refused() 
 @pytest.mark.parametrize("encode", [jpeg_png.encode_jpeg, jpeg_png.encode_png])
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 4), (0, 4, 3)])
 def test_what_is_no_image_is_refused(encode: object, shape: tuple[int, ...]) -> None:
-    with pytest.raises(InvalidObservation, match="want \\(H, W, 3\\) uint8 RGB"):
+    with pytest.raises(InvalidObservation, match="expected \\(H, W, 3\\) uint8 RGB"):
         encode(np.zeros(shape, np.uint8))
 
 

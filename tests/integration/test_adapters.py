@@ -56,7 +56,7 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
         ]
         served = agent.act_batch([observation(10 + seed) for seed in range(len(chosen))], sessions)
         with pytest.raises(
-            UnknownCheckpoint, match=r"want one of \['pour', 'stack'\] or none, for its own"
+            UnknownCheckpoint, match=r"expected one of \['pour', 'stack'\] or none, for its own"
         ):
             agent.reset(observation(0), None, checkpoint="../stack")
     assert [info["checkpoint"] for info in infos] == [

@@ -162,7 +162,7 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     assert cases["still", "easy", "tabletop/slide"]["successes"] == 0
     refused = evaluate(ray_home, str(file), "--episodes", "9", cwd=tmp_path)
     assert refused.returncode == 2
-    assert "says what is evaluated; got ['episodes'] beside it" in refused.stderr
+    assert "got ['episodes'] with it" in refused.stderr
 
 
 def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:

@@ -255,7 +255,7 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
         first, said = _status(dashboard, "nowhere")[1].strip().splitlines()
         assert first == "Deploying app 'nowhere' failed with exception:"
         assert said.startswith(
-            "ConfigError: environment.python: no such file, got '/nowhere/bin/python'"
+            "ConfigError: environment.python: expected an interpreter, got '/nowhere/bin/python'"
         )
         for app in ("broken", "large"):
             for path in ("healthz", "v1/metadata"):

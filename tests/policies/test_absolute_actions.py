@@ -176,7 +176,7 @@ def test_it_is_named_in_a_deployment_and_keeps_the_contract_of_an_agent() -> Non
 
 def test_a_policy_that_returns_rows_of_earlier_chunks_is_refused() -> None:
     settings = {"checkpoint": "anywhere", "actions": "queue"}
-    with pytest.raises(ConfigError, match="want actions: chunk"):
+    with pytest.raises(ConfigError, match="expected a policy with actions: chunk"):
         build_agent("reference", settings, [{"absolute_actions": {"state": ["joints"]}}])
 
 

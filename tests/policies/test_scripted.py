@@ -86,7 +86,7 @@ def test_a_failed_reset_keeps_no_expert() -> None:
 )
 def test_an_instruction_that_it_does_not_understand_is_refused(text: str) -> None:
     views, _ = tabletop_views()
-    with pytest.raises(InvalidObservation, match="want one like"):
+    with pytest.raises(InvalidObservation, match="expected an instruction like"):
         TabletopExpert("tabletop").reset(views[0], text)
 
 

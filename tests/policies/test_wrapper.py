@@ -128,7 +128,7 @@ def test_the_first_wrapper_is_the_nearest_to_the_robot() -> None:
     ("wrappers", "said"),
     [
         (["nothing"], "not registered"),
-        ([BRIGHT], "want a subclass"),
+        ([BRIGHT], "expected a subclass"),
         ([{DIM: {"off": 1}}], "wrapper Dim"),
         ([{DIM: {}, BRIGHT: {}}], "one name each"),
     ],

@@ -104,11 +104,15 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
         ready(monkeypatch, alone / "b", "http://127.0.0.1:8001", "pi0", "127.0.0.1:2")
         assert [one.apps for one in local_servers()] == [("noop",), ("pi0",)]
         with pytest.raises(
-            ConfigError, match=r"got 2 servers .*8000 \(noop\), .*8001 \(pi0\); say which"
+            ConfigError,
+            match=(
+                r"expected one server on this machine, got 2, .*8000 \(noop\), .*8001 \(pi0\); "
+                r"choose one"
+            ),
         ):
             join()
         with pytest.raises(
-            ConfigError, match=r"got 'act', want the URL or an application .*8000 \(noop\)"
+            ConfigError, match=r"expected the URL or an application .*8000 \(noop\).*, got 'act'"
         ):
             join("act")
         # So that it says which one it found, and goes no further.

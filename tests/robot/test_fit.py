@@ -64,13 +64,13 @@ def test_a_file_without_ranges_is_refused(tmp_path: Path, text: str) -> None:
         ([0.5, -1.0, 0.5], None),
         (
             [57.0, -1.0, 0.5],
-            r"state\[0\] \(pan\): got 57, was trained from -1 to 1; degrees for radians\?",
+            r"state\[0\] \(pan\): expected -1 to 1, the range of the training, got 57; degrees for radians\?",
         ),
         (
             [-1.9, -1.0, 0.5],
-            r"state\[0\] \(pan\): got -1.9, .*fit number \[1\] \(lift\): another order\?",
+            r"state\[0\] \(pan\): expected .*, got -1.9.*fit number \[1\] \(lift\): another order\?",
         ),
-        ([0.5, -1.0], "got 2 numbers, was trained with 3"),
+        ([0.5, -1.0], "expected 3 numbers, as the policy was trained with, got 2"),
     ],
 )
 def test_a_state_outside_of_the_training_is_found_with_its_number(
@@ -89,7 +89,7 @@ def test_a_first_chunk_and_limits_are_compared_with_the_training() -> None:
     chunk = np.zeros((5, 3))
     chunk[3, 2] = 4.0
     [found] = TRAINED.misfits(None, chunk, None)
-    assert found.startswith("first chunk[2]: got 4, was trained from 0 to 1")
+    assert found.startswith("first chunk[2]: expected 0 to 1, the range of the training, got 4")
     [found] = TRAINED.misfits(None, None, MotionLimits(low=(-1.0, -1.5, 0.0), joints=NAMES))
     assert found.startswith("action[1] (lift): was trained to -2, the arm's limit is -1.5")
 
@@ -209,7 +209,7 @@ def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(
     with caplog.at_level(logging.INFO):
         _require_fit(parse(words), agent, Standing(0.9, -1.9), None, said.append)
     assert said[0] in caplog.text
-    with pytest.raises(ContractMismatch, match=r"state\[1\] \(lift\): got 57"):
+    with pytest.raises(ContractMismatch, match=r"state\[1\] \(lift\): expected .*, got 57"):
         _require_fit(parse(words), agent, Standing(57, 0), None, said.append)
     said.clear()
     _require_fit(parse(words), Still(), Standing(57, 0), None, said.append)

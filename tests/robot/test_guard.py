@@ -20,13 +20,13 @@ GUARD = Guard(Contract(action=ActionSpec(dim=3, low=-1.0, high=1.0)))
 @pytest.mark.parametrize(
     ("action", "said"),
     [
-        (row(0, 0), r"got \(2,\) float32, want \(3,\)"),
+        (row(0, 0), r"expected \(3,\) float32, a single row, got \(2,\) float32"),
         (np.zeros((1, 3), np.float32), "single row"),
         (np.zeros(3, np.int64), "int64"),
         (row(0, np.nan, 0), "finite"),
         (row(0, np.inf, 0), "finite"),
-        (row(0, 0, -1.01), r"action\[2\]: got -1.01, below the limit -1"),
-        (row(0, 1.01, 0), r"action\[1\]: got 1.01, above the limit 1"),
+        (row(0, 0, -1.01), r"action\[2\]: expected .*, got -1.01, below the limit -1"),
+        (row(0, 1.01, 0), r"action\[1\]: expected .*, got 1.01, above the limit 1"),
     ],
 )
 def test_an_action_that_breaks_the_contract_is_refused_by_its_number(
@@ -53,7 +53,7 @@ def test_a_jump_is_refused_and_a_first_action_is_none() -> None:
     guard = Guard(max_step=np.array([0.1, 5.0]))
     guard(row(9, 9))
     guard(row(0.05, 4), row(0, 0))
-    with pytest.raises(InvalidAction, match=r"action\[0\]: got 0.2 after 0"):
+    with pytest.raises(InvalidAction, match=r"action\[0\]: expected .*, got 0.2 after 0"):
         guard(row(0.2, 0), row(0, 0))
 
 
@@ -72,9 +72,13 @@ def test_a_measured_pose_that_is_none_is_refused() -> None:
     obs = Obs(state={"joints": row(1, np.nan), "tick": row(1)})
     with pytest.raises(InvalidAction, match="finite"):
         Guard(measure=lambda obs: obs.state["joints"]).reference(obs, None)
-    with pytest.raises(ConfigError, match=r"measure: got \(1,\), want \(2,\)"):
+    with pytest.raises(
+        ConfigError, match=r"measure: expected the shape of an action, \(2,\), got \(1,\)"
+    ):
         Guard(measure=lambda obs: obs.state["tick"]).reference(obs, row(0, 0))
-    with pytest.raises(ConfigError, match="measure: got one for relative actions"):
+    with pytest.raises(
+        ConfigError, match=r"measure: expected none for relative actions.*, got one"
+    ):
         Guard(Contract(action=ActionSpec(delta=True)), measure=lambda obs: obs.state["joints"])
 
 

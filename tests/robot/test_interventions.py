@@ -180,7 +180,7 @@ def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) ->
     with Recorder(tmp_path, HZ, interventions=True) as recorder:
         for label in ("success", "discard", "failure", None):
             add(recorder, label)
-        with pytest.raises(ConfigError, match="want one of"):
+        with pytest.raises(ConfigError, match="expected one of"):
             recorder.label("good")  # type: ignore[arg-type]
     about = [
         pq.read_table(path).to_pylist()[0]

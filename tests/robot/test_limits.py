@@ -60,10 +60,10 @@ def test_speeding_up_is_limited_and_braking_is_not() -> None:
     # braking, and away in the other direction from rest.
     run(guard(limits), 0, 0.0039, 0.0078, 0.0078, 0.0039)
     for positions, said, cause in (
-        ((0, 0.0041), "acceleration 10.25, want 10 at most", "dynamics"),
+        ((0, 0.0041), "expected acceleration of at most 10 .*, got 10.25", "dynamics"),
         # Turns round at once.
-        ((0, 0.0030, 0.0060, 0.0030), "acceleration -15, want 10", "dynamics"),
-        ((0, 0.021), "velocity 1.05, want 1 at most", "max_step"),
+        ((0, 0.0030, 0.0060, 0.0030), "acceleration of at most 10 .*, got -15", "dynamics"),
+        ((0, 0.021), "expected velocity of at most 1 .*, got 1.05", "max_step"),
     ):
         with pytest.raises(InvalidAction, match=said) as refused:
             run(guard(limits), *positions)
@@ -71,7 +71,7 @@ def test_speeding_up_is_limited_and_braking_is_not() -> None:
 
 
 def test_a_jerk_is_refused_by_its_number() -> None:
-    with pytest.raises(InvalidAction, match="jerk 250, want 200 at most") as refused:
+    with pytest.raises(InvalidAction, match=r"expected jerk of at most 200 .*, got 250") as refused:
         run(guard(MotionLimits(velocity=1.0, jerk=200.0)), 0, 0.002)
     assert refused.value.cause == "dynamics"
 
@@ -110,9 +110,12 @@ def test_the_first_minutes_of_motion_have_half_of_the_limits() -> None:
 def test_limits_need_the_rate_and_as_many_numbers_as_an_action_has() -> None:
     with pytest.raises(ConfigError, match="hz=None"):
         Guard(limits=LIMITS)
-    with pytest.raises(ConfigError, match="want one number, or 3"):
+    with pytest.raises(ConfigError, match="expected one number, or 3"):
         Guard(Contract(action=ActionSpec(dim=3)), limits=MotionLimits(velocity=(1.0, 1.0)), hz=HZ)
-    with pytest.raises(ConfigError, match=r"limits for 50.0 Hz in a loop of 20"):
+    with pytest.raises(
+        ConfigError,
+        match=r"expected limits for 20.* Hz, the rate of the loop, got limits for 50.0 Hz",
+    ):
         run_loop(Arm(), Line(), hz=20, seconds=0.1, options=LoopOptions(guard=guard()))
 
 
@@ -177,7 +180,10 @@ def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follow
 
 
 def test_a_first_action_that_is_far_away_is_refused_with_the_distance() -> None:
-    with pytest.raises(InvalidAction, match=r"0\.76 from the pose 0, want 0\.5 at most"):
+    with pytest.raises(
+        InvalidAction,
+        match=r"expected a first action at most 0\.5 from the pose 0, got 0\.76, 0\.76 away",
+    ):
         guard().ease_in(row(0), row(0.76))
     assert guard().ease_in(row(0), row(0.4)) is not None
 
@@ -261,7 +267,7 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
         ("velocity: [1", "line 1"),
         ("- 1", "TypeError"),
         ("velocity: fast", "fast"),
-        ("unit: grad", "unit: got 'grad', want 'rad' or 'deg'"),
+        ("unit: grad", "unit: expected 'rad' or 'deg', got 'grad'"),
         ("urdf: none.urdf", "none.urdf"),
     ],
 )

@@ -411,7 +411,7 @@ def test_a_report_counts_refused_actions_by_cause_whatever_their_numbers(
         report = run_loop(Watched(Going.contract), player, hz=200, until=lambda: agent.tick > 12)
     assert set(report.safe) == {cause}
     assert report.safe[cause] == report.safe_ticks >= 10
-    assert report.reasons[cause].startswith("action[0]: got")
+    assert report.reasons[cause].startswith("action[0]: expected")
 
 
 def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None:
@@ -525,7 +525,7 @@ def test_a_rate_and_a_length_are_above_zero(hz: float, seconds: float | None) ->
 
 
 def test_a_restart_is_manual_or_automatic() -> None:
-    with pytest.raises(ConfigError, match="want one of"):
+    with pytest.raises(ConfigError, match="expected one of"):
         LoopOptions(restart="later")  # type: ignore[arg-type]
 
 

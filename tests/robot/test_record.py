@@ -223,7 +223,7 @@ def test_a_frame_unlike_the_first_costs_its_episode_and_is_told(tmp_path: Path) 
         with recorder.episode("stack"):
             recorder.add(obs(0), action(0), tick=0)
             recorder.add(obs(1, side), action(1), tick=1)
-    with pytest.raises(InvalidObservation, match=r"want .* as before"):
+    with pytest.raises(InvalidObservation, match=r"expected .* as before"):
         recorder.close()
     assert info(tmp_path)["total_episodes"] == 2
 
@@ -322,7 +322,7 @@ def test_a_folder_is_taken_only_as_an_empty_one_or_a_dataset_of_this_rate(tmp_pa
     record(tmp_path, 0)
     assert not (tmp_path / "meta").exists(), "an episode without frames leaves nothing"
     record(tmp_path, 2)
-    with pytest.raises(ConfigError, match="has fps 25, want 50"):
+    with pytest.raises(ConfigError, match="expected fps 50, got 25"):
         Recorder(tmp_path, 50)
     (tmp_path / "else").mkdir()
     (tmp_path / "else/thesis.tex").write_text("...")

@@ -246,32 +246,44 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     ),
     (OneActionBuffer, "an earlier act.*a later one changed it"),
     (with_batch(lambda acts, _: acts[::-1]), "session 0 in a batch of 2"),
-    (with_batch(lambda acts, _: acts[:2]), "got 2 of them, want a list of 3"),
+    (with_batch(lambda acts, _: acts[:2]), "expected a list of 3 Acts, got 2 of them"),
     (with_batch(lambda _, obs: [RuntimeError("out of memory") for _ in obs]), "out of memory"),
     (ActsByItself, "act_batch must give each session"),
     (with_batch(lambda acts, _: tuple(acts)), "got tuple"),
-    (with_act(lambda act, _: act.action), "act: got ndarray, want an Act"),
+    (with_act(lambda act, _: act.action), "act: expected an Act, got ndarray"),
     (with_act(lambda act, _: replace(act, action=act.action.astype(np.float64))), "float64"),
-    (with_act(lambda act, _: replace(act, action=act.action.tolist())), "action is list"),
+    (
+        with_act(lambda act, _: replace(act, action=act.action.tolist())),
+        "the action as a numpy array of float32, got list",
+    ),
     (with_act(lambda act, _: replace(act, action=act.action * np.nan)), "NaN"),
-    (with_act(lambda act, _: replace(act, action=act.action[:1])), "want 2 numbers a row"),
-    (with_act(lambda act, _: replace(act, done=np.bool_(True))), "done is bool"),
+    (with_act(lambda act, _: replace(act, action=act.action[:1])), "expected 2 numbers a row"),
+    (
+        with_act(lambda act, _: replace(act, done=np.bool_(True))),
+        "expected done to be a bool, got bool",
+    ),
     (with_act(lambda act, _: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
     (PreparesOtherwise, "on a prepared observation.*`prepare` must compute what"),
     (SharesItsTokenizer, r"prepare of session . on a thread.*\['tokens'\].*a tokenizer's padding"),
-    (CountsTokensWithIt, "reset: raised ValueError.*too many tokens.*on several threads"),
-    (PreparesOnOneThread, "prepare: raised RuntimeError.*Already borrowed.*on several threads"),
+    (
+        CountsTokensWithIt,
+        "reset: expected no error, got ValueError.*too many tokens.*on several threads",
+    ),
+    (
+        PreparesOnOneThread,
+        "prepare: expected no error, got RuntimeError.*Already borrowed.*on several threads",
+    ),
     (
         ParsesItsInstruction,
-        r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\[",
+        r"reset: expected no error, got KeyError.* for the instruction 'pick up the cube', .*instructions=\[",
     ),
     (
         ParsesItInAct,
-        r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\[",
+        r"act: expected no error, got KeyError.* for the instruction 'pick up the cube' .*instructions=\[",
     ),
     (with_contract(replace(CONTRACT, chunk=4)), "has 1 rows, the contract states 4"),
-    (with_contract({}), "contract: got dict"),
-    (with_reset(lambda *_: None), "reset: got NoneType"),
+    (with_contract({}), "contract: expected a Contract or None, got dict"),
+    (with_reset(lambda *_: None), "reset: expected a dict, got NoneType"),
     (with_reset(lambda agent, _: {"agent": agent}), r"info\['agent'\]"),
     (AgentClosesOnce, "the second call raised"),
 ]
@@ -291,7 +303,7 @@ def test_a_broken_agent_is_told_what_is_wrong(cls: type[GoodAgent], message: str
 
 
 def test_a_class_in_place_of_its_object_is_refused() -> None:
-    with pytest.raises(ContractViolation, match="want an object of a class that derives from"):
+    with pytest.raises(ContractViolation, match="expected an object of a class that derives from"):
         check_agent(GoodAgent)  # type: ignore[arg-type]
 
 

@@ -172,13 +172,19 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (ChangingInstruction, "instruction is 'attempt"),
     (OneBuffer, r"cameras.*front.*a later step or reset changed it"),
     (OneState, r"state.*joints.*a later step or reset changed it"),
-    (variant(contract={"action": 2}), "contract: got dict"),
-    (with_contract(action=ActionSpec()), "action.dim: got None"),
-    (with_contract(cameras={"front": CameraSpec(8, 8)}), "want 8x8"),
+    (variant(contract={"action": 2}), "contract: expected a Contract, got dict"),
+    (
+        with_contract(action=ActionSpec()),
+        "action.dim: expected the number of components of an action, got None",
+    ),
+    (with_contract(cameras={"front": CameraSpec(8, 8)}), "expected 8x8"),
     (with_contract(cameras={"wrist": CameraSpec()}), "camera 'wrist' is missing"),
     (with_contract(cameras={}), r"cameras are \['front'\]"),
-    (with_contract(state={"joints": StateSpec(3)}), r"want \(3,\)"),
-    (with_contract(gripper=True), "gripper: got none"),
+    (with_contract(state={"joints": StateSpec(3)}), r"expected shape \(3,\)"),
+    (
+        with_contract(gripper=True),
+        r"gripper: expected a number in \[0, 1\] where 1 = open, got None",
+    ),
     (with_obs(lambda obs: replace(obs, gripper=0.5)), "gripper is 0.5"),
     (
         with_obs(
@@ -189,32 +195,47 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (with_obs(lambda obs: replace(obs, state={"joints": obs.state["joints"] * np.nan})), "NaN"),
     (with_obs(lambda obs: replace(obs, cameras={"front": obs.cameras["front"] / 255})), "float64"),
     (with_obs(lambda obs: replace(obs, info={"sim": object()})), r"Obs.info\['sim'\]"),
-    (with_obs(lambda obs: {"front": obs.cameras["front"]}), "want an Obs"),
+    (with_obs(lambda obs: {"front": obs.cameras["front"]}), "expected an Obs"),
     (with_step(lambda result: tuple(result[:4])), "got a tuple of 4"),
-    (with_step(lambda result: result.__setitem__(1, np.float32(0))), "reward is float32"),
-    (with_step(lambda result: result.__setitem__(2, np.bool_(False))), "terminated is bool"),
-    (with_step(lambda result: result.__setitem__(3, 0)), "truncated is int"),
-    (with_step(lambda result: result.__setitem__(4, {})), "info.'success'. is NoneType"),
+    (
+        with_step(lambda result: result.__setitem__(1, np.float32(0))),
+        "expected reward to be a float, got float32",
+    ),
+    (
+        with_step(lambda result: result.__setitem__(2, np.bool_(False))),
+        "expected terminated to be a bool, got bool",
+    ),
+    (
+        with_step(lambda result: result.__setitem__(3, 0)),
+        "expected truncated to be a bool, got int",
+    ),
+    (
+        with_step(lambda result: result.__setitem__(4, {})),
+        "expected info.'success'. to be a bool, got NoneType",
+    ),
     (
         with_step(lambda result: result.__setitem__(4, {"success": np.bool_(False)})),
-        "info.'success'. is bool",
+        "expected info.'success'. to be a bool, got bool",
     ),
-    (with_step(lambda result: result.__setitem__(4, None)), "info is NoneType"),
+    (
+        with_step(lambda result: result.__setitem__(4, None)),
+        "expected the info as a dict, got NoneType",
+    ),
     (with_step(lambda result: result[4].update(score=np.float64(1))), r"info\['score'\]"),
-    (variant(max_steps=0), "max_steps: got 0"),
+    (variant(max_steps=0), "max_steps: expected an int of at least 1, got 0"),
     (NEVER_TRUNCATES, "is not truncated, but max_steps is 6"),
     (variant(truncated_at=5), "step 5 is truncated"),
     (
         variant(
             step=lambda self, act: GoodEnv.step(self, Act(np.nan_to_num(np.resize(act.action, 2))))
         ),
-        r"of shape \(3,\) was executed",
+        r"for an action of shape \(3,\), got none: it was executed",
     ),
-    (FailsOtherwise, "raised ValueError.*want InvalidAction"),
+    (FailsOtherwise, "expected InvalidAction .*, got ValueError"),
     (ChangesAction, "leave the caller's array"),
     (ClosesOnce, "the second call raised"),
     (with_reset(lambda obs: (obs, {"scene": object()})), r"info\['scene'\]"),
-    (with_reset(lambda obs: obs), "reset: got Obs"),
+    (with_reset(lambda obs: obs), r"reset: expected \(Obs, info\), got Obs"),
     (variant(instruction=""), "instruction: is empty"),
     (variant(describe=lambda _: {"mode": {1, 2}}), "describe"),
 ]
@@ -239,7 +260,10 @@ def test_a_broken_env_is_told_what_is_wrong(cls: type[GoodEnv], message: str) ->
 def test_an_object_that_is_no_env_of_ours_is_refused() -> None:
     with pytest.raises(
         ContractViolation,
-        match=r"want an EvalEnv; make one of Gymnasium by make_env\('gymnasium/ID'\)",
+        match=(
+            r"expected an EvalEnv, got .*; make one from Gymnasium's with "
+            r"make_env\('gymnasium/ID'\)"
+        ),
     ):
         check_env(object())  # type: ignore[arg-type]
 

@@ -117,7 +117,7 @@ def test_a_live_viewer_of_rerun_has_to_run() -> None:
 
 def test_the_address_of_something_else_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match=r"rerun: got 'ws://127.0.0.1:1', want a folder, 'live', or"
+        ConfigError, match=r"rerun: expected a folder, 'live', or .*, got 'ws://127.0.0.1:1'"
     ):
         open_viewer("ws://127.0.0.1:1")
 

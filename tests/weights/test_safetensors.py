@@ -64,7 +64,9 @@ def test_a_file_of_the_safetensors_package_is_read() -> None:
 
 
 def test_a_value_without_a_type_of_the_format_is_named() -> None:
-    with pytest.raises(InvalidWeights, match="'z': got complex64, want one of BF16, BOOL"):
+    with pytest.raises(
+        InvalidWeights, match=r"'z': expected a dtype of BF16, BOOL.*, got complex64"
+    ):
         header_of({"z": np.zeros(2, np.complex64)})
 
 
@@ -88,27 +90,30 @@ def entry(**changed: Any) -> dict[str, Any]:
         (header(b"[" * 100_000), "no JSON document"),
         (header(b'{"w": 1' + b"0" * 5000 + b"}"), "a number of 5001 digits"),
         (header(b'{"w": {}, "w": {}}'), "the key 'w' stands twice"),
-        (header([]), "got list, want an object"),
-        (header({"w": 1}), "'w': want 'dtype'"),
-        (header({"w" * 513: entry()["w"]}), "a name of 513 characters"),
-        (header({"w": {**entry()["w"], "code": "pickle"}}), "'w': want 'dtype'"),
-        (header(entry(dtype="PICKLE")), "got type 'PICKLE', want one of BOOL"),
-        (header(entry(dtype=["F32"])), "got type"),
-        (header(entry(shape=[2, -3])), "shape: want"),
-        (header(entry(shape=[2, 3.0])), "shape: want"),
-        (header(entry(shape=[True, 6])), "shape: want"),
-        (header(entry(shape="23")), "shape: want"),
-        (header(entry(shape=[1] * 33)), "shape: want at most 32"),
-        (header(entry(data_offsets=[0])), "data_offsets: want two"),
-        (header(entry(data_offsets=[0, 20])), "got bytes 0 to 20, want 0 to 24 for F32 of shape"),
-        (header(entry(data_offsets=[8, 32])), "got bytes 8 to 32, want 0 to 24"),
-        (header(entry(data_offsets=[24, 0])), "got bytes 24 to 0, want 0 to 24"),
-        (header(entry() | {"v": entry()["w"]}), "got bytes 0 to 24, want 24 to 48"),
+        (header([]), "expected an object with a value for each name, got list"),
+        (header({"w": 1}), "'w': expected 'dtype'"),
+        (header({"w" * 513: entry()["w"]}), "got one of 513"),
+        (header({"w": {**entry()["w"], "code": "pickle"}}), "'w': expected 'dtype'"),
+        (header(entry(dtype="PICKLE")), "expected a type of BOOL.*, got 'PICKLE'"),
+        (header(entry(dtype=["F32"])), "expected a type of"),
+        (header(entry(shape=[2, -3])), "shape: expected"),
+        (header(entry(shape=[2, 3.0])), "shape: expected"),
+        (header(entry(shape=[True, 6])), "shape: expected"),
+        (header(entry(shape="23")), "shape: expected"),
+        (header(entry(shape=[1] * 33)), "shape: expected at most 32"),
+        (header(entry(data_offsets=[0])), "data_offsets: expected two"),
+        (
+            header(entry(data_offsets=[0, 20])),
+            "expected the bytes 0 to 24 for F32 of shape .*, got 0 to 20",
+        ),
+        (header(entry(data_offsets=[8, 32])), "expected the bytes 0 to 24 .*, got 8 to 32"),
+        (header(entry(data_offsets=[24, 0])), "expected the bytes 0 to 24 .*, got 24 to 0"),
+        (header(entry() | {"v": entry()["w"]}), "expected the bytes 24 to 48 .*, got 0 to 24"),
         (
             header(entry() | {"v": entry(data_offsets=[32, 56])["w"]}),
-            "got bytes 32 to 56, want 24 to 48",
+            "expected the bytes 24 to 48 .*, got 32 to 56",
         ),
-        (header(entry(shape=[10**14] * 30)), "got bytes 0 to 24"),
+        (header(entry(shape=[10**14] * 30)), "expected the bytes .*, got 0 to 24"),
     ],
 )
 def test_what_is_no_header_is_refused(data: bytes, says: str) -> None:
@@ -125,8 +130,10 @@ def test_memory_is_allocated_when_its_first_byte_arrives() -> None:
 
 def test_more_bytes_than_announced_and_other_truth_values_are_refused() -> None:
     reader = ValuesReader({"b": ValueSpec(np.dtype(np.bool_), (2,))})
-    with pytest.raises(MalformedMessage, match="got 3 bytes of values, the header announced 2"):
+    with pytest.raises(
+        MalformedMessage, match="expected 2 bytes of values, as the header announced, got 3"
+    ):
         reader.add(b"\0\1\0")
     reader.add(b"\1\2")
-    with pytest.raises(MalformedMessage, match="'b': got other bytes than 0 and 1"):
+    with pytest.raises(MalformedMessage, match="'b': expected bytes of 0 and 1"):
         reader.values()

@@ -76,7 +76,7 @@ def test_what_is_trainable_may_be_inside_of_what_sessions_share() -> None:
 def test_an_agent_that_names_nothing_to_train_says_how_to() -> None:
     with pytest.raises(NotTrainable, match="set `trainable`"):
         Agent().parameters()
-    with pytest.raises(NotTrainable, match="got tuple, want"):
+    with pytest.raises(NotTrainable, match=r"expected .*, got tuple"):
         named_values({"layers": (np.zeros(1),)})
 
 
@@ -174,17 +174,20 @@ def fitted(
 @pytest.mark.parametrize(
     ("pushed", "says"),
     [
-        (NEW | {"z": np.zeros(1)}, r"'z': unknown, want one of the policy's 3 names"),
+        (NEW | {"z": np.zeros(1)}, r"'z': expected one of the policy's 3 names"),
         ({"w": NEW["w"]}, r"'b': missing; push it, or set partial=True; 'n': missing"),
-        (NEW | {"w": np.ones((3, 2), np.float32)}, r"'w': got shape \(3, 2\), want \(2, 3\)"),
-        (NEW | {"w": np.ones((2, 3), np.int32)}, r"'w': got int32, want float32"),
-        (NEW | {"w": [1.0]}, r"'w': got list, want an array"),
+        (NEW | {"w": np.ones((3, 2), np.float32)}, r"'w': expected shape \(2, 3\), got \(3, 2\)"),
+        (NEW | {"w": np.ones((2, 3), np.int32)}, r"'w': expected float32, got int32"),
+        (NEW | {"w": [1.0]}, r"'w': expected an array, got list"),
         (
             NEW | {"w": np.full((2, 3), np.nan, np.float32)},
-            r"'w': got NaN or infinite values, want finite ones",
+            r"'w': expected finite values, got NaN or infinity",
         ),
         # Above the largest float16.
-        (NEW | {"b": np.full(3, 1e5, np.float32)}, r"'b': got NaN or infinite"),
+        (
+            NEW | {"b": np.full(3, 1e5, np.float32)},
+            r"'b': expected finite values, got NaN or infinity",
+        ),
         ({**{str(n): np.zeros(1) for n in range(7)}, **NEW}, r"and 2 more$"),
     ],
 )
@@ -215,7 +218,7 @@ def test_one_number_that_is_not_finite_is_found_among_many_tensors(
     pushed["2"][place] = value
     with pytest.raises(
         InvalidWeights,
-        match=r"nothing was changed: '2': got NaN or infinite values, want finite ones$",
+        match=r"nothing was changed: '2': expected finite values, got NaN or infinity$",
     ):
         trainable.accepted(held, pushed)
 
@@ -226,7 +229,9 @@ def test_infinite_values_fit_where_the_policy_has_them() -> None:
         fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
     )
     for wrong in (mask.T, -mask, np.full_like(mask, np.nan)):
-        with pytest.raises(InvalidWeights, match="'mask': got NaN or infinite"):
+        with pytest.raises(
+            InvalidWeights, match="'mask': expected finite values, got NaN or infinity"
+        ):
             fitted(HELD | {"mask": mask}, NEW | {"mask": wrong})
 
 

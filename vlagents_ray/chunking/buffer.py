@@ -118,7 +118,7 @@ class ChunkBuffer:
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
             raise ConfigError(
-                f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function"
+                f"merge: expected one of {sorted([*MERGES, ENSEMBLE])} or a function, got {merge!r}"
             )
         self.executed = 0  # the number of executed actions of this plan
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
@@ -308,7 +308,8 @@ class CaptureClock:
             return now
         if not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
             raise InvalidObservation(
-                f"info[{CAPTURED!r}]: got {stamp!r}, want seconds since 1970, as of time.time()"
+                f"info[{CAPTURED!r}]: expected seconds since 1970, as from time.time(), got "
+                f"{stamp!r}"
             )
         if stamp != self._stamp:
             age_s = time.time() - stamp

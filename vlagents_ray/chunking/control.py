@@ -194,7 +194,7 @@ class RobotControl:
     def mark(self, label: str) -> None:
         """End the episode as a "success" or a "failure"; raises `ConfigError` for another label."""
         if label not in get_args(Outcome):
-            raise ConfigError(f"mark: got {label!r}, want one of {list(get_args(Outcome))}")
+            raise ConfigError(f"mark: expected one of {list(get_args(Outcome))}, got {label!r}")
         with self._lock:
             self._outcome = "success" if label == "success" else "failure"
 

@@ -110,24 +110,26 @@ class SafeAction:
         if isinstance(safe, str):
             if safe not in get_args(SafeName):
                 raise ConfigError(
-                    f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a "
-                    "function"
+                    f"safe: expected one of {list(get_args(SafeName))}, an array or a function, "
+                    f"got {safe!r}"
                 )
             if spec.relative is None and safe != "hold":
                 raise ConfigError(
-                    f"safe: got {safe!r}, and the policy's contract does not say whether its "
-                    "actions are relative or absolute; state it (ActionSpec.delta), or give "
-                    "safe='hold', which is right for absolute ones alone, or an action of your own"
+                    "safe: expected a policy whose contract declares whether its actions are "
+                    f"relative or absolute, got safe={safe!r} with one that does not; declare it "
+                    "(ActionSpec.delta), give safe='hold', which is right only for absolute "
+                    "actions, or give an action"
                 )
 
             self._make: Safe = stopping(spec)
             if safe not in ("auto", self._make):
                 if safe == "zero":
-                    consequence = "absolute ones take for a pose to go to"
+                    consequence = "absolute actions would take as a pose to move to"
                 else:
-                    consequence = "relative actions go on moving with"
+                    consequence = "relative actions would continue to move with"
                 raise ConfigError(
-                    f"safe: got {safe!r}, which {consequence}; give safe={self._make!r}, or 'auto'"
+                    f"safe: expected {self._make!r} or 'auto', got {safe!r}, which {consequence}; "
+                    "give one of them"
                 )
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
@@ -153,8 +155,8 @@ class SafeAction:
             if first is not None:
                 return first
             raise InvalidAction(
-                f"safe: got {self._make!r} before the first action, which there is nothing to make "
-                "from"
+                f"safe: expected an action before it, got {self._make!r} before the first action; "
+                "give an array or a function as the safe action"
             )
         if self._make == "hold":
             return last.copy()
@@ -200,7 +202,7 @@ def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction(
-            "neutral action: got a contract without action.dim; want one that states it"
+            "neutral action: expected a contract with action.dim, got one without; add it"
         )
     action = np.zeros(dim, np.float32)
     if spec.gripper_open is not None:
@@ -348,5 +350,8 @@ class Motion:
         """
         action = check_action(action, self._contract)
         if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")
+            raise InvalidAction(
+                f"action: expected a single row (D,), got shape {action.shape}; take one row of "
+                "the chunk"
+            )
         return action if self._check is None else self._check(action, last)

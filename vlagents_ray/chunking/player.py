@@ -172,15 +172,18 @@ class PlayerSettings:
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
-            raise ConfigError(f"mode: got {self.mode!r}, want one of {list(get_args(Mode))}")
+            raise ConfigError(f"mode: expected one of {list(get_args(Mode))}, got {self.mode!r}")
         for name, value in (("execute", self.execute), ("horizon", self.horizon)):
             if value is not None and value < 1:
-                raise ConfigError(f"{name}: got {value}, want at least 1, or None")
+                raise ConfigError(f"{name}: expected a number of at least 1, or None, got {value}")
         if self.max_age_s is not None and not self.max_age_s > 0:
-            raise ConfigError(f"max_age_s: got {self.max_age_s}, want above 0, or None")
+            raise ConfigError(
+                f"max_age_s: expected a number above 0, or None, got {self.max_age_s}"
+            )
         if self.mode != "async" and (self.merge != "newest" or self.real_time_chunking):
             raise ConfigError(
-                f"merge and real_time_chunking: got them with mode {self.mode!r}, want mode='async'"
+                "merge and real_time_chunking: expected mode='async' with them, got "
+                f"mode={self.mode!r}"
             )
         if self.mode == "async" and self.deadline_s is None:
             object.__setattr__(self, "deadline_s", 0.0)

@@ -38,12 +38,14 @@ def number(
             value = number_type(text)
             if value > minimum or (value == minimum and not above):
                 if value > maximum:
-                    raise argparse.ArgumentTypeError(f"got {text!r}, want at most {maximum:g}")
+                    raise argparse.ArgumentTypeError(
+                        f"expected a number of at most {maximum:g}, got {text!r}"
+                    )
                 return value
 
         noun = "a whole number" if number_type is int else "a number"
         bound = "above" if above else "from"
-        raise argparse.ArgumentTypeError(f"got {text!r}, want {noun} {bound} {minimum:g}")
+        raise argparse.ArgumentTypeError(f"expected {noun} {bound} {minimum:g}, got {text!r}")
 
     return read
 
@@ -57,7 +59,7 @@ def one_of(*names: str) -> dict[str, Any]:
         """Read a name; raise `ArgumentTypeError` for an unknown one."""
         if text not in names:
             raise argparse.ArgumentTypeError(
-                f"got {text!r}, want one of {list(names)}{did_you_mean(text, names)}"
+                f"expected one of {list(names)}, got {text!r}{did_you_mean(text, names)}"
             )
         return text
 

@@ -463,7 +463,7 @@ def judge_library(
             "update the driver, or make the environment again: env make takes torch for CUDA 12 "
             "with one from 525 on"
         )
-        return Check("warn", f"{detail}, which needs driver {oldest} or newer; got {driver}", cure)
+        return Check("warn", f"{detail}: expected driver {oldest} or newer, got {driver}", cure)
     return Check(
         "warn",
         f"{detail}, cannot use the GPU: {why}",

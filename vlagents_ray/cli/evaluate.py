@@ -268,7 +268,9 @@ class EvalOptions:
         """
         watch_options = self.options_set("until", "settle_s", "marker")
         if self.watch is None and watch_options:
-            raise ConfigError(f"got {watch_options} without --watch")
+            raise ConfigError(
+                f"expected --watch with {watch_options}, got none; add it, or leave them out"
+            )
         if self.dry_run and self.watch is not None:
             raise ConfigError(
                 "--dry-run and --watch exclude each other: the steps of the training are not known "
@@ -280,7 +282,8 @@ class EvalOptions:
             )
         if self.replica_per_gpu and self.address is None:
             raise ConfigError(
-                "--replica-per-gpu: want --address, a cluster whose GPUs can be counted"
+                "--replica-per-gpu: expected --address, a cluster whose GPUs can be counted, got "
+                "none; add it"
             )
         if self.dry_run and self.options_set("live", "live_at"):
             raise ConfigError(
@@ -289,12 +292,14 @@ class EvalOptions:
 
         robot_options = self.options_set("operator", "unblind")
         if not on_robot and robot_options:
-            raise ConfigError(f"got {robot_options} without --robot")
+            raise ConfigError(
+                f"expected --robot with {robot_options}, got none; add it, or leave them out"
+            )
         excluded = self.options_set("watch", "dry_run", "end_at", "track", "live", "live_at")
         if on_robot and excluded:
             raise ConfigError(f"--robot and {excluded} exclude each other")
         if self.operator not in (None, "page", "terminal"):
-            raise ConfigError(f"--operator: got {self.operator!r}, want page or terminal")
+            raise ConfigError(f"--operator: expected 'page' or 'terminal', got {self.operator!r}")
 
 
 @command_of(EvalOptions)
@@ -376,7 +381,8 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         excess = [*targets[1:], *policy, *suite]
         if excess:
             raise ConfigError(
-                f"{targets[0]} says what is evaluated; got {excess} beside it: write that there"
+                f"expected only {targets[0]} to define the evaluation, got {excess} with it; "
+                "write them in the file"
             )
         fields = read_run(Path(targets[0])) | run
     else:
@@ -387,8 +393,7 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
             missing.append("--out")
         if missing:
             raise ConfigError(
-                f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of "
-                "runs (.yaml)"
+                f"expected {' and '.join(missing)}, got none; add them, or give a plan (.yaml)"
             )
         fields = {"policies": [policy], "suites": [{"envs": list(targets)} | suite], **run}
 

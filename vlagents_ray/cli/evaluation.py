@@ -84,7 +84,7 @@ def live_address(at: str | None) -> tuple[str, int]:
     except ValueError:
         host = port = None
     if host is None or port is None or url.netloc != at:
-        raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+        raise ConfigError(f"--live-at: expected HOST:PORT, as in 127.0.0.1:{_PORT}, got {at!r}")
     require_watch_keys(host, load_keys())  # before anything is served
     return host, port
 
@@ -371,8 +371,8 @@ def _trained_policy(config: EvalConfig) -> tuple[int, str]:
 
     if len(patterns) != 1:
         raise ConfigError(
-            f"--watch: got {STEP} in the checkpoints of {len(patterns)} policies, want it in that "
-            f"of one, such as checkpoint: /runs/a/{STEP}"
+            f"--watch: expected {STEP} in the checkpoint of one policy, such as checkpoint: "
+            f"/runs/a/{STEP}, got it in {len(patterns)}"
         )
     [(index, pattern)] = patterns.items()
     if config.policies[index].steps:

@@ -148,7 +148,8 @@ def _write(name: str, kind: Kind) -> None:
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise ConfigError(
-            f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy"
+            "NAME: expected the name of a Python module in lower case, such as my_policy, got "
+            f"{name!r}"
         )
 
     texts = render(name, kind)

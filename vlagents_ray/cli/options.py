@@ -153,7 +153,7 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
         key, equals, value = text.partition("=")
         path = key.strip().split(".")
         if not equals or not all(path):
-            raise ConfigError(f"{option}: got {text!r}, want KEY=VALUE, as in batch.max_size=8")
+            raise ConfigError(f"{option}: expected KEY=VALUE, as in batch.max_size=8, got {text!r}")
 
         section = settings
         for name in path[:-1]:
@@ -249,5 +249,5 @@ def read_run_file(file: Path, noun: str, keys: str) -> dict[str, Any]:
         raise ConfigError(f"{noun} {str(file)!r} does not exist")
     document = read_yaml(file)
     if not isinstance(document, dict):
-        raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
+        raise ConfigError(f"{file}: expected a mapping with {keys}, got {type(document).__name__}")
     return {"out": Path("runs") / file.stem} | document

@@ -128,7 +128,7 @@ def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
     """Raise `ConfigError` if an evaluation in a cluster has no workers."""
     if config.workers == 0 and address is not None:
         raise ConfigError(
-            "workers: got 0 with --address, want 1 or more in a cluster, or no --address"
+            "workers: expected 1 or more with --address, got 0; raise it, or leave out --address"
         )
 
 
@@ -138,8 +138,9 @@ def _require_resources(plan: ResolvedPlan, deployments: Mapping[str, Deployment]
     available = gpus_here() if needed else 0.0
     if needed > available:  # Ray would never start these workers here
         raise ConfigError(
-            f"worker.gpus: a worker wants {needed:g} GPUs, this machine has {available:g}; want "
-            "less (0 draws in software), or the --address of a cluster that has them"
+            f"worker.gpus: expected at most the {available:g} GPUs of this machine, got "
+            f"{needed:g} for a worker; set less (0 draws in software), or give the --address of a "
+            "cluster that has them"
         )
     for deployment in deployments.values():
         require_packages(deployment)
@@ -257,8 +258,8 @@ def _local_policies(
 
         if workers == 0 and obstacle:
             raise ConfigError(
-                f"workers: got 0, which plays in this Python, but {name!r} has {obstacle}; want 1 "
-                "or more"
+                f"workers: expected 1 or more, as {name!r} has {obstacle}, got 0, which runs the "
+                "episodes in this Python; raise it"
             )
         if args is None or obstacle or (args.resources.num_gpus and workers is None):
             return None
@@ -300,7 +301,8 @@ def _resolve_policy(
         return _policy_at(url, policy, ask=ask)
     if policy.source is None:
         raise ConfigError(
-            f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server"
+            f"policy {policy.name!r}: expected `source`, a policy to serve, or the `url` of a "
+            "server, got neither; give one of them"
         )
 
     deployment = policy_deployment(policy, policy.source, step_follows=bool(policy.steps))
@@ -340,7 +342,8 @@ def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
     if policy.config:
         names = sorted(policy.config)
         raise ConfigError(
-            f"policy {policy.name!r}: got {names}, but {url} has its settings already"
+            f"policy {policy.name!r}: expected no settings with a `url`, got {names}; set them in "
+            f"the server at {url}"
         )
     # The server may be starting.
     with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:

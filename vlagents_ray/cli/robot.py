@@ -130,21 +130,23 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             refused.append(action.option_strings[0])
     if refused:
         condition = "with" if in_env else "without"
-        parser.error(f"got {', '.join(refused)} {condition} --env; leave them out")
+        parser.error(
+            f"expected no {', '.join(refused)} {condition} --env, got them; leave them out"
+        )
 
     if not in_env and options.policy is None:
-        parser.error("got neither a URL nor --env, want one of them")
+        parser.error("expected a URL or --env, got neither; give one of them")
     if options.robot_set and options.robot is None:
         parser.error(
-            "got --robot-set without --robot; name the robot with --robot NAME:ARGUMENT or "
-            "MODULE:CLASS"
+            "--robot-set: expected --robot with it, got none; name the robot with --robot "
+            "NAME:ARGUMENT or MODULE:CLASS"
         )
 
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
         parser.error(
-            f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async"
+            f"--merge and --rtc: expected --mode async with them, got --mode {options.mode}"
         )
     return options
 
@@ -338,8 +340,8 @@ def _require_part(name: str | None, robot: Robot) -> None:
     state = robot.observe().state
     if name not in state:
         raise ConfigError(
-            f"--measure: got {name!r}, want a part of the robot's state, one of {sorted(state)}"
-            f"{did_you_mean(name, state)}"
+            f"--measure: expected a part of the robot's state, one of {sorted(state)}, got "
+            f"{name!r}{did_you_mean(name, state)}"
         )
 
 

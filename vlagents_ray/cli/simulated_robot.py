@@ -224,15 +224,15 @@ class RobotRun:
         if self.options.policy is None:
             if leader is None:
                 raise ConfigError(
-                    "robot: got neither a policy nor --leader, want one of them, or both"
+                    "robot: expected a policy, --leader, or both, got neither; give one of them"
                 )
             return TeleoperatedAgent(leader, contract)
 
         is_remote = "://" in self.options.policy
         if is_remote and self._settings:
             raise ConfigError(
-                f"--set: got {sorted(self._settings)}, but {self.options.policy} has its settings "
-                "already"
+                f"--set: expected no settings for {self.options.policy}, a server that has its "
+                f"own, got {sorted(self._settings)}; leave them out"
             )
         inner: Agent
         if is_remote:

@@ -282,7 +282,7 @@ class RemoteAgent(Agent):
             ConfigError: The URL has none of these forms, or does not fit the transport.
         """
         if priority not in PRIORITIES:
-            raise ConfigError(f"priority: got {priority!r}, want one of {list(PRIORITIES)}")
+            raise ConfigError(f"priority: expected one of {list(PRIORITIES)}, got {priority!r}")
 
         choice = CodecChoice(codec)
         self.credentials = Credentials(api_key, ca, certificate)
@@ -481,7 +481,8 @@ class RemoteAgent(Agent):
         client_sessions = self._client_sessions(sessions)
         if len(obs) != len(client_sessions):
             raise ConfigError(
-                f"act_batch: got {len(obs)} observations for {len(client_sessions)} sessions"
+                f"act_batch: expected {len(client_sessions)} observations, one for each session, "
+                f"got {len(obs)}"
             )
         for session_obs in obs:
             require_obs(session_obs)
@@ -517,8 +518,8 @@ class RemoteAgent(Agent):
         for agent in sessions:
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
                 raise ConfigError(
-                    "sessions: want agents made by sessions() of this one, which share its "
-                    "connection"
+                    "sessions: expected agents made by sessions() of this agent, which share its "
+                    "connection, got others; make them so"
                 )
             client_sessions.append(agent._session)
         return client_sessions
@@ -589,6 +590,6 @@ def _deadline_s(obs: Sequence[Obs]) -> float:
     for deadline_ms in deadlines_ms:
         if not isinstance(deadline_ms, (int, float)) or not deadline_ms > 0:
             raise InvalidObservation(
-                f"info[{DEADLINE!r}]: got {deadline_ms!r}, want milliseconds above 0"
+                f"info[{DEADLINE!r}]: expected milliseconds above 0, got {deadline_ms!r}"
             )
     return min(deadlines_ms, default=math.inf) / 1e3

@@ -50,7 +50,9 @@ class CommandInbox:
         """
         unknown = sorted(set(allow) - set(COMMANDS))
         if unknown:
-            raise ConfigError(f"allow: got {unknown}, want some of {list(COMMANDS)}")
+            raise ConfigError(
+                f"allow: expected some of {list(COMMANDS)}, got {unknown}; leave these out"
+            )
 
         self.control = RobotControl()  # the control of the last run
         self._allow = frozenset(allow)
@@ -88,7 +90,7 @@ class CommandInbox:
             self._outcomes[command.id] = f"{command.do}: not allowed here"
         else:
             self._outcomes[command.id] = (
-                f"{command.do[:_NAME_CHARACTERS]!r}: no such command, want one of {list(COMMANDS)}"
+                f"expected a command of {list(COMMANDS)}, got {command.do[:_NAME_CHARACTERS]!r}"
             )
 
     @property

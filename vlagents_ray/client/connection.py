@@ -233,7 +233,7 @@ class Connection:
 
         if len(replies) != len(requests):  # one reply is for the whole frame
             error = replies[0].error or PolicyUnavailable(
-                f"got {len(replies)} replies to {len(requests)} requests"
+                f"expected {len(requests)} replies, one for each request, got {len(replies)}"
             )
             replies = [Reply(request.request_id, error=error) for request in requests]
 

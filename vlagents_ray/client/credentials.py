@@ -45,7 +45,8 @@ class Credentials:
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
             raise ConfigError(
-                "api_key: want visible ASCII characters without spaces, as `keys new` printed them"
+                "api_key: expected visible ASCII characters without spaces, got others; give it "
+                "as `keys new` printed it"
             )
         object.__setattr__(self, "api_key", key or None)
 
@@ -151,8 +152,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     if error.reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNSUPPORTED_PROTOCOL"):
         plain = url.replace("https://", "http://", 1).replace("wss://", "ws://", 1)
         return ConfigError(
-            f"{url}: got no TLS from this port ({error.reason}); if the server has none, write "
-            f"{plain}"
+            f"{url}: expected TLS at this port, got none ({error.reason}); if the server has "
+            f"none, write {plain}"
         )
     return ConfigError(f"{url}: TLS failed ({error}); does the server speak TLS at this port?")
 

@@ -111,13 +111,14 @@ class RunningEpisode:
         keys = camera_keys(obs.cameras)
         if set(keys.values()) != self.videos.keys():
             raise InvalidObservation(
-                f"recording: got cameras {sorted(obs.cameras)}, want those of {sorted(self.videos)}"
+                f"recording: expected the cameras {sorted(self.videos)} as in the first frame, "
+                f"got {sorted(obs.cameras)}"
             )
         for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
             first = tuple(self.features[name]["shape"]) if name in self.features else (0,)
             if shape != first:
                 raise InvalidObservation(
-                    f"recording: got {name} of {shape}, want {first} as in the first frame"
+                    f"recording: expected {name} of {first} as in the first frame, got {shape}"
                 )
 
         for name, image in obs.cameras.items():

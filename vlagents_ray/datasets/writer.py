@@ -208,8 +208,8 @@ class Dataset:
         ):
             if info.get(key) != expected:
                 raise ConfigError(
-                    f"{self.root}: has {key} {info.get(key)!r}, want {expected!r}; record into a "
-                    "new folder"
+                    f"{self.root}: expected {key} {expected!r}, got {info.get(key)!r}; record "
+                    "into a new folder"
                 )
 
         has_interventions = INTERVENTION_COLUMN in info["features"]

@@ -332,14 +332,14 @@ def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> 
     """Raise `ConfigError` unless an env has the cameras of these names."""
     unknown = sorted(set(names) - set(have))
     if unknown:
-        raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
+        raise ConfigError(f"{env}: expected cameras of {sorted(have)}, got {unknown}")
 
 
 def require_known(suite: str, task: str | None, known: Sequence[str], also: str = "") -> None:
     """Raise `UnknownEnv` unless a task is known; `also` describes further allowed tasks."""
     if task not in known:
         hint = did_you_mean(str(task), known)
-        raise UnknownEnv(f"{suite} has no task {task!r}: want one of {list(known)}{also}{hint}")
+        raise UnknownEnv(f"{suite}: expected a task of {list(known)}{also}, got {task!r}{hint}")
 
 
 def one_row(act: Act, contract: Contract) -> np.ndarray:
@@ -352,7 +352,7 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
     if action.ndim != 1:
         dim = contract.action.dim
         raise InvalidAction(
-            f"action: got {action.shape}, want ({dim},); step through a chunk row by row"
+            f"action: expected shape ({dim},), got {action.shape}; step through a chunk row by row"
         )
     return action
 
@@ -375,7 +375,9 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
             `make_env`.
     """
     if num_envs < 1:
-        raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
+        raise ConfigError(
+            f"env {name!r}: num_envs: expected a number of at least 1, got {num_envs}"
+        )
     cls, arguments = env_arguments(name, options)
     batch = cls.batched(num_envs, **arguments)
     if batch is not None:
@@ -442,7 +444,8 @@ class SequentialBatch(BatchEnv):
         count = len(acts)
         if count != self._playing:
             raise ConfigError(
-                f"step: got {count} actions, want {self._playing}, one for each episode or None"
+                f"step: expected {self._playing} actions (None for an episode that has ended), "
+                f"got {count}"
             )
         moving = {i: act for i, act in enumerate(acts) if act is not None}
         if count > 1:  # A single environment checks its action itself.
@@ -473,7 +476,7 @@ class SequentialBatch(BatchEnv):
         answer: Any = env.step(act)
         if not isinstance(answer, tuple) or len(answer) != 5:
             want = "(Obs, reward, terminated, truncated, info)"
-            raise EnvFailed(f"env step: got {kind_of(answer)}, want {want}; see EvalEnv.step")
+            raise EnvFailed(f"env step: expected {want}, got {kind_of(answer)}; see EvalEnv.step")
         return answer
 
     def renderer(self) -> Renderer | None:
@@ -520,7 +523,9 @@ def _first_obs(env: EvalEnv, seed: int, options: Options | None) -> Obs:
     """Begin an episode, and return its first observation."""
     answer: Any = env.reset(seed=seed, options=options)
     if not isinstance(answer, tuple) or len(answer) != 2:
-        raise EnvFailed(f"env reset: got {kind_of(answer)}, want (Obs, info); see EvalEnv.reset")
+        raise EnvFailed(
+            f"env reset: expected (Obs, info), got {kind_of(answer)}; see EvalEnv.reset"
+        )
     obs: Obs = answer[0]
     return obs
 
@@ -533,8 +538,8 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
     """
     if not 1 <= len(seeds) <= num_envs:
         raise ConfigError(
-            f"reset: got {len(seeds)} seeds, want 1 to {num_envs}, one for each environment that "
-            "is to play"
+            f"reset: expected 1 to {num_envs} seeds, one for each environment that runs an "
+            f"episode, got {len(seeds)}"
         )
     return len(seeds)
 

@@ -156,7 +156,10 @@ class Gymnasium(EvalEnv):
             EnvFailed: The simulator cannot be made.
         """
         if task is None:
-            raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
+            raise UnknownEnv(
+                "gymnasium: expected an id, as in 'gymnasium/Pendulum-v1', got none; add it to "
+                "the name"
+            )
 
         prepare_rendering()
         defaults = defaults_for(task)
@@ -177,7 +180,8 @@ class Gymnasium(EvalEnv):
             self._low, self._high, self._dtype = bounds(self._env.action_space)
             if unit_actions and not np.isfinite([self._low, self._high]).all():
                 raise ConfigError(
-                    f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}"
+                    f"{self._name}: unit_actions: expected an action space with finite bounds, "
+                    f"got {self._env.action_space}; leave it out"
                 )
 
             space_cameras, space_state = camera_and_state_paths(
@@ -192,7 +196,8 @@ class Gymnasium(EvalEnv):
             self._closed, self._open = gripper_range
             if self._closed == self._open:
                 raise ConfigError(
-                    f"{self._name}: gripper_range is {gripper_range}, want two different numbers"
+                    f"{self._name}: gripper_range: expected two different numbers, got "
+                    f"{gripper_range}"
                 )
 
             nested, _ = self._call("reset", seed=0)
@@ -252,7 +257,7 @@ class Gymnasium(EvalEnv):
             The first observation, and the info of the environment.
         """
         if seed < 0:
-            raise ConfigError(f"{self._name}: seed is {seed}, want 0 or more")
+            raise ConfigError(f"{self._name}: seed: expected a number from 0, got {seed}")
         if self._env is None:
             raise NotReset(f"{self._name}: is closed; make it again")
 
@@ -444,8 +449,8 @@ class Pick:
         match = _PATH.fullmatch(text)
         if match is None:
             raise ConfigError(
-                f"path {text!r}: want keys joined by '/', then perhaps a range, as in "
-                "'robot/qpos[0:7]'"
+                f"path {text!r}: expected keys joined by '/', and optionally a range, as in "
+                "'robot/qpos[0:7]'; correct it"
             )
 
         keys = tuple(key for key in match["keys"].split("/") if key)
@@ -468,7 +473,10 @@ class Pick:
         """Return the range of the value, (D,) float32; raises `ConfigError` if it is no vector."""
         array = np.array(self.value(nested), dtype=np.float32)
         if array.ndim > 1:
-            raise ConfigError(f"path {self.text!r}: got shape {array.shape}, want (D,)")
+            raise ConfigError(
+                f"path {self.text!r}: expected a vector (D,), got shape {array.shape}; choose "
+                "another path"
+            )
         numbers: np.ndarray = np.atleast_1d(array)[self.range]
         if numbers.size == 0:
             raise ConfigError(
@@ -481,7 +489,8 @@ class Pick:
         vector = self.vector(nested)
         if vector.size != 1:
             raise ConfigError(
-                f"path {self.text!r}: got {vector.size} numbers, want one, as in '{self.text}[0:1]'"
+                f"path {self.text!r}: expected one number, as in '{self.text}[0:1]', got "
+                f"{vector.size}; add a range"
             )
         return float(vector[0])
 
@@ -502,7 +511,7 @@ def as_image(
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ConfigError(
-            f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB"
+            f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}"
         )
     height, width = size[0] or image.shape[0], size[1] or image.shape[1]
     if (height, width) == image.shape[:2]:
@@ -534,8 +543,8 @@ def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:
     """Return the bounds of a Box (D,), float64, and its dtype."""
     if type(space).__name__ != "Box" or len(space.shape) != 1:
         raise ConfigError(
-            f"action space: got {space}, want Box (D,): policies give continuous vectors; "
-            "wrap the environment, and register it so wrapped"
+            "action space: expected Box (D,), as policies return continuous vectors, got "
+            f"{space}; wrap the environment, and register the wrapped one"
         )
     return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
 

@@ -154,12 +154,16 @@ class SimulatorEnv(EvalEnv):
         unknown = sorted(set(options) - ({"init_state"} if has_states else set()))
         if unknown:
             allowed = "init_state or none" if has_states else "none"
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {allowed}")
+            raise ConfigError(
+                f"{self._name}: expected reset options of {allowed}, got {unknown}; leave these out"
+            )
 
         count = self.init_states or 1
         state = options.get("init_state", seed % count)
         if type(state) is not int or not 0 <= state < count:
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
+            raise ConfigError(
+                f"{self._name}: init_state: expected a number from 0 to {count - 1}, got {state!r}"
+            )
 
         with failing(self._name, "reset"):
             obs, begin_info = self._begin(seed % 2**32, state)
@@ -314,7 +318,7 @@ def require_sizes(env: str, **sizes: int | None) -> None:
     """Raise `ConfigError` unless each option is at least 1, or None."""
     for option, value in sizes.items():
         if value is not None and value < 1:
-            raise ConfigError(f"{env}: {option} is {value}, want at least 1")
+            raise ConfigError(f"{env}: {option}: expected a number of at least 1, got {value}")
 
 
 def camera_names(model: Any) -> list[str]:

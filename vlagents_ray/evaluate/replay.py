@@ -116,8 +116,10 @@ def find(results: Results, name: str | None) -> Recorded:
 
     if not matching:
         examples = [episode.result.full_key for episode in results.episodes[:_FEW]]
-        problem = "got no episode" if name is None else f"has no episode {name!r}"
-        raise ConfigError(f"{results.out}: {problem}, want a key as {examples}, or ENV#NUMBER")
+        problem = "got none" if name is None else f"got {name!r}, which no episode has"
+        raise ConfigError(
+            f"{results.out}: expected a key such as {examples}, or ENV#NUMBER, {problem}"
+        )
 
     if len(matching) > 1:
         keys = [
@@ -125,7 +127,8 @@ def find(results: Results, name: str | None) -> Recorded:
             for recorded in matching
         ]
         raise ConfigError(
-            f"{name!r} stands for {len(matching)} episodes; want one of the keys {keys}"
+            f"expected the name of one episode, got {name!r}, which {len(matching)} episodes "
+            f"have; use one of the keys {keys}"
         )
 
     [recorded] = matching

@@ -128,7 +128,7 @@ def evaluate_plan(
     """Evaluate as `evaluate` does, by a plan that is already resolved."""
     if plan.settings.real_robot is not None:
         raise ConfigError(
-            "robot.arm: got a real robot, want a plan in simulation; see "
+            "robot.arm: expected a plan in simulation, got one on a real robot; see "
             "vlagents_ray.evaluate.robot"
         )
     factory = agents(plan, agent_factory)

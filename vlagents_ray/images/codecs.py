@@ -48,12 +48,12 @@ class ImageCodec:
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
-            raise InvalidInput(f"codec: got {self.name!r}, want one of {list(NAMES)}")
+            raise InvalidInput(f"codec: expected one of {list(NAMES)}, got {self.name!r}")
         if not 1 <= self.quality <= 100:
-            raise InvalidInput(f"quality: got {self.quality!r}, want 1 to 100")
+            raise InvalidInput(f"quality: expected a number from 1 to 100, got {self.quality!r}")
         if self.subsampling not in SUBSAMPLINGS:
             raise InvalidInput(
-                f"subsampling: got {self.subsampling!r}, want one of {list(SUBSAMPLINGS)}"
+                f"subsampling: expected one of {list(SUBSAMPLINGS)}, got {self.subsampling!r}"
             )
 
     def file(self, image: np.ndarray) -> bytes:

@@ -83,7 +83,7 @@ def read_structure(data: bytes | memoryview, max_pixels: int) -> ImageFile:
     if file.startswith(PNG_MAGIC):
         return _read_png(file, max_pixels)
     raise MalformedMessage(
-        f"image: got {len(file)} bytes starting {file[:4]!r}, want a JPEG or PNG file"
+        f"image: expected a JPEG or PNG file, got {len(file)} bytes starting {file[:4]!r}"
     )
 
 
@@ -94,8 +94,8 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
         marker, start, end = _jpeg_segment(file, at)
         if marker in _OTHER_SOF:
             raise MalformedMessage(
-                f"image: got a JPEG of the process SOF{marker - 0xC0}, want baseline or "
-                "progressive Huffman coding"
+                "image: expected a JPEG with baseline or progressive Huffman coding, got the "
+                f"process SOF{marker - 0xC0}; encode it again"
             )
         if marker in _SOF:
             if frame is not None:
@@ -234,7 +234,9 @@ def _check_size(
     file_bytes: int, height: int, width: int, pixel_bytes: int, max_pixels: int
 ) -> None:
     if not height or not width:
-        raise MalformedMessage(f"image: declares {height}x{width} pixels, want at least 1x1")
+        raise MalformedMessage(
+            f"image: expected at least 1x1 pixels, got a header with {height}x{width}"
+        )
     if height * width > max_pixels:
         raise MessageTooLarge(
             f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller "

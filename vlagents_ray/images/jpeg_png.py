@@ -165,5 +165,5 @@ def _check(image: np.ndarray) -> None:
     """Raise `InvalidObservation` unless an image can be encoded."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise InvalidObservation(
-            f"image: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB"
+            f"image: expected (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}"
         )

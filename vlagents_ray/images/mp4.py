@@ -82,7 +82,7 @@ class Mp4:
         """
         if image.shape != self._shape or image.dtype != np.uint8:
             raise InvalidObservation(
-                f"got an image of {image.shape} {image.dtype}, want {self._shape} uint8 as before"
+                f"expected {self._shape} uint8 as before, got {image.shape} {image.dtype}"
             )
         if any(self._pad):
             image = np.pad(image, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")

@@ -70,9 +70,9 @@ class AbsoluteActions(Wrapper):
             agent = agent.agent
         if isinstance(agent, ModelPolicy) and agent.config.actions != "chunk":
             raise ConfigError(
-                f"absolute_actions: got a policy with actions: {agent.config.actions}, whose rows "
-                "belong to chunks of earlier states; want actions: chunk, and let the chunk player "
-                "or the evaluation execute them"
+                "absolute_actions: expected a policy with actions: chunk, got "
+                f"{agent.config.actions}, whose rows belong to chunks of earlier states; let the "
+                "chunk player or the evaluation execute the chunks"
             )
 
     @property
@@ -112,8 +112,8 @@ class AbsoluteActions(Wrapper):
             faults.append(f"rotations as {action.rotation!r}")
         if faults:
             raise ConfigError(
-                f"absolute_actions: the policy has {' and '.join(faults)}, want relative ones that "
-                "add up with its state, such as joints; leave the wrapper out"
+                "absolute_actions: expected relative actions that add up with the policy's "
+                f"state, such as joints, got {' and '.join(faults)}; leave the wrapper out"
             )
 
     def change_batch(
@@ -161,8 +161,8 @@ class AbsoluteActions(Wrapper):
         outside = [column for column in self.config.absolute if not -dim <= column < dim]
         if outside:
             raise InvalidAction(
-                f"absolute_actions: got the absolute columns {outside} of actions with {dim} "
-                "numbers"
+                f"absolute_actions: expected columns of actions with {dim} numbers, got "
+                f"{outside}; correct `absolute`"
             )
 
         relative = np.ones(dim, bool)

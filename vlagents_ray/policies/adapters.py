@@ -180,8 +180,8 @@ class LoraAdapters:
             return LoraAdapter()
         if not isinstance(name, str) or name not in self._by_name:
             raise UnknownCheckpoint(
-                f"{ADAPTER}: got {name!r}, want one of {sorted(self._by_name)}, or none, for the "
-                "base"
+                f"{ADAPTER}: expected one of {sorted(self._by_name)}, or none for the base, got "
+                f"{name!r}"
             )
         return self._by_name[name]
 
@@ -246,8 +246,8 @@ class LoraAdapters:
         [x] = inputs
         if len(x) % len(chosen):
             raise PolicyFailed(
-                f"adapters: a layer got {len(x)} entries for {len(chosen)} rows, want as many for "
-                "each"
+                f"adapters: expected an entry of the layer's input for each of {len(chosen)} "
+                f"rows, got {len(x)}"
             )
         if downs.ndim == 3:
             entries = x.reshape(len(chosen), -1, x.shape[-1])
@@ -324,8 +324,8 @@ def base_of(folder: Path) -> str | None:
     base = _config(folder).get("base_model_name_or_path") or None
     if base is not None and not isinstance(base, str):
         raise ConfigError(
-            f"{folder / CONFIG}: got {type(base).__name__} as base_model_name_or_path, want the "
-            "name of a checkpoint"
+            f"{folder / CONFIG}: base_model_name_or_path: expected the name of a checkpoint, got "
+            f"{type(base).__name__}"
         )
     return base
 
@@ -374,8 +374,8 @@ def _config(folder: Path) -> dict[str, Any]:
     if not isinstance(config, dict) or config.get("peft_type") != "LORA":
         kind = config.get("peft_type") if isinstance(config, dict) else type(config).__name__
         raise ConfigError(
-            f"{folder / CONFIG}: got peft_type {kind!r}, want 'LORA'; merge another kind into its "
-            "base (merge_and_unload) and serve that as a checkpoint of its own"
+            f"{folder / CONFIG}: peft_type: expected 'LORA', got {kind!r}; merge another type "
+            "into its base (merge_and_unload) and serve that as a checkpoint of its own"
         )
 
     unsupported = {}
@@ -386,9 +386,9 @@ def _config(folder: Path) -> dict[str, Any]:
         unsupported.pop("init_lora_weights", None)
     if unsupported:
         raise ConfigError(
-            f"{folder / CONFIG}: got {unsupported}, want a plain LoRA of linear layers without "
-            "these; merge the fine-tune into its base (merge_and_unload) and serve that as a "
-            "checkpoint of its own"
+            f"{folder / CONFIG}: expected a plain LoRA of linear layers, got {unsupported}; merge "
+            "the fine-tune into its base (merge_and_unload) and serve that as a checkpoint of "
+            "its own"
         )
     return config
 
@@ -418,9 +418,9 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
 
     if faults or not pairs:
         raise ConfigError(
-            f"{folder / WEIGHTS}: got {faults[:_LISTED] or 'no adapters'}, want pairs "
-            f"{_PREFIX}LAYER{_DOWN} and {_PREFIX}LAYER{_UP}, and no changes of the base; merge "
-            "another kind of fine-tune into it (merge_and_unload)"
+            f"{folder / WEIGHTS}: expected pairs {_PREFIX}LAYER{_DOWN} and {_PREFIX}LAYER{_UP}, "
+            f"and no changes of the base, got {faults[:_LISTED] or 'no adapters'}; merge another "
+            "type of fine-tune into the base (merge_and_unload)"
         )
 
 
@@ -429,9 +429,9 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
     unknown = sorted(name for name in names if name not in modules)
     if unknown:
         raise ConfigError(
-            f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the "
-            f"network: {unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, "
-            "with this version of its code"
+            f"{folder / WEIGHTS}: expected layers of the network, got {len(unknown)} of "
+            f"{len(names)} that it does not have: {unknown[:_LISTED]}; use an adapter that was "
+            "trained on this checkpoint, with this version of its code"
         )
 
     unsupported = {}
@@ -440,8 +440,8 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
             unsupported[name] = type(modules[name]).__name__
     if unsupported:
         raise ConfigError(
-            f"{folder / WEIGHTS}: got adapters of {dict(list(unsupported.items())[:_LISTED])}, "
-            "want those of linear layers and plain convolutions; merge this one into its base "
+            f"{folder / WEIGHTS}: expected adapters of linear layers and plain convolutions, got "
+            f"{dict(list(unsupported.items())[:_LISTED])}; merge the fine-tune into its base "
             "(merge_and_unload)"
         )
 
@@ -477,8 +477,8 @@ def _layer(
     kinds = {saved_down.dtype.kind, saved_up.dtype.kind}
     if not kinds <= {"f", "V"}:  # V: bfloat16, which numpy lacks
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got A {saved_down.dtype} and B {saved_up.dtype}, want "
-            "real numbers; save the adapter without quantization"
+            f"{folder / WEIGHTS}: {name}: expected real numbers, got A {saved_down.dtype} and B "
+            f"{saved_up.dtype}; save the adapter without quantization"
         )
 
     # float32, since B is scaled before it is rounded to the type of the weights.
@@ -490,18 +490,18 @@ def _layer(
     up_shape = (outputs, rank, *(1 for _ in inputs[1:]))
     if (tuple(down.shape), tuple(up.shape)) != (down_shape, up_shape) or not rank:
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got A {tuple(down.shape)} and B {tuple(up.shape)}, want "
-            f"them for weights {tuple(weight.shape)}; want an adapter that was trained on this "
-            "checkpoint"
+            f"{folder / WEIGHTS}: {name}: expected A and B for weights of shape "
+            f"{tuple(weight.shape)}, got A {tuple(down.shape)} and B {tuple(up.shape)}; use an "
+            "adapter that was trained on this checkpoint"
         )
 
     alpha = config.get("lora_alpha")
     if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
-        raise ConfigError(f"{folder / CONFIG}: got lora_alpha {alpha!r}, want a number")
+        raise ConfigError(f"{folder / CONFIG}: lora_alpha: expected a number, got {alpha!r}")
     scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
     if not all(values.to(weight.dtype).isfinite().all() for values in (down, up * scale)):
         raise ConfigError(
-            f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want "
-            "finite ones; take an earlier step of the training"
+            f"{folder / WEIGHTS}: {name}: expected values that are finite as {weight.dtype}, got "
+            "NaN or infinity; take an earlier step of the training"
         )
     return down, up, scale

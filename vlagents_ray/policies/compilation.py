@@ -518,7 +518,10 @@ class Core:
                 if error <= limit:
                     continue
                 # The error is above the limit, or NaN.
-                reason = f"its results are off by {error:.2g}, want at most {limit:g}"
+                reason = (
+                    f"expected results within {limit:g} of the uncompiled ones, got a difference "
+                    f"of {error:.2g}"
+                )
             programs.pop(tier, None)
             self._failures.append(f"{self.name!r} by {tier}: {reason}")
         return eager_result

@@ -28,7 +28,7 @@ class RandomConfig(BaseModel, extra="forbid"):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.low > self.high:
-            raise ValueError(f"low and high: got [{self.low}, {self.high}], want low <= high")
+            raise ValueError(f"low and high: expected low <= high, got [{self.low}, {self.high}]")
         return self
 
 

@@ -45,8 +45,8 @@ class Scripted(Agent):
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(
-                f"scripted: got env={env!r}, want the env's name, e.g. reset(..., env='tabletop'); "
-                f"or set `task` in the policy's config"
+                "scripted: expected the name of an env, e.g. reset(..., env='tabletop'), got "
+                f"env={env!r}; or set `task` in the policy's config"
             )
         expert: Expert = (self._class or expert_class(env))(env)
         expert.reset(obs, instruction or "")

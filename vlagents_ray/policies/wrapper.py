@@ -171,15 +171,16 @@ def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrap
     settings_by_name = {entry: {}} if isinstance(entry, str) else dict(entry)
     if len(settings_by_name) != 1:
         raise ConfigError(
-            f"wrappers: got {sorted(settings_by_name)} in one entry, want one name each, with its "
-            "settings"
+            "wrappers: expected one name with its settings in each entry, got "
+            f"{sorted(settings_by_name)} in one; write an entry for each"
         )
 
     [(name, settings)] = settings_by_name.items()
     cls = wrapper_class(name)
     if not issubclass(cls, Wrapper):
         raise ConfigError(
-            f"wrappers: {name!r} is {cls.__name__}, want a subclass of {Wrapper.__module__}.Wrapper"
+            f"wrappers: {name!r}: expected a subclass of {Wrapper.__module__}.Wrapper, got "
+            f"{cls.__name__}"
         )
     wrapper: Wrapper = cls.around(agent, settings or {})
     return wrapper

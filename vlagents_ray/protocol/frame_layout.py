@@ -66,18 +66,18 @@ def unpack(
         MessageTooLarge: The frame exceeds the limits.
     """
     if len(data) > limits.body_bytes:
-        raise MessageTooLarge(f"frame: got {len(data)} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(f"frame: expected at most {limits.body_bytes} bytes, got {len(data)}")
     if len(data) < _PREFIX.size:
-        raise MalformedMessage(f"frame: got {len(data)} bytes, want at least {_PREFIX.size}")
+        raise MalformedMessage(f"frame: expected at least {_PREFIX.size} bytes, got {len(data)}")
 
     magic, version, length = _PREFIX.unpack_from(data)
     if magic != b"VLA":
         raise MalformedMessage(
-            f"frame: got {magic!r} at its start, want b'VLA'; is this a vlagents_ray frame?"
+            f"frame: expected b'VLA' at its start, got {magic!r}; is this a vlagents_ray frame?"
         )
     if version != PROTOCOL_VERSION:
         raise MalformedMessage(
-            f"frame: got version {version}, this side speaks {PROTOCOL_VERSION}; upgrade the older"
+            f"frame: expected version {PROTOCOL_VERSION}, got {version}; upgrade the older side"
         )
 
     view = memoryview(data)
@@ -132,8 +132,8 @@ def parse_json(
     """
     if len(text) > HEADER_BYTES and not long:
         raise MessageTooLarge(
-            f"message: got {len(text)} bytes of JSON, the limit is {HEADER_BYTES}; send arrays and "
-            "files as bytes"
+            f"message: expected at most {HEADER_BYTES} bytes of JSON, got {len(text)}; send "
+            "arrays and files as bytes"
         )
     if budget is not None and len(text) > _INLINE_BYTES:
         budget.parse(len(text))
@@ -170,11 +170,15 @@ def is_plain(dtype: Any) -> bool:
 def plain_dtype(dtype: Any) -> np.dtype[Any]:
     """Return the numpy dtype named `dtype`; raise `MalformedMessage` if it is not plain."""
     if not is_plain(dtype):
-        raise MalformedMessage(f"array: got dtype {shown(dtype, 20)}, want one like '<f4' or '|u1'")
+        raise MalformedMessage(
+            f"array: expected a dtype like '<f4' or '|u1', got {shown(dtype, 20)}"
+        )
     try:
         named_dtype: np.dtype[Any] = np.dtype(dtype)
     except TypeError as error:
-        raise MalformedMessage(f"array: got dtype {dtype!r}, which numpy does not know") from error
+        raise MalformedMessage(
+            f"array: expected a dtype that numpy knows, got {dtype!r}"
+        ) from error
     return named_dtype
 
 
@@ -184,21 +188,23 @@ def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
     """
     kind = plain_dtype(dtype)
     if not isinstance(data, (bytes, memoryview)):
-        raise MalformedMessage(f"array: got {type(data).__name__} for its data, want bytes")
+        raise MalformedMessage(f"array: expected bytes as its data, got {type(data).__name__}")
     if (
         not isinstance(shape, (list, tuple))
         or len(shape) > 8
         or not all(type(n) is int and n >= 0 for n in shape)
     ):
         raise MalformedMessage(
-            f"array: got shape {shown(shape)}, want up to 8 non-negative integers"
+            f"array: expected a shape of up to 8 integers of 0 or more, got {shown(shape)}"
         )
     if math.prod(shape) * kind.itemsize != len(data):
-        raise MalformedMessage(f"array: got {len(data)} bytes, want {shown(shape)} of {dtype}")
+        raise MalformedMessage(
+            f"array: expected the bytes of {shown(shape)} {dtype}, got {len(data)} bytes"
+        )
     try:
         return np.ndarray(shape, kind, data)
     except (ValueError, OverflowError) as error:
         # numpy cannot represent such a long axis, even beside an empty one.
         raise MalformedMessage(
-            f"array: got shape {shown(shape)}, which numpy does not know"
+            f"array: expected a shape that numpy accepts, got {shown(shape)}"
         ) from error

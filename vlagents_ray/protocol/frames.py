@@ -126,10 +126,10 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     header, blobs = unpack(data, limits, budget)
     nodes = header.get("requests", [header])
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
-        raise MalformedMessage(f"requests: got {shown(nodes)}, want a list of requests")
+        raise MalformedMessage(f"requests: expected a list of requests, got {shown(nodes)}")
     if len(nodes) > limits.requests:
         raise MessageTooLarge(
-            f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame"
+            f"requests: expected at most {limits.requests} in one frame, got {len(nodes)}"
         )
 
     decoded = Decoded([], {})
@@ -152,10 +152,10 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
     unknown = node.keys() - _REQUEST_KEYS
     if unknown:
         raise MalformedMessage(
-            f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}"
+            f"request: expected keys of {sorted(_REQUEST_KEYS)}, got {shown(sorted(unknown))}"
         )
     if node.get("op") not in ops:
-        raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
+        raise MalformedMessage(f"op: expected one of {list(ops)}, got {shown(node.get('op'))}")
     if node["op"] == "close":  # a close has no payload and costs nothing
         node = {name: value for name, value in node.items() if name in _OF_CLOSE}
 
@@ -163,11 +163,11 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
     history = node.get("history") or []
     if not isinstance(history, list):
         raise MalformedMessage(
-            f"history: got {type(history).__name__}, want a list of observations"
+            f"history: expected a list of observations, got {type(history).__name__}"
         )
     if len(history) > limits.history:
         raise MessageTooLarge(
-            f"history: got {len(history)} observations, the limit is {limits.history}"
+            f"history: expected at most {limits.history} observations, got {len(history)}"
         )
 
     request = Request(
@@ -192,7 +192,7 @@ def _step(node: dict[str, Any]) -> Any:
         return None
     if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
         raise MalformedMessage(
-            f"step: got {shown(step)}, want the text of the last answer, such as '7'"
+            f"step: expected the text of the last answer, such as '7', got {shown(step)}"
         )
     return int(step)
 
@@ -203,15 +203,18 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
     """
     # A reference is an object in JSON, and may be an array, bytes or a number.
     if not isinstance(request.kwargs, dict):
-        raise MalformedMessage(f"kwargs: got {type(request.kwargs).__name__}, want an object")
+        raise MalformedMessage(f"kwargs: expected an object, got {type(request.kwargs).__name__}")
     if request.contract is not None and not isinstance(request.contract, dict):
-        raise MalformedMessage(f"contract: got {type(request.contract).__name__}, want an object")
+        raise MalformedMessage(
+            f"contract: expected an object, got {type(request.contract).__name__}"
+        )
 
     if request.op in ("act", "close"):
         reset_fields = [name for name in _OF_RESET if getattr(request, name)]
         if reset_fields:
             raise MalformedMessage(
-                f"{request.op}: got {reset_fields}, which a reset states for its whole episode"
+                f"{request.op}: expected no {reset_fields}, which only a reset may set, got them; "
+                "leave them out"
             )
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
@@ -219,31 +222,31 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
     for name in ("instruction", "request_id", "session"):
         text = getattr(request, name)
         if not isinstance(text, str) and not (name == "instruction" and text is None):
-            raise MalformedMessage(f"{name}: got {type(text).__name__}, want text")
+            raise MalformedMessage(f"{name}: expected text, got {type(text).__name__}")
         if text and len(text) > (limits.text if name == "instruction" else NAME_CHARACTERS):
-            raise MessageTooLarge(f"{name}: got {len(text)} characters, which is over the limit")
+            raise MessageTooLarge(f"{name}: expected fewer characters, got {len(text)}; shorten it")
         if text and name != "instruction" and not is_name(text):
             raise MalformedMessage(
-                f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces"
+                f"{name}: expected visible ASCII characters without spaces, got {text[:40]!r}"
             )
 
     if request.op == "reset":
         parameters = _RESET_PARAMETERS & request.kwargs.keys()
         if parameters:
             raise MalformedMessage(
-                f"kwargs: got {sorted(parameters)}, which are parameters of `reset` itself; rename "
-                "them"
+                "kwargs: expected names other than the parameters of `reset` itself, got "
+                f"{sorted(parameters)}; rename them"
             )
     if not isinstance(request.priority, str) or request.priority not in PRIORITIES:
         raise MalformedMessage(
-            f"priority: got {shown(request.priority)}, want one of {list(PRIORITIES)}"
+            f"priority: expected one of {list(PRIORITIES)}, got {shown(request.priority)}"
         )
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):
         raise MalformedMessage(
-            f"deadline_ms: got {shown(request.deadline_ms)}, want a number above 0 and below "
-            f"{MOST_DEADLINE_MS:g}"
+            f"deadline_ms: expected a number above 0 and below {MOST_DEADLINE_MS:g}, got "
+            f"{shown(request.deadline_ms)}"
         )
     return request
 
@@ -313,7 +316,7 @@ def decode_replies(data: Buffer) -> list[Reply]:
     header, blobs = unpack(data, DEFAULT_LIMITS)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
-        raise MalformedMessage(f"replies: got {shown(nodes)}, want a list of replies")
+        raise MalformedMessage(f"replies: expected a list of replies, got {shown(nodes)}")
     return [_read_reply(node, ValueReader(blobs, Budget(DEFAULT_LIMITS))) for node in nodes]
 
 
@@ -335,11 +338,11 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
             )
         except (KeyError, TypeError) as error:
             raise MalformedMessage(
-                f"reply: got {shown(act)}, want action, done and info"
+                f"reply: expected action, done and info, got {shown(act)}"
             ) from error
         if not isinstance(reply.act.action, np.ndarray):
             raise MalformedMessage(
-                f"reply: action: got {shown(reply.act.action)}, expected an array"
+                f"reply: action: expected an array, got {shown(reply.act.action)}"
             )
     else:
         reply.info = _info(node.get("info") or {}, reader)
@@ -350,7 +353,7 @@ def _info(node: object, reader: ValueReader) -> dict[str, Any]:
     """Return the `info` of a reply."""
     value = reader.value(node)
     if not isinstance(value, dict):
-        raise MalformedMessage(f"reply: info: got {shown(node)}, expected an object")
+        raise MalformedMessage(f"reply: info: expected an object, got {shown(node)}")
     return value
 
 
@@ -359,7 +362,7 @@ def _timing(node: object) -> dict[str, float]:
     if node is None:
         return {}
     if not isinstance(node, dict) or not all(is_number(value) for value in node.values()):
-        raise MalformedMessage(f"reply: timing: got {shown(node)}, expected numbers by name")
+        raise MalformedMessage(f"reply: timing: expected numbers by name, got {shown(node)}")
     return node
 
 

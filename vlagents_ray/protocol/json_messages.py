@@ -46,17 +46,18 @@ def request_from_parts(
     budget.begin(op)
     document = parse_json(text, "obs:", without_duplicate_keys, budget=budget)
     if not isinstance(document, dict):
-        raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
+        raise MalformedMessage(f"obs: expected an object, got {type(document).__name__}")
 
     unknown = document.keys() - _KEYS
     if "cameras" in unknown:
         raise MalformedMessage(
-            "obs: got 'cameras' in the JSON document; send multipart/form-data, in it the document "
-            "as part 'obs' and each image as a file 'cameras.<name>', JPEG or PNG"
+            "obs: expected no 'cameras' in the JSON document, got some; send "
+            "multipart/form-data, in it the document as part 'obs' and each image as a file "
+            "'cameras.<name>', JPEG or PNG"
         )
     if unknown:
         raise MalformedMessage(
-            f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}"
+            f"obs: expected keys of {sorted(_KEYS)}, got {shown(sorted(unknown))}"
         )
 
     names = [] if op == "close" else list(images)  # a close has no payload and costs nothing

@@ -189,10 +189,13 @@ class StreamAddress:
 
     def __post_init__(self) -> None:
         if not 0 < self.port < 2**16:
-            raise MalformedMessage(f"metadata: stream: got port {self.port}, expected 1 to 65535")
+            raise MalformedMessage(
+                f"metadata: stream: expected a port from 1 to 65535, got {self.port}"
+            )
         if not (self.path.startswith(STREAM_PATH) and is_name(self.path)):
             raise MalformedMessage(
-                f"metadata: stream: got path {shown(self.path)}, expected {STREAM_PATH} and a name"
+                f"metadata: stream: expected the path {STREAM_PATH} and a name, got "
+                f"{shown(self.path)}"
             )
 
 
@@ -230,7 +233,7 @@ def read_address(kind: type[Address], document: object) -> Address | None:
         return None
     if not isinstance(document, dict):
         raise MalformedMessage(
-            f"metadata: got {shown(document)}, expected the entries of a {kind.__name__}"
+            f"metadata: expected the entries of a {kind.__name__}, got {shown(document)}"
         )
 
     values: dict[str, Any] = {}
@@ -240,7 +243,7 @@ def read_address(kind: type[Address], document: object) -> Address | None:
         value = document.get(entry.name)
         if type(value) is not _ADDRESS_TYPES[str(entry.type)]:
             raise MalformedMessage(
-                f"metadata: {kind.__name__}.{entry.name}: got {shown(value)}, expected {entry.type}"
+                f"metadata: {kind.__name__}.{entry.name}: expected {entry.type}, got {shown(value)}"
             )
         values[entry.name] = value
     return kind(**values)
@@ -391,9 +394,9 @@ def read_probe(message: bytes, budget: Budget) -> None:
     """
     budget.begin_message()
     if not is_probe(message):
-        raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r}")
+        raise MalformedMessage(f"probe: expected {_PROBE_TAG!r} at its start, got {message[:4]!r}")
     if len(message) < _HEAD_BYTES:
-        raise MalformedMessage(f"probe: got {len(message)} bytes, want at least {_HEAD_BYTES}")
+        raise MalformedMessage(f"probe: expected at least {_HEAD_BYTES} bytes, got {len(message)}")
     budget.begin("probe", "simulation")
 
 

@@ -202,7 +202,8 @@ class ShmReader:
             (count,) = COUNT.unpack_from(message)
             if count > self._limits.requests:
                 raise MessageTooLarge(
-                    f"local: got {count} acts, the limit is {self._limits.requests} in one message"
+                    f"local: expected at most {self._limits.requests} acts in one message, got "
+                    f"{count}"
                 )
 
             text_at = COUNT.size + count * ITEM.size
@@ -213,7 +214,7 @@ class ShmReader:
                 if text_bytes:
                     if number >= _MAX_LAYOUTS:
                         raise MessageTooLarge(
-                            f"local: layout {number}, want a number below {_MAX_LAYOUTS}"
+                            f"local: expected a layout below {_MAX_LAYOUTS}, got {number}"
                         )
                     self._known[number] = self._layout(
                         bytes(message[text_at : text_at + text_bytes])
@@ -230,7 +231,8 @@ class ShmReader:
                 # `isalnum` is faster than `is_name`, and most ids pass it.
                 if not id_bytes.isalnum() and not is_name(name_of_request):
                     raise MalformedMessage(
-                        f"local: request_id: got {name_of_request!r}, want visible ASCII characters"
+                        "local: request_id: expected visible ASCII characters, got "
+                        f"{name_of_request!r}"
                     )
 
                 obs = Obs(gripper=None if math.isnan(gripper) else gripper)
@@ -267,11 +269,11 @@ class ShmReader:
         session, priority, cameras, state = json.loads(text)
         check_request(Request("close", session=session, priority=priority), limits)
         if not isinstance(cameras, list) or not isinstance(state, list):
-            raise MalformedMessage("local: cameras and state: want lists of names and shapes")
+            raise MalformedMessage("local: expected lists of names and shapes as cameras and state")
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
-                f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
-                f"{limits.cameras}"
+                f"obs: expected at most {limits.cameras} cameras and states, got {len(cameras)} "
+                f"cameras and {len(state)} states"
             )
 
         for (name, shape), dimensions, max_size in (
@@ -280,19 +282,19 @@ class ShmReader:
         ):
             if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
                 raise MalformedMessage(
-                    f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions"
+                    f"local: expected a name and {dimensions} dimensions, got {name!r} of {shape!r}"
                 )
             require_array_name(name)
             if not all(type(n) is int and n >= 0 for n in shape) or (
                 dimensions == 3 and shape[2] != 3
             ):
                 raise MalformedMessage(
-                    f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)"
+                    f"local: {name!r}: expected a shape (H, W, 3) or (D,), got {shape!r}"
                 )
             size = math.prod(shape[:2])
             if size > max_size:
                 raise MessageTooLarge(
-                    f"local: {name!r}: got {size} pixels or values, the limit is {max_size}"
+                    f"local: {name!r}: expected at most {max_size} pixels or values, got {size}"
                 )
         return Layout.from_shapes(session, priority, cameras, state)
 

@@ -42,7 +42,8 @@ class ValueWriter:
         dtype = value.dtype.newbyteorder("<")
         if not is_plain(dtype.str):
             raise InvalidInput(
-                f"array: got dtype {value.dtype}, want bool, integers or floats; convert it"
+                f"array: expected a dtype of bool, integers or floats, got {value.dtype}; convert "
+                "it"
             )
         data = np.ascontiguousarray(value, dtype)
         self.blobs.append(data.data.cast("B") if data.size else b"")
@@ -74,13 +75,15 @@ class ValueWriter:
         if isinstance(value, (dict, Mapping)):
             for key in value:
                 if not isinstance(key, str) or key == "$":
-                    raise InvalidInput(f"info: got key {key!r}, want text other than '$'")
+                    raise InvalidInput(
+                        f"info: expected keys that are text other than '$', got {key!r}"
+                    )
             return {key: self.value(item) for key, item in value.items()}
         if isinstance(value, (list, Sequence)):
             return [self.value(item) for item in value]
         raise InvalidInput(
-            f"info: got {type(value).__name__}, want None, bool, int, float, str, bytes, array, "
-            "list or dict"
+            "info: expected None, bool, int, float, str, bytes, array, list or dict, got "
+            f"{type(value).__name__}"
         )
 
 
@@ -141,7 +144,9 @@ class ValueReader:
         """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
         reference = _reference(node)
         if not reference or len(node) != 1:
-            raise MalformedMessage(f"reference: got {shown(node)}, want {{'$': [kind, blob, ...]}}")
+            raise MalformedMessage(
+                f"reference: expected {{'$': [kind, blob, ...]}}, got {shown(node)}"
+            )
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
             data = self._get(rest[0])
@@ -154,7 +159,7 @@ class ValueReader:
         if kind == "float" and rest in (["nan"], ["inf"], ["-inf"]):
             return float(rest[0])
         raise MalformedMessage(
-            f"reference: got {shown(reference)}, want 'nd', 'img', 'bin' or 'float'"
+            f"reference: expected 'nd', 'img', 'bin' or 'float', got {shown(reference)}"
         )
 
     def _image(self, index: Any) -> np.ndarray:
@@ -183,7 +188,7 @@ class ValueReader:
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
             raise MalformedMessage(
-                f"reference: got blob {shown(index, 20)}, want a number below {len(self._blobs)}"
+                f"reference: expected a blob below {len(self._blobs)}, got {shown(index, 20)}"
             )
         return self._blobs[index]
 
@@ -200,11 +205,11 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
     """
     limits = reader.limits
     if not isinstance(node, dict):
-        raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
+        raise MalformedMessage(f"obs: expected an object, got {type(node).__name__}")
     unknown = node.keys() - _OBS_KEYS
     if unknown:
         raise MalformedMessage(
-            f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}"
+            f"obs: expected keys of {sorted(_OBS_KEYS)}, got {shown(sorted(unknown))}"
         )
 
     cameras = node.get("cameras") or {}
@@ -213,25 +218,25 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
     gripper = node.get("gripper")
     for name, value in (("cameras", cameras), ("state", state), ("info", info)):
         if not isinstance(value, dict):
-            raise MalformedMessage(f"obs.{name}: got {type(value).__name__}, want an object")
+            raise MalformedMessage(f"obs.{name}: expected an object, got {type(value).__name__}")
     if max(len(cameras), len(state)) > limits.cameras:
         raise MessageTooLarge(
-            f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is "
-            f"{limits.cameras}"
+            f"obs: expected at most {limits.cameras} cameras and states, got {len(cameras)} "
+            f"cameras and {len(state)} states"
         )
 
     for name in (*cameras, *state):
         require_array_name(name)
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(
-            f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open"
+            f"gripper: expected a number in [0, 1] where 1 = open, got {shown(gripper)}"
         )
 
     reader.decode_images(cameras)
     read_info = reader.value(info)
     # A reference is an object in JSON, and may be an array, bytes or a number.
     if not isinstance(read_info, dict):
-        raise MalformedMessage(f"obs.info: got {described(read_info)}, want an object")
+        raise MalformedMessage(f"obs.info: expected an object, got {described(read_info)}")
     return Obs(
         cameras={
             name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()
@@ -251,8 +256,8 @@ def require_array_name(name: str) -> None:
     """
     if not 0 < len(name) <= NAME_CHARACTERS or not name.isprintable():
         raise InvalidObservation(
-            f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} "
-            "printable characters"
+            f"obs: expected names of 1 to {NAME_CHARACTERS} printable characters, got a camera or "
+            f"state named {name[:40]!r}"
         )
 
 
@@ -267,12 +272,12 @@ def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
         or image.dtype != _UINT8
     ):
         raise InvalidObservation(
-            f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB"
+            f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}"
         )
     if image.shape[0] * image.shape[1] > limits.pixels:
         raise MessageTooLarge(
-            f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}; send it "
-            "smaller, or raise `limits.pixels`"
+            f"camera {name!r}: expected at most {limits.pixels} pixels, got {image.shape[:2]}; "
+            "send it smaller, or raise `limits.pixels`"
         )
     return image
 
@@ -285,13 +290,13 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
     if not is_list and (
         not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu"
     ):
-        raise InvalidObservation(f"state {name!r}: got {described(values)}, want (D,) float32")
+        raise InvalidObservation(f"state {name!r}: expected (D,) float32, got {described(values)}")
     if len(values) > limits.state_values:
         raise MessageTooLarge(
-            f"state {name!r}: got {len(values)} values, the limit is {limits.state_values}"
+            f"state {name!r}: expected at most {limits.state_values} values, got {len(values)}"
         )
     if is_list and not all(is_number(number) for number in values):
-        raise InvalidObservation(f"state {name!r}: want a list of numbers")
+        raise InvalidObservation(f"state {name!r}: expected a list of numbers")
 
     array: np.ndarray = np.array(values, dtype=np.float64) if is_list else values
     if array.dtype == _FLOAT32:  # numpy's `errstate` takes longer than all other work on a state
@@ -301,7 +306,7 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
             return array.astype(np.float32)
     except FloatingPointError as error:
         raise InvalidObservation(
-            f"state {name!r}: got a number beyond those of float32, want it within"
+            f"state {name!r}: expected numbers within float32, got a larger one"
         ) from error
 
 
@@ -347,7 +352,7 @@ def _as_float32(name: str, values: Any) -> np.ndarray:
         return array.astype(np.float32)
     except (TypeError, ValueError) as error:
         raise InvalidObservation(
-            f"state {name!r}: expected (D,) float32, numbers, got {described(values)}"
+            f"state {name!r}: expected (D,) float32, got {described(values)}"
         ) from error
 
 
@@ -388,14 +393,14 @@ def require_plain(value: Any, depth: int) -> None:
             raise MessageTooLarge("message: nested too deep; flatten it")
         for key in value if isinstance(value, dict) else ():
             if not isinstance(key, str):
-                raise MalformedMessage(f"message: got key {shown(key)}, want text")
+                raise MalformedMessage(f"message: expected keys that are text, got {shown(key)}")
         for item in value.values() if isinstance(value, dict) else value:
             require_plain(item, depth - 1)
     elif value is not None and not isinstance(
         value, (bool, int, float, str, bytes, np.ndarray, np.generic)
     ):
         raise MalformedMessage(
-            f"message: got a {type(value).__name__}, want plain values and arrays"
+            f"message: expected plain values and arrays, got a {type(value).__name__}"
         )
 
 

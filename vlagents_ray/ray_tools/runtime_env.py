@@ -28,17 +28,17 @@ def require_no_secrets(runtime_env: Mapping[str, Any]) -> None:
         secrets = sorted(name for name in variables if _SECRET.search(name))
     if secrets:
         raise ConfigError(
-            f"env_vars: got {secrets}, want no secrets: Ray logs them where every user of the "
-            "machine can read them. Set them in the environment in which Ray is started on each "
-            "node (by `ray start`, `vlagents-ray serve`), or in a file that only you can read, and "
-            "replace the secrets that were given here before"
+            "env_vars: expected no secrets, as Ray logs them where every user of the machine can "
+            f"read them, got {secrets}; set them in the environment in which Ray is started on "
+            "each node (by `ray start`, `vlagents-ray serve`), or in a file that only you can "
+            "read, and replace the secrets that were set here before"
         )
 
     if any(_PASSWORD_IN_URL.search(text) for text in _texts(runtime_env)):
         raise ConfigError(
-            "runtime environment: got a URL with a password, want none: Ray logs it where every "
-            "user of the machine can read it. Put the password into ~/.netrc, or write ${NAME} for "
-            "a variable that the nodes have"
+            "runtime environment: expected no passwords, as Ray logs it where every user of the "
+            "machine can read it, got a URL with one; put the password into ~/.netrc, or write "
+            "${NAME} for a variable that the nodes have"
         )
 
 

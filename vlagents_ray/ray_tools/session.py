@@ -343,9 +343,9 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
             return chosen
         raise ConfigError(
-            f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want "
-            f"it in that of {chosen.url}: call ray.shutdown() before, or join() in place of "
-            "ray.init()"
+            f"expected a process in the Ray cluster of {chosen.url}, got one in another, "
+            f"{ray.get_runtime_context().gcs_address}; call ray.shutdown() before, or join() in "
+            "place of ray.init()"
         )
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(
@@ -400,13 +400,13 @@ def _choose(url_or_app: str | None) -> LocalServer:
     running = ", ".join(f"{server.url} ({', '.join(server.apps)})" for server in servers)
     if fitting:
         raise ConfigError(
-            f"got {len(fitting)} servers on this machine, {running}; say which: "
+            f"expected one server on this machine, got {len(fitting)}, {running}; choose one: "
             f"join('{servers[0].url}')"
         )
     if servers:
         raise ConfigError(
-            f"got {url_or_app!r}, want the URL or an application of a server on this machine: "
-            f"{running}"
+            f"expected the URL or an application of a server on this machine, {running}, got "
+            f"{url_or_app!r}"
         )
     raise ConfigError(
         "no server of this user is ready on this machine; start one with `vlagents-ray serve "

@@ -69,11 +69,12 @@ class Trained:
             trained = cls.from_statistics(statistics)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(
-                f"statistics {path}: {type(error).__name__}: {error}; want {_ACCEPTED_FILES}"
+                f"statistics {path}: expected {_ACCEPTED_FILES}, got {type(error).__name__}: "
+                f"{error}"
             ) from error
         if trained.state is None and trained.action is None:
             raise ConfigError(
-                f"statistics {path}: got {sorted(statistics)}, want {_ACCEPTED_FILES}"
+                f"statistics {path}: expected {_ACCEPTED_FILES}, got {sorted(statistics)}"
             )
         return trained
 
@@ -308,8 +309,8 @@ def _outside(
     """
     if rows.shape[1] != len(low):
         sentence = (
-            f"{vector}: got {rows.shape[1]} numbers, was trained with {len(low)}; is this another "
-            "arm's checkpoint?"
+            f"{vector}: expected {len(low)} numbers, as the policy was trained with, got "
+            f"{rows.shape[1]}; is this another arm's checkpoint?"
         )
         return [sentence]
 
@@ -330,8 +331,8 @@ def _outside(
             hint = f"; it would fit number {_name(int(fitting[0]), names)}: another order?"
 
         sentences.append(
-            f"{vector}{_name(int(i), names)}: got {number:.4g}, was trained from {low[i]:.4g} to "
-            f"{high[i]:.4g}{hint}"
+            f"{vector}{_name(int(i), names)}: expected {low[i]:.4g} to {high[i]:.4g}, the range "
+            f"of the training, got {number:.4g}{hint}"
         )
     return sentences
 

@@ -90,16 +90,16 @@ class Guard:
 
         # This also rejects NaN, with which any step would pass.
         if self._max_step is not None and not (self._max_step >= 0).all():
-            raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
+            raise ConfigError(f"max_step: expected a number of 0 or more, or None, got {max_step}")
         if measure is not None and spec.relative:
             raise ConfigError(
-                "measure: got one for relative actions, which cannot be compared with a pose; "
-                "leave it out"
+                "measure: expected none for relative actions, which cannot be compared with a "
+                "pose, got one; leave it out"
             )
         if limits is not None and (hz is None or not hz > 0 or not soft_start_s >= 0):
             raise ConfigError(
-                f"limits: got hz={hz}, soft_start_s={soft_start_s}, want the control rate, and 0 s "
-                "or more"
+                "limits: expected a control rate above 0 Hz, and a soft start of 0 s or more, "
+                f"got hz={hz}, soft_start_s={soft_start_s}"
             )
 
         self._measure = measure
@@ -144,10 +144,14 @@ class Guard:
         pose = np.array(self._measure(obs), np.float32)
         dim = self._dim if last is None else len(last)
         if pose.ndim != 1 or dim not in (None, len(pose)):
-            raise ConfigError(f"measure: got {pose.shape}, want ({dim or 'D'},), as an action is")
+            raise ConfigError(
+                f"measure: expected the shape of an action, ({dim or 'D'},), got {pose.shape}; "
+                "return one number for each number of an action"
+            )
         if not np.isfinite(pose).all():
             raise InvalidAction(
-                f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken"
+                f"measure: expected finite numbers, got {pose.tolist()}; the robot's sensors are "
+                "broken"
             )
 
         if last is not None:
@@ -175,12 +179,13 @@ class Guard:
         if action.ndim != 1 or action.dtype.kind != "f" or self._dim not in (None, len(action)):
             dim = "D" if self._dim is None else self._dim
             raise InvalidAction(
-                f"action: got {action.shape} {action.dtype}, want ({dim},) float32, a single row"
+                f"action: expected ({dim},) float32, a single row, got {action.shape} "
+                f"{action.dtype}"
             )
         numbers = action.tolist()  # plain floats: for so few numbers they are faster than numpy
         if not all(map(math.isfinite, numbers)):
             raise InvalidAction(
-                f"action: got {numbers}, want finite numbers; the policy's output is broken"
+                f"action: expected finite numbers, got {numbers}; check the policy's output"
             )
 
         low, high, steps, *dynamic_limits = self._limits_of(len(numbers))
@@ -188,7 +193,8 @@ class Guard:
             if not low[i] <= number <= high[i]:
                 name, limit = ("below", low[i]) if number < low[i] else ("above", high[i])
                 raise InvalidAction(
-                    f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract",
+                    f"action[{i}]: expected a number within the limits, got {number:g}, {name} "
+                    f"the limit {limit:g}; see the contract",
                     cause="limits",
                 )
         if self.limits is not None and self.limits.chain is not None:
@@ -196,7 +202,7 @@ class Guard:
 
         if last is not None and last.shape != action.shape:
             raise InvalidAction(
-                f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
+                f"action: expected the shape {np.shape(last)}, as before, got {action.shape}"
             )
         if last is None:  # from an unknown pose, but at rest
             self._accepted = None
@@ -210,8 +216,8 @@ class Guard:
             rounding = 2 * _ROUNDING * max(abs(number), abs(last_number))
             if abs(number - last_number) > steps[i] + rounding:
                 raise InvalidAction(
-                    f"action[{i}]: got {number:g} after {last_number:g}, a larger step than "
-                    "max_step allows",
+                    f"action[{i}]: expected a step of at most max_step, got {number:g} after "
+                    f"{last_number:g}",
                     cause="max_step",
                 )
         if self.limits is not None:
@@ -306,9 +312,10 @@ class Guard:
             distance = abs(end - begin)
             if distance > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
                 raise InvalidAction(
-                    f"action[{i}]: got {end:g} as the first action, {distance:g} from the pose "
-                    f"{begin:g}, want {allowed[i]:.3g} at most; is it another arm's or in another "
-                    "order or unit? Else raise `first`",
+                    f"action[{i}]: expected a first action at most {allowed[i]:.3g} from the pose "
+                    f"{begin:g}, got {end:g}, {distance:g} away; check that the policy is for "
+                    "this arm, and the order and units of the joints; if all are right, raise "
+                    "`first`",
                     cause="max_step",
                 )
 
@@ -372,7 +379,7 @@ class Guard:
             np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
         except ValueError as error:
             raise ConfigError(
-                f"limits: {error}; want one number, or {dim} as an action has"
+                f"limits: expected one number, or {dim} as an action has: {error}"
             ) from error
 
         low, high = columns[:2]
@@ -406,9 +413,9 @@ class Guard:
                 without_effect.append(name)
         if without_effect:
             raise ConfigError(
-                f"limits: got {', '.join(without_effect)} for relative actions, which cannot be "
-                "compared with a place; remove them, or use a file with velocity, acceleration and "
-                "jerk alone"
+                "limits: expected only velocity, acceleration and jerk for relative actions, "
+                f"which cannot be compared with a position, got {', '.join(without_effect)}; "
+                "remove them, or use a file without them"
             )
 
     def _softness(self) -> float:
@@ -483,8 +490,8 @@ class Guard:
         is_soft = self._ticks_with_motion < self._soft_ticks
         soft = ", which the soft start lowers" if is_soft else ""
         return InvalidAction(
-            f"action[{i}]: got {quantity} {value * per_s:.4g}, want {limit * per_s:.3g} at most "
-            f"(units/s^{order}{soft})",
+            f"action[{i}]: expected {quantity} of at most {limit * per_s:.3g} "
+            f"(units/s^{order}{soft}), got {value * per_s:.4g}",
             cause="max_step" if order == 1 else "dynamics",
         )
 
@@ -533,7 +540,7 @@ def _strictest(
     """
     arrays = [np.asarray(bound, np.float32) for bound in bounds if bound is not None]
     if any(np.isnan(array).any() for array in arrays):
-        raise ConfigError(f"{name}: got {bounds}, want numbers")
+        raise ConfigError(f"{name}: expected numbers, got {bounds}")
     return functools.reduce(stricter, arrays) if arrays else None
 
 

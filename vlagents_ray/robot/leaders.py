@@ -84,8 +84,8 @@ def _opened(where: str, make: Callable[[], Leader]) -> Iterator[Leader]:
         raise
     except Exception as error:
         raise ConfigError(
-            f"{where}: could not be made: {type(error).__name__}: {error}; want a class that is "
-            "made without arguments"
+            f"{where}: expected a class that can be made without arguments, got "
+            f"{type(error).__name__}: {error}"
         ) from error
     if isinstance(leader, AbstractContextManager):
         with leader as entered:

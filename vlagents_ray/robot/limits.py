@@ -78,7 +78,7 @@ class MotionLimits:
         if not np.isfinite(_numbers("rest", rest_numbers)).all():
             raise ConfigError(f"rest: expected finite numbers or null, got {self.rest}")
         if self.unit not in _PER_RAD:
-            raise ConfigError(f"unit: got {self.unit!r}, want 'rad' or 'deg'")
+            raise ConfigError(f"unit: expected 'rad' or 'deg', got {self.unit!r}")
 
     @classmethod
     def read(cls, path: str | Path, action: ActionSpec | None = None) -> MotionLimits:
@@ -118,8 +118,9 @@ class MotionLimits:
             ET.ParseError,
         ) as error:
             raise ConfigError(
-                f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of "
-                "limits, a .urdf, or a LeRobotDataset v3.0; see docs/control_loop.md"
+                f"limits {path}: expected a .yaml or .json file of limits, a .urdf, or a "
+                f"LeRobotDataset v3.0, got {type(error).__name__}: {error}; see "
+                "docs/control_loop.md"
             ) from error
 
     @classmethod
@@ -131,9 +132,7 @@ class MotionLimits:
         unknown = sorted(set(document) - known_keys)
         if unknown:
             suggestions = "".join(did_you_mean(str(key), known_keys) for key in unknown)
-            raise ConfigError(
-                f"unknown keys {unknown}, want some of {sorted(known_keys)}{suggestions}"
-            )
+            raise ConfigError(f"expected some of {sorted(known_keys)}, got {unknown}{suggestions}")
         if not isinstance(document.get("joints", []), list):
             raise ConfigError(f"joints: expected a list of names, got {document['joints']!r}")
 
@@ -149,8 +148,8 @@ class MotionLimits:
         if urdf is None:
             if "unit" in document:
                 raise ConfigError(
-                    "unit: expected `urdf` with it, whose numbers it converts; got none, and "
-                    "limits are in the units of the actions; remove `unit`"
+                    "unit: expected `urdf` with it, whose numbers it converts, got none; remove "
+                    "`unit`, as limits are in the units of the actions"
                 )
             return limits
 
@@ -320,7 +319,9 @@ class Chain:
         for name, joint in joints.items():
             joint_of_child[joint.find("child").attrib["link"]] = (name, joint)
         if tip not in joint_of_child:
-            raise ConfigError(f"tip: got {tip!r}, want one of the links {sorted(joint_of_child)}")
+            raise ConfigError(
+                f"tip: expected a link, one of {sorted(joint_of_child)}, got {tip!r}"
+            )
 
         self._to_rad = to_rad
         self._joints: list[_Joint] = []  # from the tip to the base

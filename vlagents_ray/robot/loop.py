@@ -182,7 +182,7 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     """
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise ConfigError(f"{option}: got {name!r}, want module:Class, as in my_arm:MyArm")
+        raise ConfigError(f"{option}: expected module:Class, as in my_arm:MyArm, got {name!r}")
     try:
         imported = importlib.import_module(module)
     except (ImportError, ValueError) as error:
@@ -212,7 +212,8 @@ def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
     missing = [method for method in methods if not callable(getattr(cls, method, None))]
     if missing:
         raise ConfigError(
-            f"{where}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}"
+            f"{where}: expected a class with {', '.join(methods)}, got one without "
+            f"{', '.join(missing)}; add them"
         )
     return cls
 
@@ -236,7 +237,7 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
         key, equals, value = text.partition("=")
         if not equals:
             raise ConfigError(
-                f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0"
+                f"{option}-set: expected KEY=VALUE, as in port=/dev/ttyACM0, got {text!r}"
             )
         try:
             arguments[key] = json.loads(value)
@@ -473,13 +474,13 @@ def run_loop(
     if restart is None:
         restart = "auto" if getattr(robot, "simulated", False) else "manual"
     if seconds is not None and not seconds > 0:
-        raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
+        raise ConfigError(f"seconds: expected a number above 0, or None, got {seconds}")
 
     control = _shared_control(agent, watchdog, options.commands)
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
-            "recorder: got one without interventions for a player with override=; want Recorder(…, "
-            "interventions=True)"
+            "recorder: expected one with interventions for a player with override=, got one "
+            "without; make Recorder(…, interventions=True)"
         )
 
     report = options.report or LoopReport(hz)
@@ -561,13 +562,14 @@ def _guard_of(agent: Agent, guard: Guard | None, hz: float) -> Guard:
     agent_guard = agent.check if isinstance(agent.check, Guard) else None
     if guard is not None and agent_guard is not None and agent_guard is not guard:
         raise ConfigError(
-            "guard: got one besides the agent's own check=, want one of them; leave one out"
+            "guard: expected either `guard` or the agent's own check=, got both; leave one out"
         )
 
     guard = guard or agent_guard or Guard(agent.contract)
     if guard.hz not in (None, hz):
         raise ConfigError(
-            f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate"
+            f"guard: expected limits for {hz} Hz, the rate of the loop, got limits for {guard.hz} "
+            "Hz"
         )
     return guard
 
@@ -616,8 +618,8 @@ class _Run:
                 act = self.agent.act(obs)
                 if act.action.ndim != 1:
                     raise InvalidAction(
-                        f"action: got {act.action.shape}, want one row; wrap the agent in a "
-                        "ChunkPlayer"
+                        f"action: expected one row, got shape {act.action.shape}; wrap the agent "
+                        "in a ChunkPlayer"
                     )
                 self.report.done = act.done
 

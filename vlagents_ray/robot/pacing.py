@@ -41,7 +41,7 @@ class Pacer:
 
     def __init__(self, hz: float) -> None:
         if not (math.isfinite(hz) and hz > 0):
-            raise ConfigError(f"hz: got {hz}, want a rate above 0")
+            raise ConfigError(f"hz: expected a rate above 0, got {hz}")
         self.period_s = 1.0 / hz
         self.missed = 0
         self.ticks = 0  # the number of ticks that began

@@ -115,10 +115,11 @@ class Recorder:
             ConfigError: The label is unknown, or the dataset has no columns of interventions.
         """
         if label not in get_args(Label):
-            raise ConfigError(f"label: got {label!r}, want one of {list(get_args(Label))}")
+            raise ConfigError(f"label: expected one of {list(get_args(Label))}, got {label!r}")
         if label != "discard" and not self.interventions:
             raise ConfigError(
-                f"label: got {label!r} for a dataset without labels; give interventions=True"
+                f"label: expected a dataset with labels, got {label!r} for one without; give "
+                "interventions=True"
             )
         self._label = label
 

@@ -38,7 +38,7 @@ class Terminal:
                 descriptor = sys.stdin.fileno()
         if descriptor is None or not os.isatty(descriptor):
             raise ConfigError(
-                "terminal: got no terminal, want one to read keys from; run this in one"
+                "terminal: expected a terminal to read keys from, got none; run this in one"
             )
         self.descriptor = descriptor
         status = os.fstat(descriptor)
@@ -89,7 +89,8 @@ class Terminal:
         with self._lock:
             if consumer not in self._own_consumers:
                 raise ConfigError(
-                    "terminal: this consumer has not begun; want `with` around its use"
+                    "terminal: expected a consumer in use, got one that has not begun; put "
+                    "`with` around its use"
                 )
             if self._own_consumers[-1] != consumer:
                 return True

@@ -34,7 +34,7 @@ class Watchdog:
     def __init__(self, stop: Callable[[str], None], silent_s: Mapping[str, float]) -> None:
         for name, limit_s in silent_s.items():
             if not limit_s > 0:
-                raise ConfigError(f"watchdog: got {limit_s} s for {name!r}, want above 0")
+                raise ConfigError(f"watchdog: {name!r}: expected a limit above 0 s, got {limit_s}")
         self.barks: list[str] = []  # the reasons given to `stop`
         self.error: Exception | None = None
         self.control = RobotControl()
@@ -56,7 +56,9 @@ class Watchdog:
             ConfigError: `ago_s` is negative or not finite.
         """
         if not 0 <= ago_s < math.inf:
-            raise ConfigError(f"heard: got {ago_s} s ago for {name!r}, want a finite number from 0")
+            raise ConfigError(
+                f"heard: {name!r}: expected a finite number of seconds of 0 or more, got {ago_s}"
+            )
         heard_at = time.monotonic() - ago_s
         last_heard_at = self._heard_at.get(name)
         if last_heard_at is None or heard_at <= last_heard_at:

@@ -75,9 +75,11 @@ class PushOptions:
 
     def __post_init__(self) -> None:
         if self.version is not None and not 1 <= self.version <= _LARGEST:
-            raise InvalidInput(f"version: got {self.version}, want a number in [1, {_LARGEST}]")
+            raise InvalidInput(f"version: expected a number in [1, {_LARGEST}], got {self.version}")
         if self.mode not in get_args(PushMode):
-            raise InvalidInput(f"mode: got {self.mode!r}, want one of {list(get_args(PushMode))}")
+            raise InvalidInput(
+                f"mode: expected one of {list(get_args(PushMode))}, got {self.mode!r}"
+            )
 
 
 class VersionNotHeld(UnknownSession):
@@ -109,10 +111,12 @@ class Rest:
 
     def __post_init__(self) -> None:
         if self.step not in get_args(RestStep):
-            raise InvalidInput(f"rest: got {self.step!r}, want one of {list(get_args(RestStep))}")
+            raise InvalidInput(
+                f"step: expected one of {list(get_args(RestStep))}, got {self.step!r}"
+            )
         if not 0 < self.at_most_s <= _LONGEST_REST_S:
             raise InvalidInput(
-                f"at_most_s: got {self.at_most_s:g}, want seconds in (0, {_LONGEST_REST_S:g}]"
+                f"at_most_s: expected seconds in (0, {_LONGEST_REST_S:g}], got {self.at_most_s:g}"
             )
 
 
@@ -242,9 +246,8 @@ class ModelWeights:
         restored = self.make(number, self.newest, values, PushOptions(allow_same=True))
         if restored.fingerprint != digest:
             raise VersionNotHeld(
-                f"version {number} of the weights: got values with fingerprint "
-                f"{restored.fingerprint}, want {digest}; "
-                f"reset the session"
+                f"version {number} of the weights: expected values with the fingerprint {digest}, "
+                f"got {restored.fingerprint}; reset the session"
             )
         with self._lock:
             return self._alive.setdefault(number, restored)
@@ -314,8 +317,8 @@ class ModelWeights:
         most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
         if len(header) > most:
             raise MessageTooLarge(
-                f"weights: got a header of {len(header)} bytes, want at most {most} for the "
-                f"policy's {len(held)} names"
+                f"weights: expected a header of at most {most} bytes for the policy's {len(held)} "
+                f"names, got {len(header)}"
             )
         announced = read_header(header)
         trainable.require_fit(held, announced, partial=options.partial)
@@ -352,9 +355,8 @@ class ModelWeights:
             newest = self.newest
             if number <= newest.number:
                 raise Overloaded(
-                    f"weights: got version {number}, want one above {newest.number}, the newest "
-                    "here: another push was "
-                    f"faster; push again"
+                    f"weights: expected a version above {newest.number}, the newest here, got "
+                    f"{number}, as another push was faster; push again"
                 )
             if self._staged is not None:
                 raise Overloaded("weights: another push is under way; push again when it is over")
@@ -822,6 +824,6 @@ def follows(options: dict[str, Any], *, by_default: bool) -> bool:
     wanted = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
     if not isinstance(wanted, str) or wanted not in (_FOLLOW, _PINNED):
         raise InvalidInput(
-            f"{OPTION}: got {wanted!r}, want {_FOLLOW!r} (the newest version) or {_PINNED!r}"
+            f"{OPTION}: expected {_FOLLOW!r} (the newest version) or {_PINNED!r}, got {wanted!r}"
         )
     return bool(wanted == _FOLLOW)

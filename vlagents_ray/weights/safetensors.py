@@ -71,7 +71,7 @@ def header_of(values: Mapping[str, np.ndarray]) -> bytes:
     for name, value in values.items():
         if value.dtype not in _CODES:
             raise InvalidWeights(
-                f"{name!r}: got {value.dtype}, want one of {', '.join(sorted(_TYPES))}"
+                f"{name!r}: expected a dtype of {', '.join(sorted(_TYPES))}, got {value.dtype}"
             )
         end = begin + value.nbytes
         document[name] = {
@@ -124,8 +124,9 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
     announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
     if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
         raise MalformedMessage(
-            f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 "
-            f"bytes with the length of the header, and the header, at most {MESSAGE_BYTES} together"
+            "safetensors: expected 8 bytes with the length of the header, and the header, at "
+            f"most {MESSAGE_BYTES} together, got {len(data)} bytes that announce a header of "
+            f"{announced}"
         )
 
     try:
@@ -136,7 +137,8 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
     if not isinstance(document, dict):
         raise MalformedMessage(
-            f"safetensors: got {type(document).__name__}, want an object with a value for each name"
+            "safetensors: expected an object with a value for each name, got "
+            f"{type(document).__name__}"
         )
     document.pop(_METADATA, None)
 
@@ -147,8 +149,8 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         spec = ValueSpec(_TYPES[code], shape)
         if begin != offset or end - begin != spec.size:
             raise MalformedMessage(
-                f"safetensors: {name!r}: got bytes {begin} to {end}, want {offset} to "
-                f"{offset + spec.size} for {code} of shape {list(shape)}"
+                f"safetensors: {name!r}: expected the bytes {offset} to {offset + spec.size} for "
+                f"{code} of shape {list(shape)}, got {begin} to {end}"
             )
         specs[name] = spec
         offset = end
@@ -161,22 +163,25 @@ def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
     """
     if len(name) > _NAME_LENGTH:
         raise MalformedMessage(
-            f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}"
+            f"safetensors: expected names of at most {_NAME_LENGTH} characters, got one of "
+            f"{len(name)}"
         )
     if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
-        raise MalformedMessage(f"safetensors: {name!r}: want 'dtype', 'shape' and 'data_offsets'")
+        raise MalformedMessage(
+            f"safetensors: {name!r}: expected 'dtype', 'shape' and 'data_offsets'"
+        )
 
     code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
     if not isinstance(code, str) or code not in _TYPES:
         raise MalformedMessage(
-            f"safetensors: {name!r}: got type {shown(code, 20)}, want one of {', '.join(_TYPES)}"
+            f"safetensors: {name!r}: expected a type of {', '.join(_TYPES)}, got {shown(code, 20)}"
         )
     if not _are_whole(shape) or len(shape) > _DIMENSIONS:
         raise MalformedMessage(
-            f"safetensors: {name!r}: shape: want at most {_DIMENSIONS} whole numbers"
+            f"safetensors: {name!r}: shape: expected at most {_DIMENSIONS} whole numbers"
         )
     if not _are_whole(offsets) or len(offsets) != 2:
-        raise MalformedMessage(f"safetensors: {name!r}: data_offsets: want two whole numbers")
+        raise MalformedMessage(f"safetensors: {name!r}: data_offsets: expected two whole numbers")
     return offsets[0], offsets[1], code, tuple(shape)
 
 
@@ -220,8 +225,8 @@ class ValuesReader:
         """
         if self.received + len(data) > self.size:
             raise MalformedMessage(
-                f"safetensors: got {self.received + len(data)} bytes of values, the header "
-                f"announced {self.size}"
+                f"safetensors: expected {self.size} bytes of values, as the header announced, got "
+                f"{self.received + len(data)}"
             )
         self.received += len(data)
 
@@ -246,7 +251,7 @@ class ValuesReader:
         for name, value in self._values.items():
             if value.dtype == np.bool_ and value.size and value.view(np.uint8).max() > 1:
                 raise MalformedMessage(
-                    f"safetensors: {name!r}: got other bytes than 0 and 1 for truth values"
+                    f"safetensors: {name!r}: expected bytes of 0 and 1 as bools, got others"
                 )
             value.flags.writeable = False
         return self._values
@@ -297,7 +302,7 @@ def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
         data = file.read(PART_BYTES)
     if reader.received != reader.size:
         raise MalformedMessage(
-            f"safetensors: got {reader.received} bytes of values, the header announced "
-            f"{reader.size}"
+            f"safetensors: expected {reader.size} bytes of values, as the header announced, got "
+            f"{reader.received}"
         )
     return reader.values()

@@ -237,7 +237,7 @@ def _count(counters: bytes, counter: int) -> memoryview | None:
         value = int.from_bytes(count, sys.byteorder)
         if len(count) == _COUNT and value == 1:
             return count
-        reason = f"got {value} as the first value of one, want 1"
+        reason = f"expected 1 as the first value, got {value}"
     _warn_of_counts(reason)
     return None
 

@@ -281,8 +281,8 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
     if not isinstance(tree, dict | list):
         at = f" at {path.rstrip('/')!r}" if path else ""
         raise NotTrainable(
-            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of "
-            "arrays and modules; or define parameters() and load_parameters()"
+            f"trainable{at}: expected a torch module, or dicts and lists of arrays and modules, "
+            f"got {type(tree).__name__}; or define parameters() and load_parameters()"
         )
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
         if is_array(value) or _is_module(value):
@@ -510,7 +510,7 @@ def accepted(
     faults: list[str] = []
     for name, is_finite in finite.items():
         if not is_finite and not _is_equal(new[memories[name]], current[name]):
-            faults.append(f"{name!r}: got NaN or infinite values, want finite ones")
+            faults.append(f"{name!r}: expected finite values, got NaN or infinity")
     _refuse(faults)
     return {name: new[memory] for name, memory in memories.items() if memory in new}
 
@@ -586,7 +586,9 @@ def require_fit(
     faults: list[str] = []
     for name in pushed:
         if name not in current:
-            faults.append(f"{name!r}: unknown, want one of the policy's {len(current)} names")
+            faults.append(
+                f"{name!r}: expected one of the policy's {len(current)} names; push no others"
+            )
     if not partial:
         missing = [name for name in current if name not in pushed]
         faults += [f"{name!r}: missing; push it, or set partial=True" for name in missing]
@@ -640,11 +642,11 @@ def _refuse(faults: list[str]) -> None:
 def _misfit(name: str, pushed: Any, current: Any) -> str | None:
     """Describe the difference of a pushed value's shape or kind of type; None if it fits."""
     if not is_array(pushed):
-        return f"{name!r}: got {type(pushed).__name__}, want an array"
+        return f"{name!r}: expected an array, got {type(pushed).__name__}"
     if tuple(pushed.shape) != tuple(current.shape):
-        return f"{name!r}: got shape {tuple(pushed.shape)}, want {tuple(current.shape)}"
+        return f"{name!r}: expected shape {tuple(current.shape)}, got {tuple(pushed.shape)}"
     if _kind(dtype_name(pushed)) != _kind(dtype_name(current)):
-        return f"{name!r}: got {dtype_name(pushed)}, want {dtype_name(current)}"
+        return f"{name!r}: expected {dtype_name(current)}, got {dtype_name(pushed)}"
     return None
 
 

@@ -25,7 +25,9 @@ def loads(text: str | bytes, limits: MessageLimits, levels: int = 0) -> Any:
     read-only.
     """
     if len(text) > limits.body_bytes:
-        raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(
+            f"document: expected at most {limits.body_bytes} bytes, got {len(text)}"
+        )
     marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
     if sum(map(text.count, marks)) > limits.items:  # base64 contains none of these characters
         raise MessageTooLarge(
@@ -54,7 +56,7 @@ def rows(value: list[Any]) -> np.ndarray:
         shapes = {row.shape for row in value}
         if len(shapes) != 1:
             raise MalformedMessage(
-                f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all"
+                f"action: expected rows of the same shape, got the shapes {sorted(shapes)[:8]}"
             )
         return np.stack(value)
     try:
@@ -62,7 +64,7 @@ def rows(value: list[Any]) -> np.ndarray:
     except ValueError as error:
         raise MalformedMessage(f"action: no array of numbers ({error})") from error
     if array.dtype.kind not in "fiu":
-        raise MalformedMessage(f"action: got {array.dtype}, want numbers")
+        raise MalformedMessage(f"action: expected numbers, got {array.dtype}")
     return array
 
 
@@ -71,7 +73,7 @@ def decode_base64(data: object, name: str) -> bytes:
     errors.
     """
     if not isinstance(data, str):
-        raise MalformedMessage(f"{name}: got {type(data).__name__}, want base64")
+        raise MalformedMessage(f"{name}: expected base64, got {type(data).__name__}")
     try:
         altchars = b"-_" if "-" in data or "_" in data else None
         return base64.b64decode(data, altchars, validate=True)
@@ -84,7 +86,7 @@ def _hook(node: dict[str, Any]) -> Any:
     if "__numpy__" not in node:
         return node
     if node.keys() != _KEYS:
-        raise MalformedMessage(f"array: got keys {shown(list(node))}, want {sorted(_KEYS)}")
+        raise MalformedMessage(f"array: expected the keys {sorted(_KEYS)}, got {shown(list(node))}")
     return read_array(decode_base64(node["__numpy__"], "array"), node["dtype"], node["shape"])
 
 
@@ -92,7 +94,9 @@ def _plain(value: Any) -> Any:
     """Convert a value that JSON lacks to one that it has."""
     if isinstance(value, (np.ndarray, np.generic)):
         if value.dtype.kind not in "biuf":
-            raise InvalidInput(f"document: got dtype {value.dtype}, want bool, integers or floats")
+            raise InvalidInput(
+                f"document: expected a dtype of bool, integers or floats, got {value.dtype}"
+            )
         array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
         return {
             "__numpy__": base64.b64encode(array.tobytes()).decode(),
@@ -105,4 +109,7 @@ def _plain(value: Any) -> Any:
         return base64.b64encode(value).decode()
     if isinstance(value, Sequence):
         return list(value)
-    raise InvalidInput(f"document: got {type(value).__name__}, want what JSON or an array can say")
+    raise InvalidInput(
+        "document: expected a value that JSON or an array can represent, got "
+        f"{type(value).__name__}"
+    )

@@ -115,7 +115,7 @@ def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> di
     """
     entries = top.get(name) or {}
     if not isinstance(entries, Mapping):
-        raise ConfigError(f"mapping.{name}: got {type(entries).__name__}, want an object")
+        raise ConfigError(f"mapping.{name}: expected an object, got {type(entries).__name__}")
     return {str(key): read(value, f"mapping.{name}.{key}") for key, value in entries.items()}
 
 
@@ -127,11 +127,11 @@ def entry(cls: type[T], value: Any, where: str) -> T:
         raise ConfigError(f"{where}: no key; say where it lies in their observation")
     if values.get("layout", "hwc") not in get_args(Layout):
         raise ConfigError(
-            f"{where}.layout: got {values['layout']!r}, want one of {get_args(Layout)}"
+            f"{where}.layout: expected one of {get_args(Layout)}, got {values['layout']!r}"
         )
     key = values.get("key", "")
     if "*" in key and key.index("*") != len(key) - 1:
-        raise ConfigError(f"{where}: got key {key!r}, want '*' at its end alone")
+        raise ConfigError(f"{where}: expected '*' only at the end of a key, got {key!r}")
     if "open" in known and values.get("open", 1.0) == values.get("closed", 0.0):
         raise ConfigError(f"{where}: open and closed are the same, {values.get('open', 1.0)}")
     return cls(**values)
@@ -141,14 +141,14 @@ def parts(value: Any, where: str) -> tuple[StateKey, ...]:
     """Return the keys of one state, whose values are concatenated."""
     values = value if isinstance(value, list) else [value]
     if not values:
-        raise ConfigError(f"{where}: got an empty list, want one key at least")
+        raise ConfigError(f"{where}: expected at least one key, got an empty list")
     return tuple(entry(StateKey, item, where) for item in values)
 
 
 def text(value: Any, where: str) -> str:
     """Return a value that must be text."""
     if not isinstance(value, str):
-        raise ConfigError(f"{where}: got {type(value).__name__}, want text")
+        raise ConfigError(f"{where}: expected text, got {type(value).__name__}")
     return value
 
 
@@ -269,8 +269,8 @@ def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.n
         if value.dtype.kind == "f":
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
-                    f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, "
-                    "want uint8, or floats in [0, 1]; scale it"
+                    f"camera {key!r}: expected uint8, or floats in [0, 1], got {value.dtype} from "
+                    f"{value.min():g} to {value.max():g}; scale it"
                 )
             value = (255 * value).astype(np.uint8)
         if layout == "rgba" and value.ndim == 3 and value.shape[2] == 4:
@@ -279,7 +279,7 @@ def read_image(key: str, value: Any, layout: str, limits: MessageLimits) -> np.n
             value = np.ascontiguousarray(value.transpose(1, 2, 0))
         elif layout == "chw":
             raise InvalidObservation(
-                f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB"
+                f"camera {key!r}: expected (3, H, W) uint8 RGB, got {value.shape} {value.dtype}"
             )
     return as_camera(key, value, limits)
 
@@ -309,7 +309,7 @@ def read_state(
             vector = read_vector(key, value, limits)
             if source.stop is not None and source.stop > vector.size:
                 raise InvalidObservation(
-                    f"state {key!r}: got {vector.size} numbers, want {source.stop} at least"
+                    f"state {key!r}: expected at least {source.stop} numbers, got {vector.size}"
                 )
             vectors = vectors_by_name.setdefault(our_name, [])
             vectors.append(vector[source.start : source.stop])
@@ -336,8 +336,8 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
     """
     if value.ndim > ndim and value.shape[0] != 1:
         raise InvalidObservation(
-            f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by "
-            "itself"
+            f"{key!r}: expected one row, got a batch of {value.shape[0]}, {value.shape}; send "
+            "each row by itself"
         )
     if value.ndim == ndim + 2 and value.shape[1] > 0:
         value = value[:, -1]
@@ -360,14 +360,16 @@ def read_text(
         if isinstance(value, int):
             if needed and str(value) not in texts:
                 raise InvalidObservation(
-                    f"{key!r}: got {value}, want one of {sorted(texts)}; add its text to "
+                    f"{key!r}: expected one of {sorted(texts)}, got {value}; add its text to "
                     "mapping.instructions"
                 )
             value = texts.get(str(value))
     if value is not None and not isinstance(value, str):
-        raise InvalidObservation(f"{key!r}: got {type(value).__name__}, want text")
+        raise InvalidObservation(f"{key!r}: expected text, got {type(value).__name__}")
     if value is not None and len(value) > limits.text:
-        raise MessageTooLarge(f"{key!r}: got {len(value)} characters, the limit is {limits.text}")
+        raise MessageTooLarge(
+            f"{key!r}: expected at most {limits.text} characters, got {len(value)}"
+        )
     return value
 
 
@@ -397,7 +399,9 @@ class KeyMapping:
         top = closed(cls, data, "mapping", ConfigError)
         instruction = top.get("instruction")
         if instruction is not None and not isinstance(instruction, str):
-            raise ConfigError(f"mapping.instruction: got {type(instruction).__name__}, want a key")
+            raise ConfigError(
+                f"mapping.instruction: expected a key, got {type(instruction).__name__}"
+            )
         gripper = top.get("gripper")
         grippers = top.get("action_gripper") or []
         if not isinstance(grippers, list):
@@ -455,8 +459,8 @@ class KeyMapping:
             state |= read_state(flat, name, sources, limits)
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
-                f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is "
-                f"{limits.cameras}"
+                f"observation: expected at most {limits.cameras} cameras and states, got "
+                f"{len(cameras)} cameras and {len(state)} states"
             )
 
         info = {name: lookup(flat, key) for name, key in self.info.items()}
@@ -505,7 +509,8 @@ class KeyMapping:
             index = gripper.index
             if not -rows.shape[1] <= index < rows.shape[1]:
                 raise InvalidAction(
-                    f"action: got {rows.shape[1]} numbers a row, want a gripper's at {index}"
+                    f"action: expected the gripper's number at {index}, got {rows.shape[1]} "
+                    "numbers a row; change mapping.action"
                 )
             rows = rows.copy()
             opening = (rows[:, index] - spec.gripper_closed) / our_range
@@ -560,8 +565,8 @@ class KeyMapping:
             mapped_dims.append(max(span.start or 0, span.stop or 0))
         if dim is not None and max(mapped_dims) > dim:
             sentences.append(
-                f"action: the policy gives {dim} numbers a row, the mapping wants "
-                f"{max(mapped_dims)}; change mapping.action"
+                f"action: expected {max(mapped_dims)} numbers a row, as in the mapping, got {dim} "
+                "from the policy; change mapping.action"
             )
         return sentences
 
@@ -615,8 +620,8 @@ class KeyMapping:
         known = [*camera_keys, *state_keys, *self._gripper_keys()]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
-                f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for "
-                f"{known}: choose the preset of this client, or change the mapping"
+                f"observation: expected some of {known}, which the mapping reads, got "
+                f"{keys(flat)}; choose the preset of this client, or change the mapping"
             )
 
         for kind, mapped_keys, values, is_relevant in (
@@ -626,9 +631,8 @@ class KeyMapping:
             unread = self._unread(flat, is_relevant) if mapped_keys and not values else []
             if unread:
                 raise InvalidObservation(
-                    f"observation: got {unread}, which the mapping does not read, and nothing at "
-                    f"{mapped_keys}; add them to mapping.{kind}, or to mapping.info if the policy "
-                    "does without"
+                    f"observation: expected {mapped_keys}, which the mapping reads, got {unread}; "
+                    f"add them to mapping.{kind}, or to mapping.info if the policy does without"
                 )
 
     def _opening(
@@ -649,7 +653,8 @@ class KeyMapping:
         vector = read_vector(gripper.key, value, limits)
         if not -vector.size <= gripper.index < vector.size:
             raise InvalidObservation(
-                f"{gripper.key!r}: got {vector.size} numbers, want the gripper's at {gripper.index}"
+                f"{gripper.key!r}: expected the gripper's number at {gripper.index}, got "
+                f"{vector.size} numbers; change mapping.gripper"
             )
 
         reading = float(vector[gripper.index])
@@ -658,8 +663,8 @@ class KeyMapping:
             if not needed:
                 return None
             raise InvalidObservation(
-                f"{gripper.key!r}: got {reading:g} for the gripper, want {gripper.closed:g} "
-                f"(closed) to {gripper.open:g} (open); scale it, or change mapping.gripper"
+                f"{gripper.key!r}: expected a gripper from {gripper.closed:g} (closed) to "
+                f"{gripper.open:g} (open), got {reading:g}; scale it, or change mapping.gripper"
             )
         return min(1.0, max(0.0, opening))
 

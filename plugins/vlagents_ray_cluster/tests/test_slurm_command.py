@@ -112,7 +112,7 @@ def test_a_tracker_that_is_not_registered_is_refused_before_the_job_is_submitted
 ) -> None:
     done = slurm(*EVAL, "--out", str(tmp_path / "out"), "--track", "wandbb")
     assert done.exit_code == 2
-    assert "'wandbb' is not registered" in done.output
+    assert "got 'wandbb', which is not registered" in done.output
     assert "'wandb'" in done.output
 
 

@@ -176,7 +176,7 @@ def test_a_dialect_that_is_off_is_not_there() -> None:
         ({"open_pi": {}}, "open_pi"),
         ({"openvla": {"mapping": {"camera": {}}}}, "cameras"),
         ({"roboarena": {"n_external_cameras": 3}}, "n_external_cameras"),
-        ({"openpi": {"mapping": "openpi-droid"}}, "mapping wants 8"),
+        ({"openpi": {"mapping": "openpi-droid"}}, "expected 8 numbers a row"),
     ],
 )
 def test_a_wrong_setting_is_refused_before_anything_starts(

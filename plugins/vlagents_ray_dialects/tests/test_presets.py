@@ -406,10 +406,10 @@ def test_a_number_in_place_of_an_instruction_has_its_text(number: np.ndarray) ->
     needed = Contract(instruction=True)
     with pytest.raises(
         InvalidObservation,
-        match=r"got 4, want one of \['3'\]; add its text to mapping.instructions",
+        match=r"expected one of \['3'\], got 4; add its text to mapping.instructions",
     ):
         mapping.obs(theirs | {"task_id": number + 1}, contract=needed)
-    with pytest.raises(InvalidObservation, match="want text"):
+    with pytest.raises(InvalidObservation, match="expected text"):
         mapping.obs(theirs | {"task_id": np.array([0.5])})
     assert mapping.obs(theirs | {"task_id": number + 1})[1] is None, (
         "a policy without an instruction needs no texts"

@@ -211,9 +211,12 @@ def test_what_does_not_fit_is_refused_as_ever_and_nothing_stays_open(
         app.push(values, PIN)
     changed(learner)
     for wrong, message in (
-        ({**values, "part": torch.full((4,), torch.nan, device=device)}, "'part': got NaN"),
+        (
+            {**values, "part": torch.full((4,), torch.nan, device=device)},
+            "'part': expected finite values, got NaN",
+        ),
         ({"part": values["part"]}, "'rough': missing"),
-        ({**values, "part": "text"}, "'part': got str, want an array"),
+        ({**values, "part": "text"}, "'part': expected an array, got str"),
     ):
         with pytest.raises(InvalidWeights, match=message):
             app.push(wrong, PIN)

@@ -78,7 +78,7 @@ def test_mistakes_are_refused_by_name(engine: Engine) -> None:
         weights.push(engine.models.own_weights._agent.parameters())
     with pytest.raises(InvalidWeights, match="got list, want values by name"):
         weights.push([np.zeros(2)])  # type: ignore[arg-type]
-    with pytest.raises(InvalidInput, match="mode: got 'abort'"):
+    with pytest.raises(InvalidInput, match=r"mode: expected .*, got 'abort'"):
         weights.push({}, mode="abort")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Publisher: got 7"):
         Publisher(7)  # type: ignore[arg-type]

@@ -210,7 +210,7 @@ def test_an_episode_of_other_weights_is_refused(plan: EvalConfig, served: Replic
         update={"policies": [policy.model_copy(update={"pushed_weights": wanted})], "workers": 0}
     )
     with pytest.raises(
-        ConfigError, match=r"was played by versions 0 to 0 of the weights \(\w+\), want 3"
+        ConfigError, match=r"expected version 3 of the weights \(\w+\) in .*, got 0 to 0 \(\w+\)"
     ):
         evaluate(config, agent_factory=served.agent)
     assert episodes(plan.out, "reach@3") == []

@@ -175,7 +175,7 @@ def test_all_replicas_act_with_a_push_by_way_of_any(app: Application) -> None:
 
 def test_if_one_replica_refuses_none_acts_with_it(app: Application) -> None:
     app.start(Gain(), Gain(length=3), Gain())
-    with pytest.raises(InvalidWeights, match=r"'gain': got shape \(2,\), want \(3,\)"):
+    with pytest.raises(InvalidWeights, match=r"'gain': expected shape \(3,\), got \(2,\)"):
         app.push(5)
     assert app.gains() == [(0, 0.0)] * 3
     app.replicas.pop(1).engine.close()
@@ -193,7 +193,7 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
     assert app.gains() == [(501, 6.0)] * 2
     with pytest.raises(
         InvalidInput,
-        match=r"version: got 9007199254740992, want a number in \[1, 9007199254740991\]",
+        match=r"version: expected a number in \[1, 9007199254740991\], got 9007199254740992",
     ):
         PushOptions(version=2**53)
     # Or no later number is above it.

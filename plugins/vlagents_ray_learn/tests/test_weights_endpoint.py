@@ -159,9 +159,9 @@ def test_what_does_not_fit_is_refused_before_it_is_sent(
         ProxiedSocket, "send", lambda self, part, s: (sent.append(len(part)), send(self, part, s))
     )
     for wrong, says in (
-        (gains(1) | {"other": np.zeros(2**24, np.int8)}, "'other': unknown"),
+        (gains(1) | {"other": np.zeros(2**24, np.int8)}, "'other': expected one of the policy's"),
         ({"gain": gains(1)["gain"]}, "'offset': missing"),
-        (gains(1) | {"gain": np.zeros((2, LENGTH), np.float32)}, "'gain': got shape"),
+        (gains(1) | {"gain": np.zeros((2, LENGTH), np.float32)}, "'gain': expected shape"),
     ):
         sent.clear()
         with pytest.raises(InvalidWeights, match=says):

@@ -71,7 +71,7 @@ def test_a_robot_is_compared_by_the_numbers_that_are_known() -> None:
 
     joints[1] = 1.0
     [misfit] = trained.misfits(trained.vector(Obs(state=state), []), None, None)
-    assert misfit.startswith("state[1]: got 1, was trained from -2.5 to -0.5")
+    assert misfit.startswith("state[1]: expected -2.5 to -0.5, the range of the training, got 1")
     assert len(trained.draw(np.full((2, 14), 1.0), None)) == 15
 
 

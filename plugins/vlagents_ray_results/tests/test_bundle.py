@@ -340,13 +340,16 @@ def test_a_database_of_views_or_of_odd_values_is_refused(
 ) -> None:
     verify(bundle, into=tmp_path / "run", replay=0)
     for sql, why in (
-        ("CREATE VIEW x AS SELECT 1", "got 'x', which is a view that no evaluation makes"),
+        ("CREATE VIEW x AS SELECT 1", "got 'x', a view that no evaluation makes"),
         ("UPDATE cases SET seeds = '[]'", "its database holds values that no evaluation writes"),
         (
             "UPDATE runs SET config = '{\"policies\": 1}'",
             "its database holds values that no evaluation writes",
         ),
-        ("UPDATE episodes SET trajectory = '../x.npz'", "want a path below the folder of results"),
+        (
+            "UPDATE episodes SET trajectory = '../x.npz'",
+            "expected files of episodes in the folder of results",
+        ),
     ):
         shutil.copy(tmp_path / "run/results.db", tmp_path / "other.db")
         with closing(sqlite3.connect(tmp_path / "other.db")) as db, db:

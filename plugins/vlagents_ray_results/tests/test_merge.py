@@ -199,7 +199,7 @@ def test_a_file_of_an_episode_that_is_gone_is_said_in_one_sentence_and_nothing_i
     [gone] = (a / kind).rglob("ep0003_*.mp4" if kind == "videos" else "ep0003_*.npz")
     gone.unlink()
     with pytest.raises(
-        ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"
+        ConfigError, match=rf"{gone.name}: expected a file.*, got none; copy the folder again"
     ):
         merge(tmp_path / "out", [a])
     assert not list((tmp_path / "out").rglob("*.*"))
@@ -227,7 +227,7 @@ def named(folder: Path, column: str, path: str) -> Path:
 )
 def test_a_path_out_of_a_folder_of_results_is_refused(path: str) -> None:
     with pytest.raises(
-        ConfigError, match="as a file of an episode, want a path below the folder of results"
+        ConfigError, match="expected files of episodes in the folder of results, got the path"
     ):
         require_below(path)
 
@@ -240,7 +240,9 @@ def test_paths_out_of_a_folder_of_results_are_refused_by_all_that_read_it(
     (tmp_path / "secret" / "key.mp4").write_text("secret")
     theirs = named(part("theirs"), column, "videos/../../secret/key.mp4")
     for read in (Results.load, lambda folder: merge(tmp_path / "out", [folder])):
-        with pytest.raises(ConfigError, match="want a path below the folder of results"):
+        with pytest.raises(
+            ConfigError, match="expected files of episodes in the folder of results"
+        ):
             read(theirs)
     assert not list((tmp_path / "out").rglob("*.mp4"))
 

@@ -94,7 +94,7 @@ def test_a_wrong_option_is_named() -> None:
 
 def test_the_expert_says_what_it_wants() -> None:
     expert = AlohaExpert("aloha/insertion")
-    with pytest.raises(InvalidObservation, match=r"want \(14,\)"):
+    with pytest.raises(InvalidObservation, match=r"expected shape \(14,\)"):
         expert.reset(Obs(info={"sim_state": np.zeros(7)}), "")
     with pytest.raises(NotReset):
         expert.act(Obs())

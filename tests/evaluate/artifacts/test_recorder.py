@@ -152,7 +152,9 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
 def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure() -> None:
     recorder = TrajectoryRecorder()
     recorder.add_observation(Obs(state={"joints": np.zeros(7, np.float32)}))
-    with pytest.raises(EnvFailed, match=r"'joints': \(6,\).*want.*'joints': \(7,\)"):
+    with pytest.raises(
+        EnvFailed, match=r"expected.*'joints': \(7,\).*as after reset, got.*'joints': \(6,\)"
+    ):
         recorder.add_observation(Obs(state={"joints": np.zeros(6, np.float32)}))
 
 

@@ -234,7 +234,7 @@ def test_a_lost_connection_is_no_failure_of_the_policy() -> None:
 def test_an_action_that_the_env_refuses_counts_against_the_policy() -> None:
     class Narrow(Script):
         def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            raise InvalidAction("got 2 numbers, want 7")
+            raise InvalidAction("expected at least 7 numbers, got 2")
 
     assert run_episode(Narrow(), Chunks(ROW), KEY).status == "policy_error"
 
@@ -286,17 +286,29 @@ SOLVED = {"success": True}
 @pytest.mark.parametrize(
     ("obs", "said"),
     [
-        (None, "got NoneType in place of the observation"),
-        ({"joints": 1}, "got dict in place of the observation"),
+        (None, "expected an Obs as the observation, got NoneType"),
+        ({"joints": 1}, "expected an Obs as the observation, got dict"),
         (Obs(dict(FRONT), 0.5), "state 'joints' is missing"),
-        (Obs(dict(FRONT), 0.5, {"joints": np.zeros(3, np.float32)}), r"got \(3,\), want \(6,\)"),
-        (Obs(dict(FRONT), 0.5, {"joints": np.full(6, np.nan, np.float32)}), "got NaN"),
-        (Obs(dict(FRONT), None, dict(JOINTS)), "gripper: got none"),
-        (Obs(dict(FRONT), "open", dict(JOINTS)), "'open' as the gripper"),  # type: ignore[arg-type]
+        (
+            Obs(dict(FRONT), 0.5, {"joints": np.zeros(3, np.float32)}),
+            r"expected shape \(6,\), got \(3,\)",
+        ),
+        (Obs(dict(FRONT), 0.5, {"joints": np.full(6, np.nan, np.float32)}), "finite.*got NaN"),
+        (
+            Obs(dict(FRONT), None, dict(JOINTS)),
+            r"gripper: expected a number in \[0, 1\] where 1 = open, got None",
+        ),
+        (Obs(dict(FRONT), "open", dict(JOINTS)), r"expected a gripper in \[0, 1\], got 'open'"),  # type: ignore[arg-type]
         (Obs({}, 0.5, dict(JOINTS)), "camera 'front' is missing"),
-        (Obs({"front": np.zeros((4, 4), np.uint8)}, 0.5, dict(JOINTS)), "camera 'front': got"),
-        (Obs(None, 0.5, dict(JOINTS)), "NoneType as the observation's cameras"),  # type: ignore[arg-type]
-        (Obs(dict(FRONT), 0.5, dict(JOINTS), info=None), "NoneType as the observation's info"),  # type: ignore[arg-type]
+        (Obs({"front": np.zeros((4, 4), np.uint8)}, 0.5, dict(JOINTS)), "camera 'front': expected"),
+        (
+            Obs(None, 0.5, dict(JOINTS)),
+            "expected a dict as the observation's cameras, got NoneType",
+        ),  # type: ignore[arg-type]
+        (
+            Obs(dict(FRONT), 0.5, dict(JOINTS), info=None),
+            "expected a dict as the observation's info, got NoneType",
+        ),  # type: ignore[arg-type]
     ],
 )
 def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(
@@ -307,7 +319,7 @@ def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(
     # A first observation that does not fit would not fit at a second attempt; a number that is not
     # finite might.
     with pytest.raises(
-        EnvFailed if said == "got NaN" else ContractMismatch, match=f"env reset: .*{said}"
+        EnvFailed if said == "finite.*got NaN" else ContractMismatch, match=f"env reset: .*{said}"
     ):
         run_episode(Stated(before=(obs, {})), Chunks(*[ROW] * 6), KEY)
 
@@ -317,27 +329,33 @@ def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(
     [
         (
             (GOOD, 0.0, False, False, {"success": "yes"}),
-            "got 'yes' as info\\['success'\\], want a bool",
+            "expected info\\['success'\\] to be a bool, got 'yes'",
         ),
-        ((GOOD, 0.0, False, False, {"success": None}), "got None as info"),
-        ((GOOD, 0.0, False, False, {"success": 0.7}), "got 0.7 as info"),
-        ((GOOD, 0.0, False, False, None), "got NoneType as info, want 'success' among it"),
-        ((GOOD, 0.0, False, False, {}), ".*want 'success'"),
-        ((GOOD, np.nan, False, False, SOLVED), "got the reward nan, want a finite number"),
-        ((GOOD, np.inf, False, False, SOLVED), "got the reward inf, want a finite number"),
-        ((GOOD, 0.0, "no", False, SOLVED), "got 'no' as terminated"),
-        ((GOOD, 0.0, False, [False], SOLVED), ".*as truncated"),
-        ((GOOD, None, False, False, SOLVED), "got the reward None"),
-        ((GOOD, "1.0", False, False, SOLVED), "got the reward '1.0'"),
-        ((GOOD, 0.0, False, SOLVED), "got a tuple of 4"),
-        ((None,), "got a tuple of 1"),
+        (
+            (GOOD, 0.0, False, False, {"success": None}),
+            "expected info\\['success'\\] to be a bool, got None",
+        ),
+        (
+            (GOOD, 0.0, False, False, {"success": 0.7}),
+            "expected info\\['success'\\] to be a bool, got 0.7",
+        ),
+        ((GOOD, 0.0, False, False, None), "expected an info with 'success', got NoneType"),
+        ((GOOD, 0.0, False, False, {}), "expected an info with 'success'"),
+        ((GOOD, np.nan, False, False, SOLVED), "expected a finite number as the reward, got nan"),
+        ((GOOD, np.inf, False, False, SOLVED), "expected a finite number as the reward, got inf"),
+        ((GOOD, 0.0, "no", False, SOLVED), "expected terminated to be a bool, got 'no'"),
+        ((GOOD, 0.0, False, [False], SOLVED), "expected truncated to be a bool"),
+        ((GOOD, None, False, False, SOLVED), "expected a finite number as the reward, got None"),
+        ((GOOD, "1.0", False, False, SOLVED), "expected a finite number as the reward, got '1.0'"),
+        ((GOOD, 0.0, False, SOLVED), "expected .*, got a tuple of 4"),
+        ((None,), "expected .*, got a tuple of 1"),
     ],
 )
 def test_what_a_step_returns_is_never_guessed(answer: Any, said: str) -> None:
     with pytest.raises(EnvFailed, match=f"env step: {said}"):
         run_episode(Stated(after=answer), Chunks(*[ROW] * 6), KEY)
     for words in (None, 3):
-        with pytest.raises(EnvFailed, match=f"got the instruction {words}"):
+        with pytest.raises(EnvFailed, match=f"expected the instruction as a str .*, got {words}"):
             run_episode(Stated(words=words), Chunks(ROW), KEY)
 
 

@@ -109,10 +109,12 @@ def test_what_a_clock_lacks_is_named() -> None:
     with pytest.raises(ConfigError, match=r"give clock\.neutral"):
         ChunkExecutor(None, clock(), ABSOLUTE)
     ChunkExecutor(None, clock(latency=0), ABSOLUTE)
-    with pytest.raises(ConfigError, match="got 3 numbers, the policy's actions have 2"):
+    with pytest.raises(
+        ConfigError, match="expected 2 numbers, as the policy's actions have, got 3"
+    ):
         played(ChunkExecutor(None, clock(neutral=[0, 0, 0]), ABSOLUTE), 0.1)
     for execute in (None, 7):
-        with pytest.raises(ConfigError, match="nothing is left to continue"):
+        with pytest.raises(ConfigError, match="none is left to continue"):
             played(ChunkExecutor(execute, clock(real_time_chunking=True), RELATIVE), 0.1)
     bare = Contract(action=RELATIVE.action)
     with pytest.raises(ConfigError, match=r"give clock\.hz"):

@@ -144,7 +144,10 @@ def test_a_lost_session_stands_in_place_of_its_result_alone() -> None:
         (lambda *_: 1 / 0, "ZeroDivisionError"),
         (lambda _obs, *rest: (None, *rest), "env step: "),  # while they are put together
         (lambda obs, *rest: (replace(obs, state={}), *rest), "state 'position' is missing"),
-        (lambda *answer: (*answer[:4], {"success": "yes"}), r"got 'yes' as info\['success'\]"),
+        (
+            lambda *answer: (*answer[:4], {"success": "yes"}),
+            r"expected info\['success'\] to be a bool, got 'yes'",
+        ),
     ],
 )
 def test_what_one_env_does_wrong_is_no_failure_of_the_policy(change: Any, said: str) -> None:
@@ -183,7 +186,7 @@ def test_initial_states_go_by_the_episodes_number_and_the_user_before_them() -> 
 def test_each_episode_needs_a_session_and_an_environment() -> None:
     with SequentialBatch([Line()]) as env:
         for sessions, count in ((2, 2), (1, 2), (0, 0)):
-            with pytest.raises(ConfigError, match="one session an episode"):
+            with pytest.raises(ConfigError, match="one session for each episode"):
                 run_episodes(env, ToZero(), [ToZero()] * sessions, keys("line", count))
 
 
@@ -219,7 +222,10 @@ def test_a_policy_that_does_not_answer_for_each_session_fails(answers: list[Any]
     with SequentialBatch([Line() for _ in range(2)]) as env:
         results = together(env, Short(), keys("line", 2))
     assert [result.status for result in results] == ["policy_error"] * 2
-    assert all(f"got 2 observations, returned {len(answers)}" in result.error for result in results)
+    assert all(
+        f"expected 2 actions, one for each observation, got {len(answers)}" in result.error
+        for result in results
+    )
 
 
 def test_an_answer_that_is_no_act_is_the_policys_failure() -> None:

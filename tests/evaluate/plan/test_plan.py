@@ -57,7 +57,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
         "the policy is asked for no checkpoint"
     )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
-    with pytest.raises(ValueError, match="got steps and pushed_weights, want one of them"):
+    with pytest.raises(ValueError, match="expected steps or pushed_weights, got both"):
         PolicyConfig.model_validate(
             {"steps": [1], "pushed_weights": {"version": 1, "fingerprint": "a"}}
         )
@@ -229,7 +229,7 @@ def test_a_range_of_steps_includes_the_last(config: Config) -> None:
 
 def test_seeds_that_would_play_an_episode_twice_are_refused(config: Config) -> None:
     assert config(episodes=5, seeds=[10, 0, 5]).suites[0].seeds == [10, 0, 5]
-    with pytest.raises(ValidationError, match="would play some twice; want them 5 or more apart"):
+    with pytest.raises(ValidationError, match="expected seeds at least 5 apart"):
         config(episodes=5, seeds=[0, 4])
 
 
@@ -246,9 +246,7 @@ def test_numbers_that_json_lacks_are_refused(value: Any) -> None:
 
 def test_a_batch_has_no_latency_to_measure() -> None:
     assert SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig(latency=0.1)).clock is not None
-    with pytest.raises(
-        ValidationError, match="of the whole batch; want 1, or a latency in seconds"
-    ):
+    with pytest.raises(ValidationError, match="of the whole batch, got"):
         SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig())
 
 

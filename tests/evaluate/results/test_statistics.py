@@ -51,10 +51,10 @@ def test_nothing_is_known_without_episodes() -> None:
 
 def test_impossible_counts_are_refused() -> None:
     for counts in ((3, 2), (-1, 5)):
-        with pytest.raises(InvalidInput, match="want 0 <= successes <= trials"):
+        with pytest.raises(InvalidInput, match="expected 0 <= successes <= trials"):
             wilson(*counts)
     for refuse in (lambda: mcnemar(-1, 2), lambda: Pairs(both=-1)):
-        with pytest.raises(InvalidInput, match="no count below 0"):
+        with pytest.raises(InvalidInput, match="expected counts of 0 or more"):
             refuse()
 
 

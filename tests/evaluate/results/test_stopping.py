@@ -52,7 +52,7 @@ def test_looking_after_each_episode_costs_width(successes: int, trials: int) -> 
 def test_nothing_is_known_without_episodes() -> None:
     assert confidence_sequence(0, 0) == (0, 1)
     assert pooled([(0, 0)], 0.05) == (0, 1)
-    with pytest.raises(InvalidInput, match="want 0 <= successes <= trials"):
+    with pytest.raises(InvalidInput, match="expected 0 <= successes <= trials"):
         confidence_sequence(3, 2)
 
 
@@ -130,7 +130,7 @@ def test_where_a_case_stops_does_not_depend_on_the_order_in_which_episodes_arriv
 
 
 def test_a_rule_has_an_end() -> None:
-    with pytest.raises(ValidationError, match="neither target nor width"):
+    with pytest.raises(ValidationError, match="expected a target, a width or both, got neither"):
         StopConfig()
 
 

@@ -273,7 +273,7 @@ def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     [total] = summary.to_json()["totals"]
     assert total["success_once"]["rate"] is None
     assert total["success_once"]["confidence_sequence"] == [0.0, 1.0]
-    assert "have no rate in common" in printed(summary)
+    assert "have no common rate" in printed(summary)
     page = write_report(summary.results, tmp_path / "report.html").read_text()
     assert "50.0 to 100.0 %" in page  # from task to task, as the headline
     pooled = 100 * (first.stopped_at + 20) / (first.stopped_at + 40)

@@ -155,11 +155,11 @@ ROBOT = ["--robot", "robot_trials:Arm"]
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--operator", "terminal"], "got ['--operator'] without --robot"),
-        (["--unblind"], "got ['--unblind'] without --robot"),
+        (["--operator", "terminal"], "expected --robot with ['--operator'], got none"),
+        (["--unblind"], "expected --robot with ['--unblind'], got none"),
         ([*ROBOT, "--dry-run"], "--robot and ['--dry-run'] exclude each other"),
-        ([*ROBOT, "--operator", "owl"], "--operator: got 'owl', want page or terminal"),
-        ([*ROBOT, "--unblind"], "want the folder of an evaluation on a robot"),
+        ([*ROBOT, "--operator", "owl"], "--operator: expected 'page' or 'terminal', got 'owl'"),
+        ([*ROBOT, "--unblind"], "expected the folder of an evaluation on a robot"),
         ([*ROBOT, "--track", "wandb"], "['--track'] exclude each other"),
         (["simulation.yaml", *ROBOT], "robot.tasks"),
     ],

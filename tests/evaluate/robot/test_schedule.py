@@ -153,7 +153,7 @@ def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> 
     pushed = [
         {"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}
     ]
-    with pytest.raises(ConfigError, match="want checkpoints"):
+    with pytest.raises(ConfigError, match="expected none with a robot"):
         require_trials(plan(tmp_path, policies=pushed))
 
 

@@ -183,7 +183,8 @@ def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) 
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
     with pytest.raises(
-        UnknownCheckpoint, match=r"got 'fold', want one of \['pour', 'stack'\], or none"
+        UnknownCheckpoint,
+        match=r"expected one of \['pour', 'stack'\], or none for the base, got 'fold'",
     ):
         begun(policy, 0, adapter="fold")
 
@@ -191,7 +192,7 @@ def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) 
 @pytest.mark.parametrize("setting", [{"compile": True}, {"quantization": "int8"}])
 def test_what_needs_one_set_of_weights_is_refused(tmp_path: Path, setting: dict[str, Any]) -> None:
     with pytest.raises(
-        ConfigError, match=f"adapters and {next(iter(setting))}: got both, want one"
+        ConfigError, match=f"adapters and {next(iter(setting))}: expected one of the two, got both"
     ):
         Small.from_config({"checkpoint": "any", "adapters": {"stack": "any"}, **setting})
 
@@ -206,14 +207,14 @@ def test_a_family_without_adapters_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        ({"peft_type": "LOHA"}, "got peft_type 'LOHA', want 'LORA'"),
-        ({"use_dora": True}, "got {'use_dora': True}, want a plain LoRA"),
+        ({"peft_type": "LOHA"}, "peft_type: expected 'LORA', got 'LOHA'"),
+        ({"use_dora": True}, "expected a plain LoRA of linear layers, got {'use_dora': True}"),
         ({"modules_to_save": ["head"]}, "got {'modules_to_save'"),
         ({"bias": "all"}, "got {'bias': 'all'}"),
         ({"alpha_pattern": {"see": 3}}, "alpha_pattern"),
         ({"a_setting_of_later_versions": 1}, "a_setting_of_later_versions"),
         ({"init_lora_weights": "pissa_niter_4"}, "init_lora_weights"),
-        ({"lora_alpha": None}, "got lora_alpha None, want a number"),
+        ({"lora_alpha": None}, "lora_alpha: expected a number, got None"),
         ({"base_model_name_or_path": "other/base"}, None),
     ],
 )
@@ -263,26 +264,28 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
     [
         (
             "unknown",
-            (
-                r"1 of its 5 layers are not in the network: \['eye'\]; want an adapter that was "
-                r"trained on"
-            ),
+            (r"got 1 of 5 that it does not have: \['eye'\]; use an adapter that was trained on"),
         ),
-        ("half", r"got \['base_model.model.head.1.lora_B.weight'\], want pairs"),
-        ("shape", r"see: got A \(2, 5\) and B \(8, 2\), want them for weights \(8, 4\)"),
-        ("nan", "see: got NaN or infinite values"),
-        ("whole numbers", "see: got A int8 and B float32, want real numbers"),
-        ("no linear", "got adapters of {'head.1': 'Tanh'}, want those of linear layers and"),
-        ("attention", "got adapters of {'attention.out_proj': 'NonDynamicallyQuantizableLinear'}"),
+        ("half", r"expected pairs .*, got \['base_model.model.head.1.lora_B.weight'\]"),
+        (
+            "shape",
+            r"see: expected A and B for weights of shape \(8, 4\), got A \(2, 5\) and B \(8, 2\)",
+        ),
+        ("nan", "see: expected values that are finite as .*, got NaN or infinity"),
+        ("whole numbers", "see: expected real numbers, got A int8 and B float32"),
+        (
+            "no linear",
+            "expected adapters of linear layers and plain convolutions, got {'head.1': 'Tanh'}",
+        ),
+        ("attention", "got {'attention.out_proj': 'NonDynamicallyQuantizableLinear'}"),
         (
             "changed",
             (
-                r"got \['base_model.model.see.base_layer.weight'\], want pairs .* and no changes "
-                r"of "
-                r"the base"
+                r"expected pairs .* and no changes of the base, got "
+                r"\['base_model.model.see.base_layer.weight'\]"
             ),
         ),
-        ("whole", r"got \['base_model.model.see.weight'\], want pairs"),
+        ("whole", r"expected pairs .*, got \['base_model.model.see.weight'\]"),
     ],
 )
 def test_an_adapter_that_does_not_fit_is_refused(tmp_path: Path, what: str, says: str) -> None:
@@ -324,7 +327,10 @@ def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(
         ConfigError,
-        match=r"adapter 'stack': .*was trained on '.*other', want an adapter of '.*base'",
+        match=(
+            r"adapter 'stack': .*expected an adapter of '.*base', the policy's checkpoint, got "
+            r"one trained on '.*other'"
+        ),
     ):
         loaded(tmp_path, adapters=paths(tmp_path, "stack"))
     (other / "weights.bin").write_bytes(b"base")  # a copy of the base
@@ -340,7 +346,7 @@ def test_a_file_of_the_folder_is_not_the_adapter(tmp_path: Path) -> None:
     folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
     with pytest.raises(
         ConfigError,
-        match=r"adapter 'stack': .*got a file, want the folder with adapter_config.json",
+        match=r"adapter 'stack': .*expected the folder with adapter_config.json.*, got a file",
     ):
         loaded(tmp_path, adapters={"stack": str(folder / "adapter_model.safetensors")})
 
@@ -384,5 +390,7 @@ def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
     down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")
     np.testing.assert_allclose(change.detach().numpy(), (up @ down).T, atol=4e-3)
     huge = save(tmp_path / "huge", values, lora_alpha=2e6)
-    with pytest.raises(ConfigError, match=r"got NaN or infinite values as torch\.float16"):
+    with pytest.raises(
+        ConfigError, match=r"expected values that are finite as torch\.float16, got NaN or infinity"
+    ):
         read_adapter(huge, small)

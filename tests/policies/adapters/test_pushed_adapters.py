@@ -180,15 +180,15 @@ def test_sessions_of_two_versions_keep_theirs_until_their_reset(
     [
         (
             {"stack/base_model.model.head.1.lora_A.weight": np.ones((4, 8), np.float32)},
-            "unknown, want one of",
+            "expected one of the policy's",
         ),
         (
             {"see.weight": np.ones((8, 4), np.float32)},
-            "'see.weight': unknown, want one of the policy's 16 names",
+            "'see.weight': expected one of the policy's 16 names",
         ),
-        ({A: np.ones((8, DIM), np.float32)}, rf"'{A}': got shape \(8, 4\), want \(4, 4\)"),
-        ({A: np.full((4, DIM), np.nan, np.float32)}, "got NaN or infinite values"),
-        ({A: np.ones((4, DIM), np.int64)}, "got int64, want float32"),
+        ({A: np.ones((8, DIM), np.float32)}, rf"'{A}': expected shape \(4, 4\), got \(8, 4\)"),
+        ({A: np.full((4, DIM), np.nan, np.float32)}, "expected finite values, got NaN or infinity"),
+        ({A: np.ones((4, DIM), np.int64)}, "expected float32, got int64"),
     ],
 )
 def test_values_that_do_not_fit_change_nothing(

@@ -269,14 +269,16 @@ def test_a_revision_that_is_not_there_is_named_with_those_that_are(
     hub = SimpleNamespace(snapshot_download=download, HfApi=lambda: api)
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     with pytest.raises(
-        ConfigError, match=r"org/name has no revision 'v2', want one of its commits.*are main, v1$"
+        ConfigError,
+        match=r"expected a commit, a branch or a tag of org/name, got 'v2'.*are main, v1$",
     ):
         find_checkpoint("org/name@v2")
     del hub.HfApi  # such as without a network
     with pytest.raises(ConfigError, match=r"no revision 'v2'.*not known here"):
         find_checkpoint("org/name@v2")
     with pytest.raises(
-        ConfigError, match=r"'org/name@': got no revision after the @, want a commit"
+        ConfigError,
+        match=r"'org/name@': expected a commit, a tag or a branch after the @, got nothing",
     ):
         find_checkpoint("org/name@")
 

@@ -646,7 +646,9 @@ def test_the_device_and_the_family_decide_unless_the_settings_do(
 
 def test_graphs_alone_are_for_gpus(cuda: FakeCuda) -> None:
     OnGpu.cuda = cuda
-    with pytest.raises(ConfigError, match="compile: graphs: got a model on 'cpu', want 'cuda'"):
+    with pytest.raises(
+        ConfigError, match="compile: graphs: expected a model on 'cuda', got one on 'cpu'"
+    ):
         OnCpu.from_config({"checkpoint": "none", "compile": "graphs"}).initialize()
 
 
@@ -654,5 +656,7 @@ def test_adapters_leave_nothing_to_compile_and_8_bits_do() -> None:
     assert ModelConfig(checkpoint="none", quantization="int8").compile_on("cuda") == "graphs"
     assert ModelConfig(checkpoint="none", adapters={"a": "b"}).compile_on("cuda") is False
     for mode in ("graphs", True, "require"):
-        with pytest.raises(ValueError, match="adapters and compile: got both"):
+        with pytest.raises(
+            ValueError, match="adapters and compile: expected one of the two, got both"
+        ):
             ModelConfig(checkpoint="none", adapters={"a": "b"}, compile=mode)

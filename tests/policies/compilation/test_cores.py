@@ -231,7 +231,7 @@ def test_a_program_with_other_results_is_not_used(
     assert policy.compilation.sizes == [1, 3]
     [said] = report.uncompiled
     assert said.startswith("2 rows: 'linear' by torch.compile: its results are off by ")
-    assert "want at most 0.001" in caplog.text
+    assert "expected results within 0.001 of" in caplog.text
     for one, other in zip(acted(made(), [0, 1]), acted(policy, [0, 1]), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
 

@@ -198,7 +198,7 @@ def test_a_camera_or_state_whose_name_is_none_is_refused(client: TestClient, nam
             "/v1/act", content=encode_requests([Request("act", obs)]), headers=headers
         )
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid_observation")
-        assert "want 1 to 128 printable characters" in answer.json()["detail"]
+        assert "expected names of 1 to 128 printable characters" in answer.json()["detail"]
 
 
 def test_an_identity_coding_is_none(client: TestClient) -> None:

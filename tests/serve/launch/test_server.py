@@ -209,13 +209,13 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
         return
     monkeypatch.setattr(ray, "cluster_resources", dict)
     with (
-        pytest.raises(ConfigError, match=f"need {wanted:g} GPUs, this machine has 0")
+        pytest.raises(ConfigError, match=f"at most 0 GPUs, which this machine has, got {wanted:g}")
         if own
         else nullcontext()
     ):
         server._require_gpus(deployment("noop", **said))
     where = "machine" if own else "cluster"
-    assert f"need {wanted:g} GPUs, this {where} has 0; want less" in str(
+    assert f"at most 0 GPUs, which this {where} has, got {wanted:g}" in str(
         server._missing_gpus(deployment("noop", **said))
     )
 
@@ -235,7 +235,7 @@ def test_more_gpus_than_this_machine_has_are_refused_before_a_ray_starts(
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(server.private, "gpus_here", lambda: float(gpus))
     wanted = deployment("noop", resources={"num_gpus": 1}, replicas=2)
-    said = None if gpus else "need 2 GPUs, this machine has 0; want less"
+    said = None if gpus else "at most 0 GPUs, which this machine has, got 2"
     with pytest.raises(NoRay if gpus else ConfigError, match=said), server.running_server(wanted):
         pass
 

@@ -144,14 +144,14 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"checkpoint": "fold"}, r"got 'fold', want one of \['late', 'pour', 'stack'\]"),
+        ({"checkpoint": "fold"}, r"expected one of \['late', 'pour', 'stack'\].*, got 'fold'"),
         (
             {"checkpoint": "stack", "checkpoint_step": 3},
-            "got 3 with the adapter 'stack', which has none",
+            "expected none with the adapter 'stack', which has no steps, got 3",
         ),
         (
             {"checkpoint": "stack", "adapter": "pour"},
-            "got 'pour' and checkpoint 'stack', want one of them",
+            "expected one of them, got 'pour' and 'stack'",
         ),
     ],
 )
@@ -167,7 +167,7 @@ def test_what_is_not_offered_is_refused(
 )
 def test_an_adapter_stands_alone(settings: dict[str, Any]) -> None:
     with pytest.raises(
-        ValueError, match=r"stack: got .*, want \{adapter: FOLDER or org/name@COMMIT\} alone"
+        ValueError, match=r"stack: expected \{adapter: FOLDER or org/name@COMMIT\} alone, got .*"
     ) as error:
         CheckpointArgs(choices={"stack": settings})
     assert "choices" in str(wrong_settings(error.value, CheckpointArgs))
@@ -190,6 +190,7 @@ def test_adapters_of_the_settings_stay_beside_those_of_the_deployment() -> None:
     ):
         of({"checkpoint": "/runs/a", "adapters": {"stack": "/runs/other"}})
     with pytest.raises(
-        ConfigError, match=r"adapters: got \['stack'\], want a folder or hub id by the name"
+        ConfigError,
+        match=r"adapters: expected a folder or hub id by the name of each, got \['stack'\]",
     ):
         of({"checkpoint": "/runs/a", "adapters": ["stack"]})

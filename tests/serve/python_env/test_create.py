@@ -154,7 +154,7 @@ class TestThePythonThatRequirementsName:
         requirements.write_text("# python: 3.97\nsix==1.16.0\n")
         assert make_environment(requirements, tmp_path / "other", python=sys.executable).is_file()
         with pytest.raises(
-            ConfigError, match=r"found no Python 3\.97.*python3\.97 on PATH.*--python"
+            ConfigError, match=r"expected Python 3\.97, .*python3\.97 on PATH.*--python"
         ):
             make_environment(requirements, tmp_path / "third")
         assert not (tmp_path / "third").exists()
@@ -310,7 +310,10 @@ def test_it_imports_torchvision_and_lerobot_as_fits_the_machine(
 def test_missing_requirements_and_a_folder_of_something_else_are_refused(
     requirements: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=r"no such file: got '/no/such\.txt'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"expected a requirements file, got '/no/such\.txt', which does not exist",
+    ):
         make_environment(Path("/no/such.txt"), tmp_path / "env")
     with pytest.raises(ConfigError, match="holds no Python environment"):
         make_environment(requirements, tmp_path)

@@ -57,7 +57,7 @@ def test_an_interpreter_that_is_a_link_stays_one(
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
-        ({"process": "child"}, "got 'child' without `python`"),
+        ({"process": "child"}, "expected `python` with it, got 'child'"),
         ({"process": "thread", "python": "p"}, "'auto', 'replica' or 'child'"),
         ({"pythn": "p"}, "Extra inputs"),
     ],
@@ -101,14 +101,16 @@ def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(interpreter, "probe", lambda *_, other=other: other)
         assert with_process(args(python=sys.executable)).process == "child"
         with pytest.raises(
-            ConfigError, match=rf"got 'replica', which cannot run in .*{said}.*use process 'child'"
+            ConfigError,
+            match=rf"expected 'child' or 'auto', got 'replica', which cannot run in .*{said}",
         ):
             with_process(args(python=sys.executable, process="replica"))
 
 
 def test_no_such_interpreter(tmp_path: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"no such file, got '/no/such/python', want an interpreter; make one"
+        ConfigError,
+        match=r"expected an interpreter, got '/no/such/python', which does not exist; make one",
     ):
         probe("/no/such/python")
     for deployment in sorted((ROOT / "deployments").glob("*.yaml")):
@@ -138,7 +140,7 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
         (
             '#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n',
             0o755,
-            r"is Python 3.8.10, want 3.10 or newer",
+            r"expected Python 3.10 or newer, got .*, which is 3.8.10",
         ),
     ],
 )
@@ -156,7 +158,7 @@ def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_
 
 def test_an_environment_without_this_package_or_with_another_version_of_it(bare: str) -> None:
     with pytest.raises(
-        ConfigError, match=r"has no vlagents-ray, want .* as here; install it there"
+        ConfigError, match=r"expected .* as here, got no vlagents-ray in .*; install the same there"
     ):
         probe(bare)
     [packages] = Path(bare).parents[1].glob("lib/python*/site-packages")
@@ -164,7 +166,7 @@ def test_an_environment_without_this_package_or_with_another_version_of_it(bare:
     (packages / "vlagents_ray-0.0.9.dist-info" / "METADATA").write_text(
         "Name: vlagents-ray\nVersion: 0.0.9\n"
     )
-    with pytest.raises(ConfigError, match=r"has vlagents-ray 0.0.9, want"):
+    with pytest.raises(ConfigError, match=r"expected .*, got vlagents-ray 0.0.9"):
         probe(bare)
 
 

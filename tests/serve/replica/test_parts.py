@@ -223,10 +223,10 @@ def test_settings_of_a_part_are_checked_by_its_own_model(
 
 def test_a_class_that_is_no_part_and_an_unknown_name_are_errors() -> None:
     with pytest.raises(
-        ValidationError, match=r"NoPart has no Config; want a subclass of .*ReplicaPart"
+        ValidationError, match=r"expected a subclass of .*ReplicaPart, .*, got .*NoPart without one"
     ):
         ServerArgs(policy="noop", parts={f"{HERE}:NoPart": {}})
-    with pytest.raises(ValidationError, match="'latency' is not registered"):
+    with pytest.raises(ValidationError, match="'latency', which is not registered"):
         ServerArgs(policy="noop", parts={"latency": {}})
 
 
@@ -336,7 +336,7 @@ def test_only_a_parts_own_route_is_a_page_without_a_key(
         assert parts.pages(app.routes) == {path}
     else:
         with pytest.raises(
-            ConfigError, match=f"expected pages that are routes of its own, got '{path}'"
+            ConfigError, match=f"expected pages that are routes of this part, got '{path}'"
         ):
             parts.pages(app.routes)
     parts.close()

@@ -89,7 +89,7 @@ def test_parameters_that_the_first_act_makes_can_be_pushed(
     served = Served(serving(Lazy()))
     options = PushOptions("keep", partial, allow_same=True)
     served.reset("a")
-    with pytest.raises(InvalidWeights, match="unknown, want one of the policy's 0 names"):
+    with pytest.raises(InvalidWeights, match="expected one of the policy's 0 names"):
         served.learn.stage(1, gains(1), options)
     served.act("a")
     served.learn.stage(2, gains(2), options)
@@ -143,7 +143,7 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(
     served.learn.commit(2, PushOptions(pin=True))
     served.reset("pinned", "robot")
     assert served.act("pinned") == (2, 2.0)
-    with pytest.raises(InvalidInput, match="weights: got 7, want 'follow'"):
+    with pytest.raises(InvalidInput, match=r"weights: expected 'follow' .*, got 7"):
         served.reset("pinned", weights=7)
 
 
@@ -185,14 +185,14 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
     assert served.act("a") == (0, 0.0)
     with pytest.raises(Overloaded, match="another push"):
         served.learn.stage(2, gains(2), PushOptions())
-    with pytest.raises(InvalidInput, match="mode: got 'now'"):
+    with pytest.raises(InvalidInput, match=r"mode: expected .*, got 'now'"):
         PushOptions("now")  # type: ignore[arg-type]
     served.learn.drop(1)
     served.push(1)
     served.learn.commit(1, PushOptions("keep"))  # as when its reply was lost
     with pytest.raises(
         Overloaded,
-        match="got version 1, want one above 1, the newest here: another push was faster",
+        match="expected a version above 1, the newest here, got 1, as another push was faster",
     ):
         served.learn.stage(1, gains(3), PushOptions())
 

@@ -168,7 +168,7 @@ class CodecChoice:
         elif self._compressed is None:
             if requested not in get_args(CodecName):
                 raise InvalidInput(
-                    f"codec: got {requested!r}, want one of {list(get_args(CodecName))}"
+                    f"codec: expected one of {list(get_args(CodecName))}, got {requested!r}"
                 )
             self.codec = ImageCodec(requested)
 

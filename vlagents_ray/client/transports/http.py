@@ -183,8 +183,8 @@ class HttpTransport:
             if len(content) > DEFAULT_LIMITS.body_bytes:
                 self.close()
                 raise MessageTooLarge(
-                    f"{self._url.geturl()}: got an answer of more than {DEFAULT_LIMITS.body_bytes} "
-                    "bytes, want that of a policy server"
+                    f"{self._url.geturl()}: expected the answer of a policy server, got more than "
+                    f"{DEFAULT_LIMITS.body_bytes} bytes; check the URL"
                 )
             return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:
@@ -241,7 +241,7 @@ def http_url(url: str) -> SplitResult:
     scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
     if scheme is None or not parts.hostname:
         raise ConfigError(
-            f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP"
+            f"url: expected http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP, got {url!r}"
         )
     return parts._replace(scheme=scheme)
 

@@ -145,7 +145,7 @@ def select_transport(
     is_in_cluster = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
         raise ConfigError(
-            f"transport: got {transport!r}, want one of {list(get_args(TransportName))}"
+            f"transport: expected one of {list(get_args(TransportName))}, got {transport!r}"
         )
     unsupported = ("http", "websocket") if is_in_cluster else ("handle", "plasma")
     if transport in unsupported:

@@ -210,7 +210,8 @@ def _require_same_user(connection: socket.socket) -> None:
     uid = peer_uid(connection)
     if uid != os.getuid():
         raise PermissionError(
-            f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own"
+            f"it belongs to the user with the number {uid}, not to {os.getuid()}, this process's "
+            "user"
         )
 
 

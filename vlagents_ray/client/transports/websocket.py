@@ -337,8 +337,8 @@ class WebSocketTransport:
         size = sum(map(len, pieces))
         if size > STREAM_BYTES:  # the server would just close the connection
             raise MessageTooLarge(
-                f"{self._url}: got {size} bytes, the limit of a WebSocket message is "
-                f"{STREAM_BYTES}; send JPEG, or use transport='http'"
+                f"{self._url}: expected at most {STREAM_BYTES} bytes in a WebSocket message, got "
+                f"{size}; send JPEG, or use transport='http'"
             )
 
         connection = self._stream(left_s(deadline))

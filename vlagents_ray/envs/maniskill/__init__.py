@@ -212,8 +212,8 @@ class ManiSkillBatch(BatchEnv):
         """
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
-                f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want "
-                "physx_cuda"
+                f"maniskill/{task}: expected num_envs 1 with {sim_backend}, got {num_envs}; use "
+                "physx_cuda for several environments"
             )
         self.num_envs = num_envs
         self.max_steps, self._task_limit = step_limits(f"maniskill/{task}", task, max_steps)

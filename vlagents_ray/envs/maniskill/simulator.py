@@ -80,8 +80,8 @@ def step_limits(env: str, task: str, max_steps: int | None) -> tuple[int, int | 
     registered = require("mani_skill.utils.registration").REGISTERED_ENVS
     if task not in registered:
         raise UnknownEnv(
-            f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of "
-            "its ids"
+            f"maniskill: expected a task of {sorted(INSTRUCTIONS)}, or another of ManiSkill's "
+            f"ids, got {task!r}"
         )
 
     task_limit: int | None = registered[task].max_episode_steps
@@ -405,7 +405,9 @@ class Simulator:
         )
         try:
             if not hasattr(self.env.agent, "robot"):  # The task has no robot, or several.
-                raise ConfigError(f"{self.name}: want a task with exactly one robot")
+                raise ConfigError(
+                    f"{self.name}: expected a task with exactly one robot; choose another"
+                )
             if "success" not in self.env.get_info():
                 raise ConfigError(
                     f"{self.name} does not say what success is: there is nothing to evaluate"

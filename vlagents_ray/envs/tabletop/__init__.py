@@ -130,7 +130,7 @@ class Tabletop(EvalEnv):
         if value >= low and (high is None or value <= high):
             return
         allowed = f"at least {low}" if high is None else f"{low} to {high} in {self._task!r}"
-        raise ConfigError(f"tabletop: {option} is {value}, want {allowed}")
+        raise ConfigError(f"tabletop: {option}: expected {allowed}, got {value}")
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -192,7 +192,8 @@ class Tabletop(EvalEnv):
         unknown = sorted(set(options or {}) - {"instruction"})
         if unknown:
             raise ConfigError(
-                f"tabletop: unknown reset options {unknown}, want none or 'instruction'"
+                f"tabletop: expected the reset option 'instruction' or none, got {unknown}; leave "
+                "these out"
             )
 
         rng = np.random.default_rng(seed % 2**64)  # Numpy accepts no negative seed.
@@ -248,7 +249,7 @@ class Tabletop(EvalEnv):
             possible |= {goal.instruction: goal for goal in goals(world, task)}
         if instruction not in possible:
             raise ConfigError(
-                f"tabletop: got instruction {instruction!r}, want one of this scene's: "
-                f"{list(possible)}"
+                f"tabletop: expected an instruction of this scene, one of {list(possible)}, got "
+                f"{instruction!r}"
             )
         return possible[str(instruction)]

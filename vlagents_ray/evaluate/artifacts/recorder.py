@@ -193,8 +193,8 @@ class TrajectoryRecorder(EpisodeObserver):
         state = {name: np.array(values, np.float32) for name, values in obs.state.items()}
         if self._states and _shapes(state) != _shapes(self._states[0]):
             raise EnvFailed(
-                f"env step: got the state {_shapes(state)}, want {_shapes(self._states[0])} as "
-                "after reset"
+                f"env step: expected the state {_shapes(self._states[0])} as after reset, got "
+                f"{_shapes(state)}"
             )
 
         if self._grippers and (obs.gripper is None) != (self._grippers[0] is None):

@@ -59,8 +59,8 @@ def require_below(path: str) -> str:
     parts = PurePosixPath(path).parts
     if not parts or path.startswith("/") or ".." in parts or "\0" in path:
         raise ConfigError(
-            f"got {path!r} as a file of an episode, want a path below the folder of results; "
-            f"no evaluation writes another: do not trust the author of this results.db"
+            f"expected files of episodes in the folder of results, got the path {path!r}, which "
+            "no evaluation writes; do not trust the author of this results.db"
         )
     return path
 
@@ -94,8 +94,8 @@ def require_there(path: Path) -> Path:
     """
     if not path.is_file():
         raise ConfigError(
-            f"{path}: got no file, want the one that results.db names there; copy the folder again "
-            f"from where it was evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
+            f"{path}: expected a file, as results.db names one there, got none; copy the folder "
+            f"again from where it was evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
         )
     return path
 

@@ -231,8 +231,8 @@ def run_episodes(
     """
     if not len(keys) == len(sessions) <= env.num_envs or not keys:
         raise ConfigError(
-            f"got {len(keys)} episodes and {len(sessions)} sessions for {env.num_envs} "
-            "environments; want one session an episode, and an environment for each"
+            f"expected one session for each episode, and at most {env.num_envs} episodes, as "
+            f"there are environments, got {len(keys)} episodes and {len(sessions)} sessions"
         )
 
     # Reset the environments.
@@ -354,7 +354,8 @@ class _Episode:
             # The contract of the environment may state no size.
             if self._width not in (None, rows.shape[1]):
                 raise InvalidAction(
-                    f"action: got {rows.shape}, want {self._width} numbers a row, as in the first"
+                    f"action: expected {self._width} numbers a row, as in the first action, got "
+                    f"shape {rows.shape}"
                 )
             self._width = rows.shape[1]
 
@@ -478,7 +479,8 @@ def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contr
                 answers = agent.act_batch(requests, [episode.session for episode in episodes])
             if len(answers) != len(episodes):
                 raise PolicyFailed(
-                    f"act_batch: got {len(episodes)} observations, returned {len(answers)} actions"
+                    f"act_batch: expected {len(episodes)} actions, one for each observation, got "
+                    f"{len(answers)}"
                 )
     except VLAgentsError as error:
         answers = [error] * len(episodes)

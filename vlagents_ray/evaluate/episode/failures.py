@@ -205,7 +205,8 @@ def checked_instruction(instruction: object, where: str) -> str:
     """Return `instruction`; raises `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
         raise errors.EnvFailed(
-            f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none"
+            f"env {where}: expected the instruction as a str (empty if the task has none), got "
+            f"{instruction!r}"
         )
     return instruction
 
@@ -232,7 +233,7 @@ def checked_step(
         if isinstance(info, Mapping):
             description = f"info with {sorted(map(str, info))}"
         raise errors.EnvFailed(
-            f"env step: got {description}, want 'success' among it; see EvalEnv.step"
+            f"env step: expected an info with 'success', got {description}; see EvalEnv.step"
         )
 
     return EnvStep(
@@ -258,12 +259,13 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
 
     if not isinstance(obs, Obs):
         raise error_class(
-            f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs"
+            f"env {where}: expected an Obs as the observation, got {type(obs).__name__}"
         )
     for name, value in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
         if not isinstance(value, (dict, Mapping)):  # testing for a dict first is faster
             raise error_class(
-                f"env {where}: got {type(value).__name__} as the observation's {name}, want a dict"
+                f"env {where}: expected a dict as the observation's {name}, got "
+                f"{type(value).__name__}"
             )
 
     try:
@@ -276,7 +278,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
         ) from error
     except TypeError as error:  # such as a gripper that is not a number
         raise error_class(
-            f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]"
+            f"env {where}: expected a gripper in [0, 1], got {obs.gripper!r}"
         ) from error
     return obs
 
@@ -289,7 +291,7 @@ def _number(reward: Any) -> float:
             return float(reward)
     except (TypeError, ValueError):
         pass
-    raise errors.EnvFailed(f"env step: got the reward {reward!r}, want a finite number")
+    raise errors.EnvFailed(f"env step: expected a finite number as the reward, got {reward!r}")
 
 
 def _truth(value: object, name: str) -> bool:
@@ -298,4 +300,4 @@ def _truth(value: object, name: str) -> bool:
         return value
     if isinstance(value, bool | np.bool_) or (isinstance(value, Real) and value in (0, 1)):
         return bool(value)
-    raise errors.EnvFailed(f"env step: got {value!r} as {name}, want a bool")
+    raise errors.EnvFailed(f"env step: expected {name} to be a bool, got {value!r}")

@@ -55,8 +55,8 @@ class ChunkExecutor:
         self._hz = self._clock.hz or env.control_hz or 0.0
         if self._real_time and not self._hz:
             raise ConfigError(
-                "clock: got no hz, and the env's contract states no control_hz; give clock.hz, in "
-                "1/s"
+                "clock: expected hz, or an env whose contract declares control_hz, got neither; "
+                "give clock.hz, in 1/s"
             )
 
         self._spec = env.action
@@ -110,9 +110,9 @@ class ChunkExecutor:
             return
         if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
-                f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are "
-                "executed before the next request, so that nothing is left to continue; give an "
-                "`execute` below that, and none in the policy"
+                "clock.real_time_chunking: expected chunks that are longer than `execute`, got "
+                f"{len(rows)} rows, all of which are executed before the next request, so that "
+                "none is left to continue; lower `execute`, and leave it out of the policy"
             )
 
         # The ticks between the observation and its answer.
@@ -160,7 +160,8 @@ class ChunkExecutor:
             still = np.asarray(configured, np.float32)
         if still.shape != (dim,):
             raise ConfigError(
-                f"clock.neutral: got {len(still)} numbers, the policy's actions have {dim}"
+                f"clock.neutral: expected {dim} numbers, as the policy's actions have, got "
+                f"{len(still)}"
             )
 
         if self._last is None:

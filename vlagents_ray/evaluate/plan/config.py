@@ -118,8 +118,8 @@ class PolicyConfig(_PlanModel):
     def _consistent(self) -> Self:
         if self.steps and self.pushed_weights is not None:
             raise ValueError(
-                "got steps and pushed_weights, want one of them: each names checkpoints in the "
-                "results"
+                "expected steps or pushed_weights, got both; leave one out, as each names "
+                "checkpoints in the results"
             )
 
         reserved = {"seed", "env", "contract"}
@@ -185,7 +185,8 @@ class StopConfig(_PlanModel):
     def _some_end(self) -> Self:
         if self.target is None and self.width is None:
             raise ValueError(
-                "got neither target nor width, want one or both: the first that is reached ends it"
+                "expected a target, a width or both, got neither; give at least one, as the "
+                "first that is reached ends the task"
             )
         return self
 
@@ -218,14 +219,14 @@ class SuiteConfig(_PlanModel):
     def _consistent(self) -> Self:
         if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
             raise ValueError(
-                f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that "
-                "of the whole batch; want 1, or a latency in seconds"
+                "num_envs: expected 1 with a measured clock.latency, which would be that of the "
+                f"whole batch, got {self.num_envs}; set 1, or give the latency in seconds"
             )
         for low, high in itertools.pairwise(sorted(self.seeds)):
             if high - low < self.episodes:
                 raise ValueError(
-                    f"seeds: {low} and {high} with {self.episodes} episodes each would play some "
-                    f"twice; want them {self.episodes} or more apart"
+                    f"seeds: expected seeds at least {self.episodes} apart, as each runs "
+                    f"{self.episodes} episodes, got {low} and {high}, which would run some twice"
                 )
         return self
 

@@ -37,7 +37,8 @@ def combined(folders: Sequence[Results]) -> Results:
     """
     if not folders:
         raise ConfigError(
-            "report: got no folder, want one or more that evaluations wrote their results to"
+            "report: expected one folder or more that evaluations wrote, got none; name at least "
+            "one"
         )
     if len(folders) == 1:
         return folders[0]

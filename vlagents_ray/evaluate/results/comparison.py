@@ -118,7 +118,7 @@ def compare(
     if timing is not None:
         timings = by_timing(results.cases)
         if timing not in timings:
-            raise ConfigError(f"compare: got the timing {timing!r}, want one of {list(timings)}")
+            raise ConfigError(f"compare: expected a timing of {list(timings)}, got {timing!r}")
         results = results.among(timings[timing])
 
     return comparisons(results, [(a, b)], accept_changes=accept_changes)[0]
@@ -271,8 +271,8 @@ def _shared(
     timings = by_timing(compared)
     if len(timings) > 1:
         raise ConfigError(
-            f"compare: {a!r} and {b!r} share episodes of several clocks, which have no rate in "
-            f"common; want one of them, timing={' or '.join(map(repr, timings))}"
+            "compare: expected one clock, as episodes of several clocks have no common rate, got "
+            f"{a!r} and {b!r} with several; choose one: timing={' or '.join(map(repr, timings))}"
         )
     if not suites:
         raise ConfigError(

@@ -153,8 +153,8 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
     ):
         if kind not in statements or not str(sql).startswith(statements[kind]):
             raise ConfigError(
-                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not "
-                "trust its author"
+                f"{out / FILE}: expected only the tables of an evaluation, got {name!r}, a {kind} "
+                "that no evaluation makes; do not trust its author"
             )
 
     if not db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
@@ -166,8 +166,8 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
         raise ConfigError(
-            f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another "
-            "folder"
+            f"{out / FILE}: expected version {VERSION} of the results, got {version}; choose "
+            "another folder"
         )
 
     for table, known in _known_columns().items():
@@ -179,8 +179,8 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
         if unknown:
             difference = f"the unknown columns {sorted(unknown)}"
         raise ConfigError(
-            f"{out / FILE}: got {difference} in its table {table!r}, want those of this version of "
-            "vlagents-ray; read it with the version that wrote it"
+            f"{out / FILE}: expected the table {table!r} of this version of vlagents-ray, got "
+            f"{difference}; read it with the version that wrote it"
         )
 
 

@@ -279,7 +279,8 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
     """Read one consistent state of all tables in `out`, even while an evaluation writes."""
     if not (out / FILE).is_file():
         raise ConfigError(
-            f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to"
+            f"{out}: expected a folder that an evaluation wrote, with {FILE} in it, got one "
+            "without; check the path"
         )
     try:
         with closing(read_only(out)) as db:

@@ -48,7 +48,8 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     """
     if not 0 <= successes <= trials:
         raise InvalidInput(
-            f"wilson: got {successes} successes in {trials} trials, want 0 <= successes <= trials"
+            f"wilson: expected 0 <= successes <= trials, got {successes} successes in {trials} "
+            "trials"
         )
     if trials == 0:
         return 0.0, 1.0
@@ -126,7 +127,7 @@ class Pairs:
 
     def __post_init__(self) -> None:
         if min(self.both, self.only_a, self.only_b, self.neither) < 0:
-            raise InvalidInput(f"pairs: got {self}, want no count below 0")
+            raise InvalidInput(f"pairs: expected counts of 0 or more, got {self}")
 
     def __add__(self, other: Pairs) -> Pairs:
         return Pairs(
@@ -191,7 +192,9 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
         InvalidInput: A number is negative.
     """
     if min(only_a, only_b) < 0:
-        raise InvalidInput(f"mcnemar: got {only_a} and {only_b} episodes, want no count below 0")
+        raise InvalidInput(
+            f"mcnemar: expected counts of 0 or more, got {only_a} and {only_b} episodes"
+        )
 
     n = only_a + only_b
     # The numbers of ways to choose k of n, and up to k of n: integers, which are exact for any
@@ -303,8 +306,8 @@ def confidence_sequence(
     """
     if not 0 <= successes <= trials:
         raise InvalidInput(
-            f"confidence_sequence: got {successes} successes in {trials} trials, want 0 <= "
-            "successes <= trials"
+            f"confidence_sequence: expected 0 <= successes <= trials, got {successes} successes "
+            f"in {trials} trials"
         )
 
     failures = trials - successes

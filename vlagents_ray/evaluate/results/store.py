@@ -485,9 +485,9 @@ def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
     acted = (first, last, result.policy_fingerprint)
     if acted != (pushed.version, pushed.version, pushed.fingerprint):
         raise WeightsLost(
-            f"policy: {result.key} was played by versions {first} to {last} of the weights "
-            f"({result.policy_fingerprint}), want {pushed.version} ({pushed.fingerprint}); push "
-            "nothing while a version is evaluated, and let the policy's `options` ask for no other"
+            f"policy: expected version {pushed.version} of the weights ({pushed.fingerprint}) in "
+            f"{result.key}, got {first} to {last} ({result.policy_fingerprint}); push nothing "
+            "while a version is evaluated, and let the policy's `options` choose no other"
         )
 
 

@@ -103,7 +103,9 @@ class Verdict:
                 rubric; or a repetition has no reason.
         """
         if self.outcome == "repeat" and not self.note.strip():
-            raise ConfigError("verdict: got a repetition without a reason, want one in words")
+            raise ConfigError(
+                "verdict: expected a reason in words for a repetition, got none; give one"
+            )
         if self.outcome != "partial":
             return float(self.outcome == "success")
 
@@ -111,8 +113,8 @@ class Verdict:
         if not rubric or unknown_parts:
             actual = f"the parts {unknown_parts}" if rubric else "a partial success"
             raise ConfigError(
-                f"verdict: got {actual}, want some of the rubric's {sorted(rubric)}; see "
-                "`robot.tasks`"
+                f"verdict: expected some of the rubric's marks {sorted(rubric)}, got {actual}; "
+                "see `robot.tasks`"
             )
         points = sum(rubric[name] for name in set(self.earned))
         return points / sum(rubric.values())
@@ -454,13 +456,13 @@ class PageOperator(Operator):
     async def _take(self, http: Request) -> Response:
         """Accept an answer, unless it is for another trial or question than the present one."""
         if not http.headers.get("content-type", "").startswith("application/json"):
-            return PlainTextResponse("want application/json", 415)
+            return PlainTextResponse("expected application/json", 415)
 
         body = b""
         async for data in http.stream():
             body += data
             if len(body) > _BODY:
-                return PlainTextResponse(f"want at most {_BODY} bytes", 413)
+                return PlainTextResponse(f"expected at most {_BODY} bytes", 413)
 
         try:
             answer = json.loads(body)
@@ -469,7 +471,7 @@ class PageOperator(Operator):
             question = answer["phase"], answer["trial"], answer["attempt"]
             verdict = _verdict(answer) if answer["phase"] == "verdict" else None
         except (ValueError, TypeError, KeyError, RecursionError):
-            return PlainTextResponse("want phase, trial, attempt, do, earned, note", 400)
+            return PlainTextResponse("expected phase, trial, attempt, do, earned and note", 400)
 
         with self._changed:
             trial = self._trial
@@ -482,7 +484,7 @@ class PageOperator(Operator):
 
             choices = _CHOICES.get(self._phase, set())
             if answer["do"] not in choices:
-                return PlainTextResponse(f"do: want one of {sorted(choices)}", 400)
+                return PlainTextResponse(f"do: expected one of {sorted(choices)}", 400)
             try:
                 if verdict is not None:
                     verdict.score(trial.rubric)

@@ -256,11 +256,13 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
         return EvalConfig.model_validate(plan["config"])
     except FileNotFoundError as error:
         raise ConfigError(
-            f"{error.filename}: is missing; want the folder of an evaluation on a robot"
+            f"expected the folder of an evaluation on a robot, got one without {error.filename}; "
+            "check the path"
         ) from error
     except (KeyError, ValueError) as error:
         raise ConfigError(
-            f"{out / LOG}: cannot be read with this key; want the `robot.key` of its plan"
+            f"{out / LOG}: expected a log that this key opens, got another's; use the `robot.key` "
+            "of its plan"
         ) from error
 
 
@@ -407,14 +409,15 @@ def require_trials(config: EvalConfig) -> None:
     """Raise `ConfigError` if a configuration has no robot, or settings without meaning on one."""
     if config.real_robot is None:
         raise ConfigError(
-            "robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one "
-            "(--robot)"
+            "robot: expected `robot: {tasks: …}` in the plan and the robot's class (--robot), "
+            "got no robot; give both"
         )
     if any(policy.pushed_weights is not None for policy in config.policies):
-        raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
+        raise ConfigError("pushed_weights: expected none with a robot, got some; leave them out")
     if config.track:
         raise ConfigError(
-            f"track: got {config.track} with a robot, want none: rates tell policies before the end"
+            f"track: expected none with a robot, got {config.track}; leave it out, as rates would "
+            "unblind the policies before the end"
         )
 
 

@@ -274,8 +274,8 @@ class Rollout:
         sessions = getattr(agent, "sessions", None)
         if sessions is None:
             raise ConfigError(
-                "num_envs: got more than 1 for a policy in the worker's own process; give it a "
-                "`url`"
+                "num_envs: expected 1 for a policy in the worker's own process, got more; give "
+                "it a `url`"
             )
         if number > len(self._sessions):
             self._sessions += sessions(number - len(self._sessions))
@@ -389,8 +389,8 @@ def agents(
     for policy in plan.policies:
         if policy.url is None and policy.name not in factories:
             raise ConfigError(
-                f"policy {policy.name!r}: got no url, want that of its server, as "
-                "http://localhost:8000"
+                f"policy {policy.name!r}: expected the `url` of its server, as "
+                "http://localhost:8000, got none; add it"
             )
     return functools.partial(_agent, plan.limits, factories, priority)
 

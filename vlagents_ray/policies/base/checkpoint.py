@@ -122,14 +122,14 @@ def find_adapter(
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
         raise ConfigError(
-            f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it"
+            f"{folder}: expected the folder with {', '.join(FILES)}, as PEFT saves it, got a file"
         )
 
     trained_on = base_of(folder)
     if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
         raise ConfigError(
-            f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the "
-            "policy's checkpoint; if these are the same weights, name it so as "
+            f"{folder}: expected an adapter of {checkpoint!r}, the policy's checkpoint, got one "
+            f"trained on {trained_on!r}; if these are the same weights, write that name as "
             "base_model_name_or_path in its adapter_config.json"
         )
 
@@ -185,7 +185,8 @@ def _from_hub(name: str) -> Path:
     repository, at, commit = name.partition("@")
     if at and not commit:
         raise ConfigError(
-            f"checkpoint {name!r}: got no revision after the @, want a commit, a tag or a branch"
+            f"checkpoint {name!r}: expected a commit, a tag or a branch after the @, got nothing; "
+            "name one"
         )
 
     try:
@@ -193,8 +194,8 @@ def _from_hub(name: str) -> Path:
     except Exception as error:  # of many classes: no such id, no access, no network, offline mode
         if type(error).__name__ == "RevisionNotFoundError":
             raise ConfigError(
-                f"checkpoint {name!r}: {repository} has no revision {commit!r}, want one of its "
-                f"commits, or of its branches and tags, which are {_revisions(hub, repository)}"
+                f"checkpoint {name!r}: expected a commit, a branch or a tag of {repository}, got "
+                f"{commit!r}; its branches and tags are {_revisions(hub, repository)}"
             ) from error
         raise ConfigError(
             f"checkpoint {name!r}: neither a path here nor to be had from the hub "
@@ -251,8 +252,8 @@ def _safetensors(folder: Path) -> list[Path]:
     files = sorted(folder.glob("*.safetensors"))
     if len(files) != 1:
         raise ConfigError(
-            f"checkpoint {folder}: got {[file.name for file in files]}, want one .safetensors file "
-            "or an index"
+            f"checkpoint {folder}: expected one .safetensors file or an index, got "
+            f"{[file.name for file in files]}"
         )
     return files
 

@@ -123,8 +123,8 @@ class ModelConfig(BaseModel, extra="forbid"):
     def _chunks_of_an_ensemble_overlap(self) -> Self:
         if self.actions == "ensemble" and self.execute == 1:
             raise ValueError(
-                "execute: got 1 with actions 'ensemble', which leaves nothing to average; leave it "
-                "out"
+                "execute: expected 2 or more with actions 'ensemble', got 1, which leaves "
+                "nothing to average; leave it out"
             )
         return self
 
@@ -139,8 +139,8 @@ class ModelConfig(BaseModel, extra="forbid"):
         for name, value in is_set.items():
             if value:
                 raise ValueError(
-                    f"adapters and {name}: got both, want one of them; merge an adapter into its "
-                    f"base to have {name} for it"
+                    f"adapters and {name}: expected one of the two, got both; merge an adapter "
+                    f"into its base to use {name} with it"
                 )
         return self
 
@@ -149,7 +149,7 @@ class ModelConfig(BaseModel, extra="forbid"):
     def _ascending(cls, sizes: list[int] | None) -> list[int] | None:
         if sizes is not None and (not sizes or sizes[0] < 1 or sizes != sorted(set(sizes))):
             raise ValueError(
-                f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]"
+                f"expected ascending positive numbers, such as [1, 2, 4, 8, 16], got {sizes}"
             )
         return sizes
 

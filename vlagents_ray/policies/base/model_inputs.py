@@ -97,8 +97,8 @@ def choose_cameras(
     if set(mapping) != set(known):
         example = ", ".join(f"{name}: …" for name in known)
         raise ConfigError(
-            f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, "
-            f"each with the name of one of yours, as in cameras: {{{example}}}"
+            f"cameras: expected a mapping of the checkpoint's cameras {sorted(known)}, got "
+            f"{sorted(mapping)}; give each the name of one of yours, as in cameras: {{{example}}}"
         )
     return {name: mapping[name] for name in known}
 
@@ -131,7 +131,8 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
         if name in (GRIPPER, CLOSED):
             if obs.gripper is None:
                 raise InvalidObservation(
-                    "gripper: got none, want a number in [0, 1] where 1 = open"
+                    "gripper: expected a number in [0, 1] where 1 = open, got None; set it in "
+                    "the observation"
                 )
             gripper = obs.gripper if name == GRIPPER else 1.0 - obs.gripper
             values.append(np.array([gripper], np.float32))
@@ -143,8 +144,9 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     vector = np.concatenate(values) if values else np.zeros(0, np.float32)
     if dim is not None and vector.shape != (dim,):
         raise InvalidObservation(
-            f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint "
-            "was trained; set the policy's `state` to the parts that it was trained with"
+            f"state: expected {dim} numbers, as the checkpoint was trained with, got "
+            f"{len(vector)} from {list(parts)}; set the policy's `state` to the parts that it was "
+            "trained with"
         )
     return vector
 
@@ -175,13 +177,13 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
     samples = count_in(obs, SAMPLES)
     if samples > config.max_samples:
         raise InvalidObservation(
-            f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, "
-            "or set the policy's `max_samples`"
+            f"info[{SAMPLES!r}]: expected a number of at most {config.max_samples}, got "
+            f"{samples}; request fewer, or raise the policy's `max_samples`"
         )
     if samples and config.actions != "chunk":
         raise InvalidObservation(
-            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples "
-            "are of whole chunks, so set the policy's `actions` to 'chunk'"
+            f"info[{SAMPLES!r}]: expected none with actions: {config.actions}, got {samples}; set "
+            "the policy's `actions` to 'chunk', as samples are whole chunks"
         )
     return samples
 
@@ -192,8 +194,8 @@ def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
         return ()
     if obs.info.get(LEFTOVER) is not None:
         raise InvalidObservation(
-            f"info[{WANT!r}]: got it with {LEFTOVER!r}, want one of them; a chunk that continues a "
-            "plan is not drawn from the policy's distribution"
+            f"info[{WANT!r}]: expected no {LEFTOVER!r} with it, got both; leave one out, as a "
+            "chunk that continues a plan is not drawn from the policy's distribution"
         )
     return tuple(obs.info[WANT])
 
@@ -209,7 +211,7 @@ def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
     if plan.ndim != 2 or dim not in (None, plan.shape[1]) or not np.isfinite(plan).all():
         content = leftover.shape if isinstance(leftover, np.ndarray) else type(leftover).__name__
         raise InvalidObservation(
-            f"info[{LEFTOVER!r}]: got {content}, want (H, {dim or 'D'}) finite float32"
+            f"info[{LEFTOVER!r}]: expected (H, {dim or 'D'}) finite float32, got {content}"
         )
     return plan
 
@@ -222,7 +224,7 @@ def count_in(obs: Obs, name: str) -> int:
     """
     value = obs.info.get(name) or 0
     if not isinstance(value, int | np.integer) or value < 0:
-        raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")
+        raise InvalidObservation(f"info[{name!r}]: expected an int of 0 or more, got {value!r}")
     return int(value)
 
 

@@ -282,7 +282,7 @@ class ModelPolicy(Agent, abc.ABC):
             )
         elif mode == "graphs" and kind != "cuda":
             raise ConfigError(
-                f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out"
+                f"compile: graphs: expected a model on 'cuda', got one on {kind!r}; leave it out"
             )
         self.compilation.mode = mode
         self.config = self.config.model_copy(update={"compile": mode})
@@ -297,7 +297,8 @@ class ModelPolicy(Agent, abc.ABC):
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation(
-                "instruction: got none, want what the robot is to do, in words"
+                "instruction: expected the robot's task in words, got an empty text; give one at "
+                "the reset"
             )
         adapter = self.adapters.find(kwargs.get(ADAPTER))
         self._begin(instruction or "", int(kwargs.get("seed") or 0), adapter.fingerprint)
@@ -591,7 +592,8 @@ class ModelPolicy(Agent, abc.ABC):
             took = time.perf_counter() - began
             if len(results) != len(padded_rows):
                 raise PolicyFailed(
-                    f"predict: got {len(padded_rows)} rows, returned {len(results)} chunks"
+                    f"predict: expected {len(padded_rows)} chunks, one for each row, got "
+                    f"{len(results)}"
                 )
 
             shortest = self.report.pass_s

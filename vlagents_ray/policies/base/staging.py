@@ -92,7 +92,7 @@ class Staging:
         for row in rows:
             if row.layout != layout:
                 raise ValueError(
-                    f"stack: got rows of {layout} and {row.layout}, want the same arrays in each"
+                    f"stack: expected the same arrays in each row, got {layout} and {row.layout}"
                 )
             # Its copy was freed after an earlier batch, or another replica has prepared it.
             if row.block is None:

@@ -71,7 +71,7 @@ def sim_vector(
     if not isinstance(state, np.ndarray) or state.shape != (size,):
         content = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
         raise InvalidObservation(
-            f"info['sim_state']: got {content}, want ({size},), as the env {env_name} gives it; "
-            f"{cure}"
+            f"info['sim_state']: expected shape ({size},), as the env {env_name} returns it, got "
+            f"{content}; {cure}"
         )
     return state

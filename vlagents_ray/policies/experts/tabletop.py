@@ -77,7 +77,10 @@ class TabletopExpert:
         if "xyzrpy" not in obs.state:
             raise MissingState("xyzrpy", have=obs.state)
         if obs.gripper is None:
-            raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+            raise InvalidObservation(
+                "gripper: expected a number in [0, 1] where 1 = open, got None; set it in the "
+                "observation"
+            )
 
         position, opening = obs.state["xyzrpy"][:3].astype(np.float64), obs.gripper
         done = False
@@ -158,9 +161,9 @@ def _parse(instruction: str) -> tuple[str, str, str]:
         if match and all(colour in _HUES for colour in match.groups()):
             return task, match[1], match[match.re.groups]
     raise InvalidObservation(
-        f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the "
-        f"blue pad', 'slide ... onto ...', 'stack ...' or 'lift ...', with colours of "
-        f"{sorted(_HUES)}"
+        "tabletop expert: expected an instruction like 'put the red puck on the blue pad', "
+        f"'slide ... onto ...', 'stack ...' or 'lift ...', with colours of {sorted(_HUES)}, got "
+        f"{instruction!r}"
     )
 
 

@@ -72,11 +72,12 @@ class Checkpoint(BaseModel, extra="forbid", frozen=True):
         unknown = [word for word in words if word not in self.words]
         if unknown:
             raise InvalidObservation(
-                f"instruction: got {unknown[0]!r} in {instruction!r}, want words of {self.words}"
+                f"instruction: expected words of {self.words}, got {unknown[0]!r} in "
+                f"{instruction!r}"
             )
         if not 0 < len(words) <= self.sizes.longest:
             raise InvalidObservation(
-                f"instruction: got {len(words)} words, want 1 to {self.sizes.longest}"
+                f"instruction: expected 1 to {self.sizes.longest}, got {len(words)} words"
             )
 
         tokens = np.zeros(self.sizes.longest, np.int64)

@@ -125,7 +125,8 @@ class Reference(ModelPolicy):
             [name] = embodiments
         if name is None or name not in embodiments:
             raise ConfigError(
-                f"embodiment: got {name!r}, want one of {sorted(embodiments)}, those of {folder}"
+                f"embodiment: expected one of {sorted(embodiments)}, which {folder} has, got "
+                f"{name!r}"
             )
         robot = embodiments[name]
 

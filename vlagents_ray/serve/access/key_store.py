@@ -56,15 +56,16 @@ class Key:
         """Raise `ConfigError` if a field is invalid."""
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
             raise ConfigError(
-                f"key name: got {self.name!r}, want 1 to 64 letters, digits, '.', '_' or '-'"
+                f"key name: expected 1 to 64 letters, digits, '.', '_' or '-', got {self.name!r}"
             )
         if not isinstance(self.sha256, str) or not _SHA256.fullmatch(self.sha256):
             raise ConfigError(
-                f"key {self.name!r}: sha256: want 64 hexadecimal digits, as `keys new` makes them"
+                f"key {self.name!r}: sha256: expected 64 hexadecimal digits, got others; make the "
+                "key with `keys new`"
             )
         if not all(isinstance(app, str) for app in self.apps):
             raise ConfigError(
-                f"key {self.name!r}: apps: got {self.apps!r}, want names of applications"
+                f"key {self.name!r}: apps: expected names of applications, got {self.apps!r}"
             )
 
         self._require_positive("rate", int, float)
@@ -74,18 +75,18 @@ class Key:
         if self.priority is not None and self.priority not in PRIORITIES:
             meant = did_you_mean(str(self.priority), PRIORITIES)
             raise ConfigError(
-                f"key {self.name!r}: priority: got {self.priority!r}, want one of "
-                f"{list(PRIORITIES)}{meant}"
+                f"key {self.name!r}: priority: expected one of {list(PRIORITIES)}, got "
+                f"{self.priority!r}{meant}"
             )
         unknown = sorted(map(str, set(self.scopes) - set(SCOPES)))
         if unknown:
             meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)
             raise ConfigError(
-                f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}{meant}"
+                f"key {self.name!r}: scopes: expected some of {list(SCOPES)}, got {unknown}{meant}"
             )
         if not isinstance(self.revoked, bool):
             raise ConfigError(
-                f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false"
+                f"key {self.name!r}: revoked: expected true or false, got {self.revoked!r}"
             )
 
     def _require_positive(self, field: str, *types: type) -> None:
@@ -95,7 +96,9 @@ class Key:
             return
         is_number = isinstance(value, types) and not isinstance(value, bool)
         if not is_number or not 0 < value < 1e12:
-            raise ConfigError(f"key {self.name!r}: {field}: got {value!r}, want a positive number")
+            raise ConfigError(
+                f"key {self.name!r}: {field}: expected a positive number, got {value!r}"
+            )
 
 
 def parse_keys(text: str, where: str = "keys") -> list[Key]:
@@ -112,7 +115,7 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
             f"writes it ({error})"
         ) from error
     if not isinstance(entries, list):
-        raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
+        raise ConfigError(f"keys: expected a list, got {type(entries).__name__}")
 
     keys = [_parse(entry) for entry in entries]
     names = [key.name for key in keys]
@@ -127,7 +130,7 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
 def _parse(entry: Any) -> Key:
     if not isinstance(entry, dict) or not {"name", "sha256"} <= entry.keys():
         raise ConfigError(
-            f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least"
+            f"keys: expected an object with 'name' and 'sha256' at least, got {shown(entry)}"
         )
 
     known = {field.name for field in fields(Key)}
@@ -135,7 +138,7 @@ def _parse(entry: Any) -> Key:
     if unknown:
         meant = "".join(did_you_mean(field, known) for field in unknown)
         raise ConfigError(
-            f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}{meant}"
+            f"key {entry['name']!r}: expected some of {sorted(known)}, got {sorted(unknown)}{meant}"
         )
 
     values = dict(entry)
@@ -143,7 +146,7 @@ def _parse(entry: Any) -> Key:
         names = entry.get(field) or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ConfigError(
-                f"key {entry['name']!r}: {field}: got {names!r}, want a list of names"
+                f"key {entry['name']!r}: {field}: expected a list of names, got {names!r}"
             )
         values[field] = tuple(names)
     return Key(**values)

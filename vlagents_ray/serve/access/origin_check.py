@@ -58,7 +58,7 @@ def require_same_origin(headers: Mapping[str, str]) -> None:
     site = headers.get("sec-fetch-site", "none")
     if site not in ("same-origin", "none"):
         raise Forbidden(
-            f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself"
+            f"sec-fetch-site: expected 'same-origin', got {site[:40]!r}; open the live page itself"
         )
 
 

@@ -62,8 +62,8 @@ class EnvironmentArgs(_DeploymentModel):
     def _one(self) -> EnvironmentArgs:
         if self.python is None and self.process != "auto":
             raise ValueError(
-                f"process: got {self.process!r} without `python`; name an interpreter, or leave it "
-                "out"
+                f"process: expected `python` with it, got {self.process!r} alone; name an "
+                "interpreter, or leave it out"
             )
         # The check also covers a child process: Serve shows the deployment, and a child may become
         # a replica.
@@ -109,8 +109,8 @@ class BatchArgs(_DeploymentModel):
             return self
         if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
             raise ValueError(
-                f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, "
-                "16]"
+                "sizes: expected ascending positive numbers, such as [1, 2, 4, 8, 16], got "
+                f"{self.sizes}"
             )
         if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
             raise ValueError(
@@ -149,8 +149,9 @@ class CheckpointArgs(_DeploymentModel):
                 len(settings) > 1 or not isinstance(settings[ADAPTER], str)
             ):
                 raise ValueError(
-                    f"{name}: got {settings}, want {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone; "
-                    "it is used with the settings in `config`"
+                    f"{name}: expected {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone, got "
+                    f"{settings}; leave out the other settings, as the adapter is used with those "
+                    "in `config`"
                 )
         return choices
 
@@ -198,8 +199,8 @@ class StreamArgs(_DeploymentModel):
     def _ascending(self) -> StreamArgs:
         if self.ports is not None and self.ports[0] > self.ports[1]:
             raise ValueError(
-                f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, "
-                "9015]"
+                "ports: expected the first and the last one, such as [9000, 9015], got "
+                f"{list(self.ports)}"
             )
         return self
 

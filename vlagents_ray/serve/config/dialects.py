@@ -155,7 +155,9 @@ def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
         ConfigError: The preset is unknown, or the object is invalid.
     """
     if not isinstance(value, (str, Mapping)):
-        raise ConfigError(f"mapping: got {type(value).__name__}, want a preset's name or an object")
+        raise ConfigError(
+            f"mapping: expected a preset's name or an object, got {type(value).__name__}"
+        )
     fields = {"preset": value} if isinstance(value, str) else dict(value)
     base = _preset(fields.pop("preset")) if "preset" in fields else {}
     return KeyMapping.from_json({**base, **fields})
@@ -179,7 +181,7 @@ def _preset(name: object) -> Mapping[str, Any]:
     known = presets()
     meant = did_you_mean(str(name), known)
     raise ConfigError(
-        f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}"
+        f"mapping: expected one of the presets {sorted(known)}, or an object, got {name!r}{meant}"
     )
 
 

@@ -45,8 +45,9 @@ class RegisteredArgs(BaseModel, extra="allow"):
         config = getattr(registered, "Config", None)
         if not (isinstance(config, type) and issubclass(config, cls.config_base)):
             raise ConfigError(
-                f"{name}: {registered.__module__}.{registered.__qualname__} has no Config; want a "
-                f"subclass of {cls.base}, whose Config is a {cls.config_base.__name__}"
+                f"{name}: expected a subclass of {cls.base}, whose Config is a "
+                f"{cls.config_base.__name__}, got "
+                f"{registered.__module__}.{registered.__qualname__} without one; add it"
             )
         return config
 

@@ -189,7 +189,7 @@ class Dialect(abc.ABC):
         or None without one.
         """
         if not isinstance(theirs, dict):
-            raise MalformedMessage(f"observation: got {type(theirs).__name__}, want a map")
+            raise MalformedMessage(f"observation: expected a map, got {type(theirs).__name__}")
         return self.mapping.obs(theirs, self.context.limits, self.context.contract)
 
     def rows(self, reply: Reply) -> np.ndarray:
@@ -380,7 +380,7 @@ async def decoded(
     """
     admission.begin_message()
     if data is None:
-        raise MalformedMessage("message: got text, want a binary map")
+        raise MalformedMessage("message: expected a binary message with a map, got text")
     admission.begin("act")
     return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
 
@@ -429,7 +429,8 @@ class ImplicitEpisode:
         instruction = self.instruction if instruction is None else instruction
         if instruction is None and contract is not None and contract.instruction:
             raise InvalidObservation(
-                "instruction: got none, the policy needs one; send it with the observation"
+                "instruction: expected one, as the policy needs it, got none; send it with the "
+                "observation"
             )
         return instruction
 

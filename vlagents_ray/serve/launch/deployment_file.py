@@ -141,8 +141,8 @@ def _refuse_unknown(source: str, path: Path) -> None:
         )
     if "/" in source:
         raise UnknownPolicy(
-            f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give "
-            "the file of its family, as in deployments/lerobot.yaml --set "
+            f"policy: expected a policy or a deployment file, got {source!r}; for a checkpoint, "
+            "give the file of its family, as in deployments/lerobot.yaml --set "
             f"checkpoint={source}"
         )
     if path.is_dir():
@@ -175,8 +175,7 @@ def policy_application(source: str, app: str | None = None) -> Application:
         [app] = applications
     if app is None or app not in applications:
         raise ConfigError(
-            f"{source}: holds the policies {sorted(applications)}, got {app!r}; name one of them "
-            "as the app"
+            f"{source}: expected one of the policies {sorted(applications)} as the app, got {app!r}"
         )
     return applications[app]
 
@@ -200,7 +199,7 @@ def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> 
     apps = our_apps(changed)
     if len(apps) != 1:
         raise ConfigError(
-            f"--{name}-port: the file holds {len(apps)} policies, want one; write it there"
+            f"--{name}-port: expected a file with one policy, got {len(apps)}; write the port there"
         )
 
     args = apps[0].args
@@ -217,7 +216,8 @@ def only_application(name: str, config: Deployment) -> Application:
     if len(config.applications) != 1:
         names = [app.name for app in config.applications]
         raise ConfigError(
-            f"{name}: holds {names}, want one application; serve it and give the URL of one of them"
+            f"{name}: expected one application, got {names}; serve it and give the URL of one of "
+            "them"
         )
     return config.applications[0]
 
@@ -328,7 +328,8 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
             meant = did_you_mean(app.import_path, [IMPORT_PATH])
             if app.import_path != IMPORT_PATH and meant:
                 raise ConfigError(
-                    f"{source}: {app.name}: import_path: got {app.import_path!r}{meant}"
+                    f"{source}: {app.name}: import_path: expected {IMPORT_PATH!r}, got "
+                    f"{app.import_path!r}{meant}"
                 )
 
         for app in our_apps(config):

@@ -285,8 +285,9 @@ def _missing_gpus(config: Deployment, local_gpus: float | None = None) -> str | 
     is_local = local_gpus is not None or session.started_here()
     where = "this machine" if is_local else "this cluster"
     return (
-        f"resources.num_gpus: the replicas of {needed} need {total:g} GPUs, {where} has "
-        f"{available:g}; want less (0 runs on the CPU), or add a machine that has them"
+        f"resources.num_gpus: expected at most {available:g} GPUs, which {where} has, got "
+        f"{total:g} for the replicas of {needed}; set less (0 runs on the CPU), or add a machine "
+        "that has them"
     )
 
 

@@ -72,7 +72,7 @@ class Checkpoints:
         adapters = config.get(_ADAPTERS) or {}
         if not isinstance(adapters, Mapping):
             raise ConfigError(
-                f"adapters: got {adapters!r}, want a folder or hub id by the name of each"
+                f"adapters: expected a folder or hub id by the name of each, got {adapters!r}"
             )
 
         conflicts = sorted(
@@ -80,8 +80,8 @@ class Checkpoints:
         )
         if conflicts:
             raise ConfigError(
-                f"adapters: got {conflicts} both in the policy's settings and among the "
-                "deployment's checkpoints, want each name once; rename one"
+                f"adapters: expected each name once, got {conflicts} both in the policy's "
+                "settings and among the deployment's checkpoints; rename one"
             )
         return {**config, _ADAPTERS: {**adapters, **self._adapters}}
 
@@ -96,27 +96,28 @@ class Checkpoints:
         if isinstance(choice, str) and choice in self._adapters:
             if step is not None:
                 raise UnknownCheckpoint(
-                    f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it "
-                    "out"
+                    f"{STEP}: expected none with the adapter {choice!r}, which has no steps, got "
+                    f"{step!r}; leave it out"
                 )
             adapter = rest.get(ADAPTER)
             if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
                 raise UnknownCheckpoint(
-                    f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them"
+                    f"{ADAPTER} and {CHOICE}: expected one of them, got {rest[ADAPTER]!r} and "
+                    f"{choice!r}; leave one out"
                 )
             return DEFAULT, {**rest, ADAPTER: choice}
 
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
-            raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
+            raise UnknownCheckpoint(f"{CHOICE}: expected {self._offered()}, got {choice!r}")
 
         if step is not None:
             if not self._steps:
                 raise UnknownCheckpoint(
-                    f"{STEP}: got {step!r}; this deployment offers {self._offered()}"
+                    f"{STEP}: expected {self._offered()}, got {step!r}; leave it out"
                 )
             if isinstance(step, bool) or not isinstance(step, int) or step < 0:
                 raise UnknownCheckpoint(
-                    f"{STEP}: got {step!r}, want a number of training steps, such as 20000"
+                    f"{STEP}: expected a number of training steps, such as 20000, got {step!r}"
                 )
         return CheckpointChoice(choice, step), rest
 

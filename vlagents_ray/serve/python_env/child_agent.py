@@ -133,7 +133,7 @@ class Child:
 
         if len(replies) != len(requests):  # a single reply to the whole message
             raise replies[0].error or PolicyFailed(
-                f"got {len(replies)} replies to {len(requests)} requests"
+                f"expected {len(requests)} replies, one for each request, got {len(replies)}"
             )
         return replies
 

@@ -94,9 +94,9 @@ def find_python(version: str) -> str:
         if os.access(interpreter, os.X_OK) and _minor(interpreter) == version:
             return str(interpreter)
     raise ConfigError(
-        f"found no Python {version}, which the requirements want: looked for python{version} on "
-        f"PATH, in {pyenv} and in {uv}; install it (`uv python install {version}`), or name one: "
-        f"--python /path/to/python{version}"
+        f"expected Python {version}, which the requirements need, got none: looked for "
+        f"python{version} on PATH, in {pyenv} and in {uv}; install it (`uv python install "
+        f"{version}`), or name one: --python /path/to/python{version}"
     )
 
 
@@ -145,7 +145,10 @@ def make_environment(
     files = [requirements, *more]
     for file in files:
         if not file.is_file():
-            raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
+            raise ConfigError(
+                f"expected a requirements file, got {str(file)!r}, which does not exist; check "
+                "the path"
+            )
         if file.suffix == ".py":
             raise ConfigError(
                 f"{file}: expected a requirements file, such as needs.txt, got a module of Python"

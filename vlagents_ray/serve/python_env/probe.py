@@ -87,7 +87,8 @@ def probe(
         else:
             cure = f"make one with `{_command_for(python)}`"
         raise ConfigError(
-            f"environment.python: no such file, got {python!r}, want an interpreter; {cure}"
+            f"environment.python: expected an interpreter, got {python!r}, which does not exist; "
+            f"{cure}"
         )
 
     version = importlib.metadata.version("vlagents-ray")
@@ -124,14 +125,15 @@ def probe(
     if _minor(versions["python"]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(
-            f"environment.python: {python} is Python {versions['python']}, want {oldest} or newer"
+            f"environment.python: expected Python {oldest} or newer, got {python}, which is "
+            f"{versions['python']}"
         )
     theirs = versions.get("vlagents-ray")
     if theirs != version:
         installed = f"vlagents-ray {theirs}" if theirs else "no vlagents-ray"
         raise ConfigError(
-            f"environment.python: {python} has {installed}, want {version} as here; install it "
-            f"there, or make the environment with `{_command_for(python)}`"
+            f"environment.python: expected {version} as here, got {installed} in {python}; "
+            f"install the same there, or make the environment with `{_command_for(python)}`"
         )
     return EnvironmentProbe(versions, examined)
 
@@ -192,9 +194,9 @@ def _process(
     obstacle = interpreter.obstacle_to_replicas()
     if obstacle is not None and environment.process == "replica":
         raise ConfigError(
-            f"environment.process: got 'replica', which cannot run in {environment.python}: "
-            f"{obstacle}; use process 'child' (or 'auto'), or make the environment anew with "
-            "`vlagents-ray env make`"
+            "environment.process: expected 'child' or 'auto', got 'replica', which cannot run in "
+            f"{environment.python}: {obstacle}; use one of them, or make the environment again "
+            "with `vlagents-ray env make`"
         )
     return "child" if obstacle else "replica"
 

@@ -219,8 +219,8 @@ class ReplicaParts:
             for path in part.pages.values():
                 if _route_of(path, server) not in self._routes[name]:
                     raise ConfigError(
-                        f"part {name!r}: expected pages that are routes of its own, got {path!r}; "
-                        "correct its `pages`"
+                        f"part {name!r}: expected pages that are routes of this part, got "
+                        f"{path!r}; correct its `pages`"
                     )
                 paths.add(path)
         return frozenset(paths)

@@ -38,8 +38,8 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
         ({"urls": ["ws://me:secret@box:1"]}, "name it in key_env"),
         ({"mapping": None}, "openpi has none of its own; give an object, or a preset"),
         ({"mapping": "openpi-libera"}, "openpi-libero"),
-        ({"mapping": {"camera": {}}}, "unknown keys"),
-        ({"contract": {"chunks": 3}}, "unknown keys"),
+        ({"mapping": {"camera": {}}}, r"got \['camera'\]"),
+        ({"contract": {"chunks": 3}}, r"got \['chunks'\]"),
         (
             {"protocol": "vlagents", "urls": ["rpyc://box:1"], "key_env": "KEY"},
             "no place for a key",

@@ -52,7 +52,7 @@ def test_an_adapter_that_is_pushed_over_the_network_acts_as_the_saved_one(
     plain, trained = played(server), pairs(policy(folder).model, LAYERS, RANKS["stack"], seed=9)
     with Publisher(server.url) as weights:
         version = weights.push(named(trained), partial=True)
-        with pytest.raises(InvalidWeights, match=r"unknown, want one of the policy's 16 names"):
+        with pytest.raises(InvalidWeights, match=r"expected one of the policy's 16 names"):
             weights.push({f"fold/{name}": value for name, value in trained.items()}, partial=True)
         save(folder.parent / "trained", trained)
         alone = Small.from_config(

@@ -56,7 +56,7 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
             assert weights.acknowledged(version) == 2
             assert acted() == {(version, version)}
         learner.weight.fill_(torch.nan)
-        with pytest.raises(InvalidWeights, match="'weight': got NaN"):
+        with pytest.raises(InvalidWeights, match="'weight': expected finite values, got NaN"):
             weights.push(learner.state_dict())
         assert set(sent) == {SharedValues}
         if device == "cpu":

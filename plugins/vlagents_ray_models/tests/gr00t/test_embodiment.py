@@ -35,4 +35,4 @@ def test_ranges_are_those_of_the_normalisation_in_the_order_of_the_model(
         assert [end.tolist() for end in span] == [[-1, -2, 0], [1, 2, 1]]
     state = trained.vector(Obs(gripper=1.0, state={"arm": [0.5, 57.0]}), [])  # type: ignore[dict-item]
     [misfit] = trained.misfits(state, None, None)
-    assert misfit.startswith("state[1]: got 57, was trained from -2 to 2")
+    assert misfit.startswith("state[1]: expected -2 to 2, the range of the training, got 57")

@@ -466,7 +466,7 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             SAME.format(4),
             {"state": ["a"], "contract": {"hz": 3}},
-            r"contract: .*unknown keys \['hz'\]",
+            r"contract: expected some of .*, got \['hz'\]",
         ),
         (
             SAME.format(4),

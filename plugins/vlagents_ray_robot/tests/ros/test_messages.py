@@ -197,7 +197,7 @@ def test_a_compressed_image_is_decoded() -> None:
     grey = np.full((16, 16, 3), 90, np.uint8)
     jpeg = {"format": "jpeg", "data": base64.b64encode(encode_jpeg(grey)).decode()}
     assert abs(messages.compressed_image(jpeg).astype(int) - 90).max() <= 2
-    with pytest.raises(MalformedMessage, match="want a JPEG or PNG file"):
+    with pytest.raises(MalformedMessage, match="expected a JPEG or PNG file"):
         messages.compressed_image({"format": "32FC1; compressedDepth", "data": bytes(40)})
 
 

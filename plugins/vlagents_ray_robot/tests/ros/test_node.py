@@ -447,6 +447,9 @@ def test_a_policy_of_deltas_is_refused_by_topics_of_targets() -> None:
 def test_an_action_of_another_length_is_not_published() -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
         settings = settings_from(ros_arm.settings(double.url), "arm.yaml")
-        with RosRobot(settings) as robot, pytest.raises(InvalidAction, match=r"want \(2,\)"):
+        with (
+            RosRobot(settings) as robot,
+            pytest.raises(InvalidAction, match=r"expected shape \(2,\)"),
+        ):
             robot.apply(np.zeros(3, np.float32))
         assert double.on(COMMANDS) == []

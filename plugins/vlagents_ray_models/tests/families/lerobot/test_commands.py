@@ -257,7 +257,7 @@ def test_images_are_sent_as_the_bytes_that_the_camera_gave_and_states_by_their_n
     [
         ({"url": ""}, "policy.url: got none"),
         ({"state": []}, "the policy wants the parts ['joints', 'gripper']"),
-        ({"state": ["joints"]}, "divided into ['joints']"),
+        ({"state": ["joints"]}, "expected ['joints'] of the policy"),
         ({"cameras": {"top": "tpo"}}, "did you mean 'top'"),
         ({"n_action_steps": 3}, "want at most 2"),
         ({"n_action_steps": 0}, "want 1 or more"),
@@ -315,8 +315,13 @@ class Trained(MirrorPolicy):
     ("part", "low", "high", "said"),
     [
         ("observation.state", 0.0, 10.0, None),
-        ("observation.state", 0.0, 1.0, r"state\[0\].*: got 9, was trained from 0 to 1"),
-        ("action", 1000.0, 1001.0, r"first chunk\[0\].*was trained from 1000 to 1001"),
+        (
+            "observation.state",
+            0.0,
+            1.0,
+            r"state\[0\].*: expected 0 to 1, the range of the training, got 9",
+        ),
+        ("action", 1000.0, 1001.0, r"first chunk\[0\].*expected 1000 to 1001"),
     ],
 )
 def test_a_robot_outside_of_the_training_is_found_before_the_first_motion(

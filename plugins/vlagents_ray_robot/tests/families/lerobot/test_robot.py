@@ -89,7 +89,7 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
     arm.apply(np.arange(6, dtype=np.float32))
     CLOCK.sleep(1.0)
     assert arm.observe().state["joints"].tolist() == [0, 1, 2, 3, 4, 5]
-    with pytest.raises(InvalidAction, match=r"want \(6,\)"):
+    with pytest.raises(InvalidAction, match=r"expected shape \(6,\)"):
         arm.apply(np.zeros(7, np.float32))
     report = examine(arm, operator=Person(), clock=CLOCK)
     assert report.ok, report.lines()
@@ -129,7 +129,7 @@ def test_a_robot_of_a_plugin_is_driven_by_name() -> None:
             ["port=/dev/new", "id=none"],
             "lerobot-calibrate --robot.type=so101_follower",
         ),
-        ("so101_follower", ["/dev/ttyACM0"], "want KEY=VALUE"),
+        ("so101_follower", ["/dev/ttyACM0"], "expected KEY=VALUE"),
     ],
 )
 def test_a_wrong_robot_or_setting_is_named_with_its_cure(
