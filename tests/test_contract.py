@@ -315,8 +315,8 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         )
         assert told == [
             (
-                "state 'joints': the policy needs 21 numbers, the env gives 7; is this another "
-                "task's or robot's policy?"
+                "state 'joints': the policy needs 21 numbers, the env provides 7; is this "
+                "another task's or robot's policy?"
             )
         ]
 

@@ -32,5 +32,5 @@ def test_the_second_of_a_key_is_found_among_many() -> None:
     # In quadratic time, it would take an hour.
     pairs = [(str(number), number) for number in range(200_000)]
     assert len(without_duplicate_keys(pairs)) == 200_000
-    with pytest.raises(ValueError, match="the key '199999' stands twice"):
+    with pytest.raises(ValueError, match="the key '199999' occurs twice"):
         without_duplicate_keys([*pairs, pairs[-1]])

@@ -184,7 +184,11 @@ def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Instal
     install("lab-policies", policies="mine = lab_policies.registry:MINE")
     install("other-lab", policies="mine = lab_policies.registry:OTHER")
     with pytest.raises(
-        ConfigError, match=r"registered .* by lab-policies and other-lab: uninstall one of them"
+        ConfigError,
+        match=(
+            r"expected .* once in .*, got it from lab-policies and other-lab; uninstall one of "
+            r"them"
+        ),
     ):
         registry.policy_class("mine")
 

@@ -212,7 +212,7 @@ def differences(policy: Contract, env: Contract) -> list[str]:
         )
     if policy.instruction and env.instruction is False:
         sentences.append(
-            "instruction: the policy needs one, the env has none; set it in the env's options"
+            "instruction: the policy needs one, the env provides none; set it in the env's options"
         )
 
     sentences += _action_differences(policy.action, env.action)
@@ -223,7 +223,7 @@ def differences(policy: Contract, env: Contract) -> list[str]:
         )
     if _differ(policy.chunk, env.chunk):
         sentences.append(
-            f"chunk: the policy returns {policy.chunk} rows, the env takes {env.chunk}; set the "
+            f"chunk: the policy returns {policy.chunk} rows, the env accepts {env.chunk}; set the "
             "policy's chunk length"
         )
     return sentences
@@ -242,14 +242,14 @@ def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
         provided = env.cameras.get(name)
         if provided is None:
             yield (
-                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras)}; "
+                f"camera {name!r}: the policy needs it, the env provides {sorted(env.cameras)}; "
                 "add or rename a camera of the env"
             )
         elif _differ(needed.height, provided.height) or _differ(needed.width, provided.width):
             yield (
                 f"camera {name!r}: the policy needs {needed.height}x{needed.width} pixels (height "
-                f"x width), the env gives {provided.height}x{provided.width}; set the env's camera "
-                "size"
+                f"x width), the env provides {provided.height}x{provided.width}; set the env's "
+                "camera size"
             )
 
 
@@ -264,7 +264,7 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
         cure = _parts_cure(needed.dim, env) if has_single_part else ""
         if provided is None:
             yield (
-                f"state {name!r}: the policy needs it, the env gives {sorted(env.state)}; "
+                f"state {name!r}: the policy needs it, the env provides {sorted(env.state)}; "
                 f"{cure or 'add or rename a state of the env'}"
             )
             continue
@@ -272,12 +272,12 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
         if _differ(needed.dim, provided.dim):
             cure = cure or "is this another task's or robot's policy?"
             yield (
-                f"state {name!r}: the policy needs {needed.dim} numbers, the env gives "
+                f"state {name!r}: the policy needs {needed.dim} numbers, the env provides "
                 f"{provided.dim}; {cure}"
             )
         if _differ(needed.unit, provided.unit):
             yield (
-                f"state {name!r}: the policy needs {needed.unit!r}, the env gives "
+                f"state {name!r}: the policy needs {needed.unit!r}, the env provides "
                 f"{provided.unit!r}; convert it"
             )
 
@@ -315,7 +315,8 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
         returned, accepted = getattr(policy, name), getattr(env, name)
         if _differ(returned, accepted):
             yield (
-                f"action.{name}: the policy gives {returned!r}, the env takes {accepted!r}; {cure}"
+                f"action.{name}: the policy returns {returned!r}, the env accepts {accepted!r}; "
+                f"{cure}"
             )
 
     for number, ours, theirs in reordered(policy.names or (), env.names or ()):
@@ -326,12 +327,12 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
 
     if policy.low is not None and env.low is not None and policy.low < env.low:
         yield (
-            f"action.low: the policy goes down to {policy.low}, the env takes {env.low}; scale "
+            f"action.low: the policy goes down to {policy.low}, the env accepts {env.low}; scale "
             "or clip the actions"
         )
     if policy.high is not None and env.high is not None and policy.high > env.high:
         yield (
-            f"action.high: the policy goes up to {policy.high}, the env takes {env.high}; scale "
+            f"action.high: the policy goes up to {policy.high}, the env accepts {env.high}; scale "
             "or clip the actions"
         )
 

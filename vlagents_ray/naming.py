@@ -56,7 +56,7 @@ def without_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(values) < len(pairs):
         # The search takes linear time, since a stranger may have chosen the keys.
         [(repeated_key, _)] = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"the key {repeated_key[:80]!r} stands twice in one object")
+        raise ValueError(f"the key {repeated_key[:80]!r} occurs twice in one object")
     return values
 
 

@@ -182,7 +182,8 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
 _ELSEWHERE = {
     "torch": "run `pip install torch` in the policy's environment",
     "torchao": (
-        "run `pip install torchao` in the policy's environment; its requirements file leaves it out"
+        "run `pip install torchao` in the policy's environment; its requirements file does not "
+        "include it"
     ),
 }
 # packages installed as dependencies of those of the families
@@ -359,8 +360,8 @@ def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
     distributions = sorted({_distribution_of(other) for other in points})
     if len({other.value for other in points}) > 1:
         raise ConfigError(
-            f"{point.name!r} is registered in {point.group} by {' and '.join(distributions)}: "
-            "uninstall one of them"
+            f"expected {point.name!r} once in {point.group}, got it from "
+            f"{' and '.join(distributions)}; uninstall one of them"
         )
 
     expected = (

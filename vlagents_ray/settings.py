@@ -64,7 +64,9 @@ def require_arguments(
         for name in arguments:
             if name not in accepted and not suggestion:
                 suggestion = did_you_mean(name, accepted)
-        raise ConfigError(f"{subject}: {error}; it takes {sorted(accepted)}{suggestion}") from error
+        raise ConfigError(
+            f"{subject}: {error}; it accepts {sorted(accepted)}{suggestion}"
+        ) from error
 
     annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
     try:
@@ -156,7 +158,7 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     elif kind == "missing":
         example = next(iter(getattr(siblings.get(name), "examples", None) or ()), "…")
         setting = f"`{name}: {example}`" if option is None else f"{option} {where}={example}"
-        message = f"is missing; give {setting}"
+        message = f"is missing; add {setting}"
     elif kind == "extra_forbidden":
         accepted = sorted(siblings)
         message = "there is no such setting"

@@ -311,8 +311,8 @@ class _AgentSuite:
     _reset_kwargs: dict[str, Any]
     # The cure of errors that the agent raises, for messages.
     cure: str = (
-        "if the policy parses its instructions or takes only some observations, give "
-        "check_agent(…, instructions=[…], obs=[…]) those that it knows"
+        "if the policy parses its instructions or accepts only some observations, pass some that "
+        "it accepts: check_agent(…, instructions=[…], obs=[…])"
     )
 
     def begin(self, i: int) -> Agent:
@@ -396,7 +396,7 @@ class _AgentSuite:
         """Return the result of `act`; raise `ContractViolation` if it is no valid `Act`."""
         if isinstance(act, Exception):
             raise ContractViolation(
-                f"{where}: failed with {act!r} for an observation that `act` takes"
+                f"{where}: failed with {act!r} for an observation that `act` accepts"
             ) from act
         if not isinstance(act, Act):
             raise ContractViolation(f"{where}: expected an Act, got {type(act).__name__}")
@@ -415,7 +415,8 @@ class _AgentSuite:
         chunk = self._contract.chunk if self._contract is not None else None
         if chunk not in (None, len(act.rows())):
             raise ContractViolation(
-                f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}"
+                f"{where}: expected {chunk} rows in the action, as in the contract, got "
+                f"{len(act.rows())}"
             )
         if type(act.done) is not bool:
             raise ContractViolation(
@@ -511,9 +512,7 @@ def check_env(
     other = suite.play(seeds[1], actions)
     again = suite.play(seeds[0], actions)
 
-    because = (
-        "an episode must be a pure function of its seed and options, whatever was played before"
-    )
+    because = "an episode must be a pure function of its seed and options, whatever ran before"
     require_same(first.instruction, again.instruction, "instruction", because)
     require_same(first.copies[0], again.copies[0], "the first observation", because)
     if same_steps:
@@ -593,7 +592,7 @@ class _EnvSuite:
             raise ContractViolation(f"instruction: expected a str, got {kind_of(instruction)}")
         if self._contract.instruction and not instruction:
             raise ContractViolation(
-                "instruction: is empty, but the contract states that the env has one"
+                "instruction: expected one, as the contract declares it, got an empty text"
             )
         return obs
 
@@ -710,6 +709,6 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
             )
     if contract.gripper is False and obs.gripper is not None:
         raise ContractViolation(
-            f"{where}: gripper is {obs.gripper}, the contract states that there is none"
+            f"{where}: expected no gripper, as in the contract, got {obs.gripper}"
         )
     require_wireable(obs.info, f"{where}: Obs.info")

@@ -266,7 +266,7 @@ class EpisodeViewer:
             self._thread.join(self._recordings.closing_s)
             if self._thread.is_alive():
                 self.error = self.error or TimeoutError(
-                    f"nothing at {self._recordings.target} takes what is left"
+                    f"no viewer at {self._recordings.target} accepts the remaining frames"
                 )
 
     def report(self) -> str:

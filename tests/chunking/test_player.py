@@ -460,7 +460,8 @@ def test_where_holding_would_go_on_moving_a_refused_safe_action_is_raised() -> N
         player.reset(obs(1))
         assert player.act(obs(1)).action.tolist() == [1, 1]
         with pytest.raises(
-            InvalidAction, match=r"waiting.*the safe action is refused, too.*below the limit 0\.5"
+            InvalidAction,
+            match=r"waiting.*the guard also rejects the safe action.*below the limit 0\.5",
         ):
             player.act(obs(2))
         agent.gate.release(100)

@@ -114,7 +114,9 @@ def test_out_of_time_has_an_exit_status_of_its_own(
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 75, done.output
     assert ends == [1_801_420_200.0]
-    assert "out of time after 3 of 9 episodes; go on with --resume" in " ".join(done.stderr.split())
+    assert "out of time after 3 of 9 episodes; continue with --resume" in " ".join(
+        done.stderr.split()
+    )
 
 
 @pytest.mark.usefixtures("no_server")
@@ -222,7 +224,7 @@ def test_only_what_was_asked_for_now_is_missed(
         (["--live-at", "8050"], "expected HOST:PORT"),
         (["--live-at", "127.0.0.1:many"], "expected HOST:PORT"),
         (["--live-at", "0.0.0.0:8050"], "without keys all cameras would be public"),
-        (["--live", "--dry-run"], "nothing is played"),
+        (["--live", "--dry-run"], "a dry run has no episodes to watch"),
     ],
 )
 @pytest.mark.usefixtures("no_server")

@@ -125,7 +125,7 @@ def test_one_signal_ends_an_evaluation_that_hangs(
     assert "Traceback" not in printed
     [error] = [line for line in printed.splitlines() if line.startswith("error ")]
     assert error == (
-        f"error interrupted after {finished} of {EPISODES} episodes; go on with --resume --out out"
+        f"error interrupted after {finished} of {EPISODES} episodes; continue with --resume --out out"
     )
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)

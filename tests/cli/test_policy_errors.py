@@ -83,7 +83,7 @@ def test_a_policy_that_always_fails_says_so_and_ends_with_a_status_of_its_own(
     [title] = [i for i, line in enumerate(done.stdout.splitlines()) if "Errors of policies" in line]
     [row] = [line for line in done.stdout.splitlines()[title:] if WORDS[how] in line]
     assert row.split()[-1] == "4"
-    assert "every episode ended by an error of the policy" in done.stderr
+    assert "every episode ended with an error of the policy" in done.stderr
 
 
 def test_a_policy_that_fails_now_and_then_has_a_rate(
@@ -91,7 +91,7 @@ def test_a_policy_that_fails_now_and_then_has_a_rate(
 ) -> None:
     done = eval_of(tmp_path / "out", functools.partial(Failing, "nan", (1, 2)), monkeypatch)
     assert done.exit_code == 0, done.output
-    assert "2 episodes ended by an error of the policy" in done.stdout
+    assert "2 episodes ended with an error of the policy" in done.stdout
 
 
 def test_errors_of_the_policy_in_a_row_stop_the_evaluation(
@@ -101,7 +101,7 @@ def test_errors_of_the_policy_in_a_row_stop_the_evaluation(
     done = eval_of(tmp_path / "out", agent, monkeypatch, episodes=50, abort_after=3)
     assert done.exit_code == run.POLICY_ERRORS, done.output
     assert (
-        "3 episodes in a row ended by an error of the policy: policy_failed: policy act: KeyError"
+        "3 episodes in a row ended with an error of the policy: policy_failed: policy act: KeyError"
         in done.stderr
     )
     assert "3/50" in done.stdout

@@ -636,7 +636,7 @@ def test_without_a_terminal_the_command_says_so() -> None:
         [sys.executable, "-c", ON_AN_ARM, "--seconds", "0.2"],
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert "keys: none, as there is no terminal" in run.stdout
+    assert "no keys, as there is no terminal" in run.stdout
 
 
 class FaultyArm(Served):

@@ -261,7 +261,7 @@ def test_a_policy_that_lacks_a_setting_names_a_file_and_a_page_that_have_it(
     checkout = Path(vlagents_ray.__file__).parents[1]
     [file] = re.findall(r"deployments/\w+\.yaml", str(raised.value))
     [page] = re.findall(r"docs/policies/\w+\.md", str(raised.value))
-    assert "is missing; give --set" in str(raised.value)
+    assert "is missing; add --set" in str(raised.value)
     assert read_yaml(checkout / file)["applications"][0]["args"]["policy"] == policy
     assert policy in (checkout / page).read_text()
 

@@ -147,7 +147,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("eval", "my_policies:Reach", *EVAL, "scripted"),
-            "my_policies:Reach': is no EvalEnv; an environment of Gymnasium is named",
+            "my_policies:Reach': expected an EvalEnv, got another class; name an environment",
         ),
         (
             ("serve", "runs/act/last"),

@@ -38,7 +38,7 @@ FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
             None,
             r"expected \{step\} in the checkpoint of one policy, .*, got it in 2",
         ),
-        ([SWEPT | {"steps": [10]}], None, "--watch finds its steps; leave `steps` out"),
+        ([SWEPT | {"steps": [10]}], None, "expected no `steps` with --watch"),
         ([SWEPT], "runs/training_finished", "ended without a checkpoint"),
         ([SWEPT], "results.db", "resume them"),
     ],
@@ -143,10 +143,10 @@ def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(
         _trained_policy(swept("pi0", tmp_path, place, max_rows=0))
     config = swept("pi0", tmp_path, place)
     assert _trained_policy(config) == (0, "/runs/{step}/pretrained_model")
-    with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
+    with pytest.raises(ConfigError, match="checkpoint_step None: expected either both"):
         resolve_policies(config)
     if place == "deployment":
-        with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
+        with pytest.raises(ConfigError, match="checkpoint_step None: expected either both"):
             read_deployment(str(config.policies[0].source))
 
 

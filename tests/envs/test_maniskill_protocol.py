@@ -77,7 +77,7 @@ def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
         deviations = env.describe()["protocol"]["deviations"]
     assert len(deviations) == 2
     assert deviations[0].startswith("reconfigure is False")
-    assert deviations[1] == "max_steps is 7, the task's own is 50"
+    assert deviations[1] == "max_steps is 7, the task's limit is 50"
 
 
 def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:

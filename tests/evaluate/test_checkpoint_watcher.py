@@ -123,13 +123,13 @@ def test_what_the_policy_loads_has_to_be_there(tmp_path: Path) -> None:
     watcher = CheckpointWatcher(str(tmp_path / "{step}" / "model"), settle_s=0)
     list(one_file(tmp_path / "1" / "optimizer"))
     assert watcher.scan(0) == []
-    assert watcher.waiting() == {1: "model: no file is there"}
+    assert watcher.waiting() == {1: "model: expected a file, got none"}
 
 
 def test_a_file_can_be_a_checkpoint_and_a_pattern_has_a_place_for_the_step(tmp_path: Path) -> None:
     (tmp_path / "epoch=7.ckpt").write_bytes(bytes(10))
     assert CheckpointWatcher(str(tmp_path / "epoch={step}.ckpt"), settle_s=0).scan(0) == [7]
-    with pytest.raises(ConfigError, match="write one where the step stands"):
+    with pytest.raises(ConfigError, match="write it in place of the step"):
         CheckpointWatcher("/runs/a")
 
 

@@ -108,7 +108,7 @@ def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_vi
     warnings = [
         record.getMessage()
         for record in caplog.records
-        if "nothing of it is recorded" in record.getMessage()
+        if "its video is not recorded" in record.getMessage()
     ]
     assert len(bare) == len(warnings) == 1
     assert len(failed) > 1

@@ -75,7 +75,10 @@ def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(
 
 @pytest.mark.parametrize(
     ("record", "why"),
-    [("none", r".*--record all"), ("all", r", as .*\.npz, the recorded trajectory, is gone$")],
+    [
+        ("none", "but without a recorded trajectory .*--record all"),
+        ("all", r"the first step is not known, as .*\.npz, the recorded trajectory, is missing$"),
+    ],
 )
 def test_without_a_trajectory_it_is_said_that_the_actions_differ(
     config: Config, tmp_path: Path, record: str, why: str
@@ -84,7 +87,7 @@ def test_without_a_trajectory_it_is_said_that_the_actions_differ(
     for trajectory in results.out.rglob("*.npz"):
         trajectory.unlink()
     first, *_ = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
-    assert re.match(rf"actions: they differ; from which step on is not known{why}", first)
+    assert re.match(rf"actions: they differ[,;] {why}", first)
 
 
 class Rounded(ToZero):
@@ -159,7 +162,10 @@ def test_the_same_actions_have_no_difference_and_without_a_recording_it_is_unkno
     unrecorded = find(play(config(episodes=1, out=tmp_path / "other")), f"{LINE}#0")
     replayed = play(unrecorded.config(tmp_path / "again"), lambda: Rounded(1e-6))
     assert actions_difference(unrecorded, replayed) is None
-    assert "nor whether by more than rounding" in compare(unrecorded, replayed)[0]
+    assert (
+        "neither the first step nor the size of the difference is known"
+        in compare(unrecorded, replayed)[0]
+    )
 
 
 class Tired(Noisy):
@@ -244,7 +250,8 @@ def test_a_replay_that_differs_says_that_the_weights_are_others(
     assert compare(recorded, with_weights(play(recorded.config(tmp_path / "same")), "b")) == []
     found = compare(recorded, with_weights(play(recorded.config(tmp_path / "other"), Noisy), "b"))
     assert (
-        found[-1] == "weights: a played it, now it is b: another checkpoint, or other files in it"
+        found[-1]
+        == "weights: expected a, as recorded, got b: another checkpoint, or other files in it"
     )
 
 

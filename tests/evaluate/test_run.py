@@ -147,7 +147,7 @@ class TestOnACluster:
         assert "{'OMP_NUM_THREADS': '3', 'LP_NUM_THREADS': '5', 'EXTRA': 'yes'}" in text
 
     def test_a_cluster_without_room_is_told_so(self, config: Config) -> None:
-        with pytest.raises(ConfigError, match=r"no room for a worker in 0\.5 s.*lower `workers`"):
+        with pytest.raises(ConfigError, match=r"within 0\.5 s, .*lower `workers`"):
             evaluate(config(cpus_per_worker=64, place_timeout_s=0.5), agent_factory=ToZero)
 
     def test_a_worker_that_does_not_leave_makes_room_for_one_of_another_kind(
@@ -219,6 +219,6 @@ def test_many_lost_episodes_in_a_row_stop_the_evaluation(
 
 def test_a_contract_mismatch_stops_the_evaluation_before_any_step(config: Config) -> None:
     settings = config(env_options={"state_dim": 3})
-    with pytest.raises(ContractMismatch, match="the policy needs 2 numbers, the env gives 3"):
+    with pytest.raises(ContractMismatch, match="the policy needs 2 numbers, the env provides 3"):
         here(settings, functools.partial(ToZero, state_dim=2))
     assert outcomes(settings) == []

@@ -118,7 +118,7 @@ def test_an_evaluation_whose_head_dies_ends_and_can_be_resumed(tmp_path: Path) -
         assert evaluation.wait(180) == 1
         print(f"GCS: killed, and the evaluation ended after {time.monotonic() - killed:.1f} s")
         gone(log, started)
-        assert "go on with --resume" in log.read_text()
+        assert "continue with --resume" in log.read_text()
     assert played(out)
 
 

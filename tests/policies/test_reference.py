@@ -184,7 +184,7 @@ def test_a_checkpoint_that_is_damaged_is_refused(folder: Path, tmp_path: Path) -
     with pytest.raises(ConfigError, match=r"model.safetensors: cannot be read: .*size mismatch"):
         made(tmp_path)
     (tmp_path / CONFIG).write_text("{}")
-    with pytest.raises(ConfigError, match="is no checkpoint of the reference policy"):
+    with pytest.raises(ConfigError, match="expected a checkpoint of the reference policy"):
         made(tmp_path)
 
 

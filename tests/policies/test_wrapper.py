@@ -139,7 +139,9 @@ def test_wrong_entries_are_refused(wrappers: list[Any], said: str) -> None:
 
 
 def test_a_class_that_is_no_agent_is_refused() -> None:
-    with pytest.raises(UnknownPolicy, match="'json:JSONDecoder': is no Agent; derive the class"):
+    with pytest.raises(
+        UnknownPolicy, match="'json:JSONDecoder': expected an Agent; derive the class"
+    ):
         build_agent("json:JSONDecoder", {})
 
 

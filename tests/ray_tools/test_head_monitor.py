@@ -32,7 +32,7 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
 def test_a_head_that_is_silent_for_a_while_is_waited_for(
     silent: socket.socket, caplog: pytest.LogCaptureFixture
 ) -> None:
-    watched = HeadMonitor("go on with --resume")
+    watched = HeadMonitor("continue with --resume")
     assert not watched.answers()
     assert not watched.answers()
     assert caplog.text.count("does not answer") == 1
@@ -45,7 +45,7 @@ def test_one_that_stays_silent_is_given_up_before_ray_ends_this_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "0.000001")
-    watched = HeadMonitor("go on with --resume")
+    watched = HeadMonitor("continue with --resume")
     with pytest.raises(ClusterLost, match=r"127\.0\.0\.1:\d+, has not answered.*--resume"):
         watched.answers()
 
@@ -53,7 +53,7 @@ def test_one_that_stays_silent_is_given_up_before_ray_ends_this_process(
 @pytest.mark.usefixtures("silent")
 def test_it_is_not_asked_at_every_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(head_monitor, "PERIOD_S", 3600.0)
-    assert HeadMonitor("go on with --resume").answers()
+    assert HeadMonitor("continue with --resume").answers()
 
 
 @pytest.fixture
@@ -71,10 +71,10 @@ def test_the_end_of_the_daemon_here_is_noticed_though_the_head_answers(
     with socket.socket(socket.AF_UNIX) as daemon:
         daemon.bind(node.raylet_socket_name)
         daemon.listen()
-        watched = HeadMonitor("go on with --resume")
+        watched = HeadMonitor("continue with --resume")
         assert watched.answers()
     assert Path(node.raylet_socket_name).exists()  # as after kill -9
-    with pytest.raises(ClusterLost, match=r"raylet, has ended; go on with --resume"):
+    with pytest.raises(ClusterLost, match=r"raylet, has ended; continue with --resume"):
         watched.answers()
 
 

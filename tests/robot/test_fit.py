@@ -214,5 +214,5 @@ def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(
     said.clear()
     _require_fit(parse(words), Still(), Standing(57, 0), None, said.append)
     [line] = said
-    assert "states no ranges of its training" in line
+    assert "declares no ranges of its training" in line
     assert "--trained-on" in line

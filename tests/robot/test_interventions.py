@@ -209,7 +209,7 @@ def test_a_dataset_goes_on_with_its_own_columns(tmp_path: Path) -> None:
         add(recorder)
         with pytest.raises(ConfigError, match="interventions=True"):
             recorder.label("success")
-    with pytest.raises(ConfigError, match="recorded without interventions"):
+    with pytest.raises(ConfigError, match="expected a recording with interventions"):
         Recorder(tmp_path / "old", HZ, interventions=True)
     with Recorder(tmp_path / "old", HZ) as recorder:
         add(recorder)

@@ -50,15 +50,15 @@ STATED = {"observation.state": RANGE, "action": RANGE}
 MISFITS: dict[str, tuple[Case, str]] = {
     "unit": (
         Case(RIGHT | {"state": {"joints": StateSpec(2, "deg")}}),
-        "needs 'deg', the env gives 'rad'",
+        "needs 'deg', the env provides 'rad'",
     ),
-    "relative actions": (Case(action(delta=True)), "action.delta: the policy gives True"),
+    "relative actions": (Case(action(delta=True)), "action.delta: the policy returns True"),
     "order of joints": (Case(action(names=("lift", "pan"))), "number 0 is 'lift' of the policy"),
     "number of joints": (
         Case(RIGHT | {"state": {"joints": StateSpec(3, "rad")}}),
         "needs 3 numbers",
     ),
-    "dimension of actions": (Case(action(dim=7, names=None)), "action.dim: the policy gives 7"),
+    "dimension of actions": (Case(action(dim=7, names=None)), "action.dim: the policy returns 7"),
     "a missing camera": (Case(RIGHT | {"state": {"elbow": StateSpec(1)}}), "state 'elbow'"),
     "a state outside of the training": (
         Case(statistics=STATED, pose=(57.0, 0.5)),

@@ -281,7 +281,10 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
         ParsesItInAct,
         r"act: expected no error, got KeyError.* for the instruction 'pick up the cube' .*instructions=\[",
     ),
-    (with_contract(replace(CONTRACT, chunk=4)), "has 1 rows, the contract states 4"),
+    (
+        with_contract(replace(CONTRACT, chunk=4)),
+        "expected 4 rows in the action, as in the contract, got 1",
+    ),
     (with_contract({}), "contract: expected a Contract or None, got dict"),
     (with_reset(lambda *_: None), "reset: expected a dict, got NoneType"),
     (with_reset(lambda agent, _: {"agent": agent}), r"info\['agent'\]"),

@@ -185,7 +185,10 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
         with_contract(gripper=True),
         r"gripper: expected a number in \[0, 1\] where 1 = open, got None",
     ),
-    (with_obs(lambda obs: replace(obs, gripper=0.5)), "gripper is 0.5"),
+    (
+        with_obs(lambda obs: replace(obs, gripper=0.5)),
+        "expected no gripper, as in the contract, got 0.5",
+    ),
     (
         with_obs(
             lambda obs: replace(obs, state={"joints": obs.state["joints"].astype(np.float64)})
@@ -236,7 +239,7 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (ClosesOnce, "the second call raised"),
     (with_reset(lambda obs: (obs, {"scene": object()})), r"info\['scene'\]"),
     (with_reset(lambda obs: obs), r"reset: expected \(Obs, info\), got Obs"),
-    (variant(instruction=""), "instruction: is empty"),
+    (variant(instruction=""), "instruction: expected one, as the contract declares it"),
     (variant(describe=lambda _: {"mode": {1, 2}}), "describe"),
 ]
 

@@ -57,7 +57,7 @@ LATE = Held(
     "the answer came so late that the robot had passed its rows; lower the latency, or the rate "
     "(hz)",
 )
-OLD = Held("old", "what was planned is older than max_age_s")
+OLD = Held("old", "the planned action is older than max_age_s")
 STALE = Held(
     "stale",
     "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that "
@@ -327,11 +327,13 @@ class Motion:
         try:
             action = self._checked(self._safe(obs, last), last)
         except InvalidAction as refused:
-            why = why._replace(reason=f"{why.reason}; the safe action is refused, too: {refused}")
+            why = why._replace(
+                reason=f"{why.reason}; the guard also rejects the safe action: {refused}"
+            )
             if last is None or not self._safe.holds:
                 raise InvalidAction(
-                    f"no action for this tick: {why.reason}; let the guard pass it, or give "
-                    "another one (safe=)"
+                    f"no action for this tick: {why.reason}; change the guard's limits, or give "
+                    "another safe action (safe=)"
                 ) from refused
             action = self._checked(last, last)
 

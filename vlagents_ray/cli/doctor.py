@@ -110,7 +110,7 @@ def judge_shared_memory(total: float, free: float, memory: float) -> Check:
     """
     store = min(_STORE_SHARE * memory, _STORE_MAX, max(_STORE_UNCAPPED, 0.95 * free))
     detail = (
-        f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store takes up to "
+        f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store uses up to "
         f"{store / GB:.1f} GB"
     )
     if free >= store:
@@ -243,7 +243,7 @@ def run(
     """
     for interpreter in pythons:
         _require_program(interpreter)
-    with console.status("looking around; rendering a frame takes some seconds"):
+    with console.status("checking this machine; rendering a frame takes some seconds"):
         results = list(checks(port, pythons))
 
     if as_json:
@@ -460,8 +460,8 @@ def judge_library(
     oldest = OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)
     if int(driver.partition(".")[0]) < oldest:
         cure = (
-            "update the driver, or make the environment again: env make takes torch for CUDA 12 "
-            "with one from 525 on"
+            "update the driver, or make the environment again: env make installs torch for CUDA "
+            "12 if the driver is 525 or newer"
         )
         return Check("warn", f"{detail}: expected driver {oldest} or newer, got {driver}", cure)
     return Check(

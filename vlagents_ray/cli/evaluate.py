@@ -273,8 +273,8 @@ class EvalOptions:
             )
         if self.dry_run and self.watch is not None:
             raise ConfigError(
-                "--dry-run and --watch exclude each other: the steps of the training are not known "
-                "yet"
+                "--dry-run and --watch exclude each other: the steps of the training are not "
+                "known in advance"
             )
         if self.end_at is not None and self.watch is not None:
             raise ConfigError(
@@ -287,7 +287,7 @@ class EvalOptions:
             )
         if self.dry_run and self.options_set("live", "live_at"):
             raise ConfigError(
-                "--dry-run and --live exclude each other: nothing is played that could be watched"
+                "--dry-run and --live exclude each other: a dry run has no episodes to watch"
             )
 
         robot_options = self.options_set("operator", "unblind")

@@ -248,7 +248,7 @@ def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
         names = ", ".join(f"{case.contender} in {case.task}" for case in failing)
         fail(
-            f"every episode ended by an error of the policy: {names}; the first one: "
+            f"every episode ended with an error of the policy: {names}; the first error: "
             f"{error.strip()}",
             POLICY_ERRORS,
         )
@@ -377,7 +377,8 @@ def _trained_policy(config: EvalConfig) -> tuple[int, str]:
     [(index, pattern)] = patterns.items()
     if config.policies[index].steps:
         raise ConfigError(
-            f"policy {config.policies[index].name!r}: --watch finds its steps; leave `steps` out"
+            f"policy {config.policies[index].name!r}: expected no `steps` with --watch, which "
+            "finds them, got some; leave them out"
         )
     return index, pattern
 
@@ -477,7 +478,7 @@ def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> Non
     # Workers share one queue, so that at most one episode's time is lost at the end.
     total_s = sum(row.remaining * (row.seconds or 0.0) for row in forecast)
     seconds = total_s / max(1, min(workers, remaining))
-    time = f"{_time(seconds)} as by earlier episodes"
+    time = f"{_time(seconds)}, judging from earlier episodes"
 
     unknown = sum(row.seconds is None for row in forecast)
     if unknown == len(forecast):

@@ -88,7 +88,7 @@ def dialect(name: Name) -> None:
             (f"{as_typed('vlagents-ray')} serve {name}.yaml", "serves a policy that does nothing"),
             (
                 f'curl -d \'{{"q": [0, 0], "task": "lift the cup"}}\' http://localhost:8000/{name}',
-                "asks it, in a second terminal",
+                "calls it, in a second terminal",
             ),
         )
 

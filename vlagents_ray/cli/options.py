@@ -55,7 +55,7 @@ StateDims = Annotated[
     typer.Option(
         "--state-dim",
         metavar="PART=N",
-        help="The number of numbers in a part of the state, if the policy does not declare it.",
+        help="Number of values in a part of the state, if the policy does not declare it.",
     ),
 ]
 _MOST_DIMS = 1_000_000  # most numbers in a part of the state

@@ -90,7 +90,7 @@ def served(
         if local is not None:
             if config.workers is None:
                 out.print(
-                    "a short evaluation, in this process without Ray (--workers 1 plays it in a "
+                    "a short evaluation, in this process without Ray (--workers 1 runs it in a "
                     "worker of Ray)"
                 )
             stack.enter_context(variables(_variables(config, local)))

@@ -29,7 +29,7 @@ _EXIT_S = 3.0
 _LOOK_S = 1.0  # period of the check for an interrupt that Python dropped
 _END_S = 90.0  # from Ctrl-C to the end: a third for Serve, the rest for Ray's shutdown
 RESTART = "start it again"
-RESUME = "what was played is kept: go on with --resume when there is a cluster again"
+RESUME = "finished episodes are kept: continue with --resume when a cluster is running again"
 
 _FILE_BYTES = 10_000_000  # Serve logs each request; two files of this size are kept
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read

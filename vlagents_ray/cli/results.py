@@ -209,13 +209,12 @@ def replay_command(
         differences = compare(recorded, summary.results)
         rounding = actions_difference(recorded, summary.results)
         steps = recorded.episode.result.steps
-        same = f"the same: {steps} actions byte for byte, and what came of them"
+        same = f"the same: {steps} actions byte for byte, and their outcomes"
         if rounding is not None:
             same = (
-                f"the same up to rounding: {steps} actions, and what came of them; the first to "
-                f"differ is that of step {rounding.step}, by {rounding.at_first:.2g}, as in "
-                "batches of another size, later ones differ by at most "
-                f"{rounding.largest:.2g}"
+                f"the same up to rounding: {steps} actions, and their outcomes; the first "
+                f"difference is {rounding.at_first:.2g} at step {rounding.step}, as in batches of "
+                f"another size, the largest {rounding.largest:.2g}"
             )
         for line in [*(differences or [same]), f"replay: {replay_folder}"]:
             out.print(line)

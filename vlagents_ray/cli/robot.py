@@ -236,7 +236,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if has_terminal:
             say(KEYS)
         else:
-            say("keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+            say("no keys, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
 
         loop_options = LoopOptions(
             restart=options.restart,
@@ -364,8 +364,8 @@ def _require_fit(
     is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
         message = (
-            "the policy states no ranges of its training, so this arm's pose and the first chunk "
-            "are not compared with them; --trained-on FILE names them"
+            "the policy declares no ranges of its training, so this arm's pose and the first "
+            "chunk are not compared with them; give them with --trained-on FILE"
         )
         say(message)
         logger.info("%s", message)

@@ -98,7 +98,10 @@ class ServeOptions:
         """
         args = parse_settings(self.serve_set, "--serve-set")
         if "config" in args:
-            raise ConfigError("--serve-set config: the policy's own settings go into --set")
+            raise ConfigError(
+                "--serve-set: expected settings of the deployment, got `config`; give the "
+                "policy's settings with --set"
+            )
         config = parse_settings(self.settings, "--set")
         return {**args, **({"config": config} if config else {})}
 
@@ -113,7 +116,7 @@ class ServeOptions:
         if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
             return None
         if self.tls_cert is None or self.tls_key is None:
-            raise ConfigError("TLS: give both --tls-cert and --tls-key")
+            raise ConfigError("TLS: expected both --tls-cert and --tls-key, got one; give both")
         return Tls(self.tls_cert, self.tls_key, self.tls_client_ca)
 
 

@@ -100,7 +100,9 @@ class ClientSession:
     def act(self, obs: Obs) -> Request:
         """Return the request for an action; raises `NotReset` outside an episode."""
         if self.episode is None:
-            raise NotReset("act before reset: this agent has no session, or lost it; reset first")
+            raise NotReset(
+                "expected a reset before act: this agent has no session, or lost it; reset it"
+            )
         return Request(
             "act",
             obs,

@@ -294,7 +294,7 @@ class _NextTransport:
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 metadata = None
         except VLAgentsError as error:
-            logger.info("the replica stays, no other one is found: %s", error)
+            logger.info("the session stays at this replica, as no other was found: %s", error)
         finally:
             with self._lock:
                 self.metadata, self.ended = metadata, True

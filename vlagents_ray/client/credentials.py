@@ -113,7 +113,7 @@ def warn_of_plain_http(origin: str) -> None:
     """Log, once per server, that an API key is sent to it unencrypted over a network."""
     if not is_loopback(urlsplit(origin).hostname or ""):
         logger.warning(
-            "%s: the API key goes there unencrypted, and others may read it; use https:// or wss://",
+            "%s: the API key is sent unencrypted, and others may read it; use https:// or wss://",
             origin,
         )
 
@@ -135,8 +135,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
             )
         else:
             cure = (
-                "if the server's certificate is signed by a CA of your own, give the file of the "
-                "CA's certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
+                "if your own CA signed the server's certificate, give the file of the CA's "
+                "certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
             )
         return ConfigError(
             f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}"
@@ -144,7 +144,7 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
 
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
         return ConfigError(
-            f"{url}: the server refuses this client's certificate, or that it has none "
+            f"{url}: the server rejects this client's certificate, or requires one "
             f"({error.reason}); give certificate=(certificate file, key file), signed by the CA "
             "that the server trusts"
         )

@@ -215,8 +215,8 @@ class Dataset:
         has_interventions = INTERVENTION_COLUMN in info["features"]
         if self.interventions and not has_interventions:
             raise ConfigError(
-                f"{self.root}: was recorded without interventions, so its frames lack the column "
-                f"{INTERVENTION_COLUMN!r}; record into a new folder"
+                f"{self.root}: expected a recording with interventions, got one whose frames lack "
+                f"the column {INTERVENTION_COLUMN!r}; record into a new folder"
             )
         self.info = info
         self.interventions = has_interventions

@@ -287,7 +287,8 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
     cls = env_class(name)
     if not issubclass(cls, EvalEnv):
         raise UnknownEnv(
-            f"env {name!r}: is no EvalEnv; an environment of Gymnasium is named gymnasium/MODULE:ID"
+            f"env {name!r}: expected an EvalEnv, got another class; name an environment of "
+            "Gymnasium gymnasium/MODULE:ID"
         )
     task = env_task(name)
     arguments = {"task": task, **options} if task is not None else dict(options)

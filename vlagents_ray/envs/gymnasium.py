@@ -322,7 +322,8 @@ class Gymnasium(EvalEnv):
         except gymnasium.error.UnregisteredEnv as error:
             hint = did_you_mean(self._id.rpartition("/")[2], gymnasium.registry)
             raise UnknownEnv(
-                f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{hint}"
+                f"{self._name}: {error}; gymnasium/MODULE:ID imports the module that registers "
+                f"it{hint}"
             ) from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"{self._name}: {error}") from error

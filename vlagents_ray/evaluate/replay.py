@@ -73,8 +73,9 @@ class Recorded:
         case = next((case for case in cases if case.fingerprint == self.case.case_id), None)
         if case is None:
             raise ConfigError(
-                f"{self.results.out}: the settings of run {run.run} have no such case as that of "
-                f"{self.episode.result.key}; replay it in the folder in which it was played"
+                f"{self.results.out}: expected the case of {self.episode.result.key} in the "
+                f"settings of run {run.run}, got others; replay it in the folder in which it was "
+                "run"
             )
 
         policy_settings = case.policy.model_dump()
@@ -133,7 +134,10 @@ def find(results: Results, name: str | None) -> Recorded:
 
     [recorded] = matching
     if recorded.episode.result.status == "infra_failed":
-        raise ConfigError(f"{name!r} was never played to its end: {recorded.episode.result.error}")
+        raise ConfigError(
+            f"expected a finished episode, got {name!r}, which never ended: "
+            f"{recorded.episode.result.error}"
+        )
     return recorded
 
 
@@ -175,7 +179,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     are_known = recorded_weights is not None and replayed_weights is not None
     if differences and are_known and recorded_weights != replayed_weights:
         differences.append(
-            f"weights: {recorded_weights} played it, now it is {replayed_weights}: another "
+            f"weights: expected {recorded_weights}, as recorded, got {replayed_weights}: another "
             "checkpoint, or other files in it"
         )
     return differences
@@ -221,17 +225,17 @@ def _describe_actions(recorded: Recorded, replayed: Path) -> str:
     path = recorded.episode.trajectory
     if path is None:
         return (
-            "actions: they differ; from which step on is not known, nor whether by more than "
-            "rounding, as no trajectory was recorded (eval --record all, or `record: all` in its "
-            "file); the size of a batch, which several episodes share, changes the last digits of "
-            "an action, about 1e-7"
+            "actions: they differ, but without a recorded trajectory (eval --record all, or "
+            "`record: all` in its file) neither the first step nor the size of the difference is "
+            "known; the size of a batch, which several episodes share, changes the last digits "
+            "of an action, about 1e-7"
         )
 
     file = recorded.results.file(path)
     if not file.is_file():
         return (
-            f"actions: they differ; from which step on is not known, as {file}, the recorded "
-            "trajectory, is gone"
+            f"actions: they differ; the first step is not known, as {file}, the recorded "
+            "trajectory, is missing"
         )
 
     recorded_actions = Trajectory.load(file).actions

@@ -59,7 +59,7 @@ class EvaluationInterrupted(KeyboardInterrupt):
     def __init__(self, summary: Summary) -> None:
         done, planned = summary.total.episodes, summary.total.planned
         super().__init__(
-            f"{self.why} after {done} of {planned} episodes; go on with --resume --out "
+            f"{self.why} after {done} of {planned} episodes; continue with --resume --out "
             f"{summary.out}"
         )
         self.summary = summary

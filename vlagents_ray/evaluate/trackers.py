@@ -95,7 +95,9 @@ class TrackerFeed:
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
                 log.warning(
-                    "%s: still sending after %g s; given up", ", ".join(self._working), CLOSE_S
+                    "%s: still sending after %g s; the rest is dropped",
+                    ", ".join(self._working),
+                    CLOSE_S,
                 )
 
     def _loop(self) -> None:

@@ -160,9 +160,7 @@ def _jpeg_frame(header: bytes) -> tuple[int, int, int, int, int]:
         max(8 * (each & 15) for each in sampling),
     )
     if precision != 8 or components > 4 or not 0 < unit_width <= 32 or not 0 < unit_height <= 32:
-        raise MalformedMessage(
-            "image: broken JPEG (its header has invalid values, or other than 8 bits)"
-        )
+        raise MalformedMessage("image: expected a JPEG of 8 bits with a valid header, got another")
     return height, width, components, unit_height, unit_width
 
 

@@ -100,8 +100,8 @@ def quantize(policy: Any, kind: Quantization) -> None:
         torchao.quantize_(attrgetter(policy.network)(policy), config)
     except (RuntimeError, AttributeError, NotImplementedError, AssertionError) as error:
         raise ConfigError(
-            f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); "
-            "try the other one, or dtype: bfloat16"
+            f"quantization {kind!r}: torchao cannot use it on this machine "
+            f"({type(error).__name__}: {error}); try the other type, or dtype: bfloat16"
         ) from error
 
 

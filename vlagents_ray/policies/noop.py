@@ -18,12 +18,12 @@ class NoopConfig(BaseModel, extra="forbid"):
 
     action_dim: int = Field(default=7, ge=1)
     delta: bool | None = Field(
-        default=None, description="whether the contract states relative actions"
+        default=None, description="whether the contract declares relative actions"
     )
     chunk: int = Field(
         default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)"
     )
-    base_ms: float = Field(default=0.0, ge=0, description="time a batch takes, whatever its size")
+    base_ms: float = Field(default=0.0, ge=0, description="duration of a batch of any size")
     per_item_ms: float = Field(default=0.0, ge=0, description="time that each item of a batch adds")
 
 

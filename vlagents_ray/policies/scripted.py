@@ -20,7 +20,7 @@ class ScriptedConfig(BaseModel, extra="forbid"):
         default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'"
     )
     expert: str | None = Field(
-        default=None, description="'module:Class' of an expert, in place of the env's own one"
+        default=None, description="'module:Class' of an expert that replaces the env's own"
     )
 
 

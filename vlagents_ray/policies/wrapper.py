@@ -149,7 +149,7 @@ def build_agent(
     cls = policy_class(policy)
     if not issubclass(cls, Agent):
         raise UnknownPolicy(
-            f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent"
+            f"policy {policy!r}: expected an Agent; derive the class from vlagents_ray.Agent"
         )
     if cls.act is Agent.act and cls.act_batch is Agent.act_batch:
         raise ConfigError(

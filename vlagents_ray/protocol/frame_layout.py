@@ -92,7 +92,7 @@ def unpack(
 
     lengths = header.get("blobs") if isinstance(header, dict) else None
     if not isinstance(lengths, list) or not all(type(n) is int and n >= 0 for n in lengths):
-        raise MalformedMessage("frame: the header has no list 'blobs' of lengths")
+        raise MalformedMessage("frame: expected a list 'blobs' of lengths in the header, got none")
     blobs: list[Buffer] = []
     for blob_length in lengths:
         offset += -offset % _ALIGN
@@ -145,7 +145,8 @@ def parse_json(
         # Parsing would need far more memory and time than the length suggests.
         if sum(map(data.count, marks)) > max_values:
             raise MessageTooLarge(
-                f"message: more than {max_values} values in its JSON; send arrays instead of lists"
+                f"message: expected at most {max_values} values in its JSON, got more; send "
+                "arrays instead of lists"
             )
 
     try:

@@ -264,7 +264,8 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
 
     if len(nodes) > 1 and sum(map(len, (*nodes, *writer.blobs))) > DEFAULT_LIMITS.body_bytes:
         error = MessageTooLarge(
-            f"replies: over {DEFAULT_LIMITS.body_bytes} bytes together; ask for fewer at once"
+            f"replies: expected at most {DEFAULT_LIMITS.body_bytes} bytes together, got more; "
+            "request fewer at once"
         )
         error_replies = [Reply(reply.request_id, error=error) for reply in replies]
         return encode_replies(error_replies, arrived=arrived)

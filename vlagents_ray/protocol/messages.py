@@ -344,9 +344,9 @@ class Budget:
         self._left -= size
         if self._left < 0:
             raise MessageTooLarge(
-                f"request: its images and bytes take more than {self.limits.decoded_bytes} bytes, "
-                "decoded, each as often as it is named; send fewer or smaller ones, or raise "
-                "`limits.decoded_bytes`"
+                f"request: expected images and bytes of at most {self.limits.decoded_bytes} bytes "
+                "in all when decoded, got more (each counts as often as it is named); send fewer "
+                "or smaller ones, or raise `limits.decoded_bytes`"
             )
 
     def hold(self, size: int) -> None:
@@ -366,9 +366,9 @@ class Budget:
         self._seconds_left -= seconds
         if self._seconds_left < 0:
             raise MessageTooLarge(
-                f"request: decoding its images takes {-self._seconds_left:.3g} s longer than it "
-                "may; send fewer or smaller ones, or raise `limits.decoded_bytes`, to which the "
-                "time is in proportion"
+                f"request: decoding its images takes {-self._seconds_left:.3g} s longer than "
+                "allowed; send fewer or smaller ones, or raise `limits.decoded_bytes`, to which "
+                "the allowed time is proportional"
             )
         yield
 

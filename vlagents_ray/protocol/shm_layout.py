@@ -260,7 +260,9 @@ class ShmReader:
             ) from error
 
         if len(requests) != count or not count:
-            raise MalformedMessage(f"local: {len(requests)} acts in a message that says {count}")
+            raise MalformedMessage(
+                f"local: expected {count} acts, as the message announces, got {len(requests)}"
+            )
         return requests
 
     def _layout(self, text: bytes) -> Layout:

@@ -128,7 +128,8 @@ class ValueReader:
         self._items += 1
         if self._items > self.limits.items:
             raise MessageTooLarge(
-                f"info: more than {self.limits.items} values; send arrays instead of lists"
+                f"info: expected at most {self.limits.items} values, got more; send arrays "
+                "instead of lists"
             )
         if not isinstance(node, (dict, list)):
             return node

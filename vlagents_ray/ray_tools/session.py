@@ -410,7 +410,7 @@ def _choose(url_or_app: str | None) -> LocalServer:
         )
     raise ConfigError(
         "no server of this user is ready on this machine; start one with `vlagents-ray serve "
-        "POLICY`. Those of other users, and on other machines, are reached at their URL: "
+        "POLICY`. Connect to servers of other users, or on other machines, by URL: "
         "RemoteAgent('http://HOST:8000')"
     )
 

@@ -261,7 +261,8 @@ class MotionLimits:
         unknown = sorted(set(names) - set(elements))
         if unknown:
             raise ConfigError(
-                f"{file}: has no joints {unknown}, has {sorted(elements)}; name them in `joints`"
+                f"{file}: expected the joints {sorted(elements)}, got {unknown}; name them in "
+                "`joints`"
             )
 
         def limit_of(name: str, key: str, default: float) -> float:

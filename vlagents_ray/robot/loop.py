@@ -336,9 +336,9 @@ class LoopReport:
                 cause, most_ticks = safe_cause, safe_ticks
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
-            f"of it, most often: {self.reasons.get(cause, cause)}. If answers come too late, use a "
-            "lower rate (hz), a policy with longer chunks, or let a tick wait for its answer "
-            "(deadline_s, --deadline-ms)"
+            f"of the policy, most often: {self.reasons.get(cause, cause)}. If answers arrive too "
+            "late, use a lower rate (hz) or a policy with longer chunks, or let a tick wait for "
+            "its answer (deadline_s, --deadline-ms)"
         )
 
     @property
@@ -349,7 +349,7 @@ class LoopReport:
             return None
         return (
             f"apply takes {self.apply_p50_ms:.3g} ms of a tick of {tick_ms:.3g} ms: send the "
-            "command and return, do not wait until the arm is there"
+            "command and return, without waiting for the arm to arrive"
         )
 
     def log_warnings(self) -> None:
@@ -692,7 +692,7 @@ class _Run:
                 if self._command(last) is not None:
                     break
         except InvalidAction as error:
-            logger.warning("the way to the rest pose ends here: %s", error)
+            logger.warning("the robot stops on its way to the rest pose: %s", error)
 
     def _reason_to_hold(self, act: Act) -> Held | None:
         """Apply new commands; return why this tick may command nothing, or None."""

@@ -153,7 +153,7 @@ class PendingRequest:
             self.message.answer(self.index, reply)
         except Exception:
             logger.exception(
-                "request %s: its caller could not take the reply", self.request.request_id
+                "request %s: its caller could not accept the reply", self.request.request_id
             )
 
     def drop_preparation(self) -> None:

@@ -78,7 +78,7 @@ class Session(Generic[M]):
     def wrong_step(self, step: int) -> UnknownSession:
         """Return the error for an act at another step, which would repeat or skip an act."""
         return UnknownSession(
-            f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an "
+            f"session {self.id!r}: expected step {self.steps}, got {step} from its client; an "
             "answer was lost, or this is another episode: reset it"
         )
 
@@ -281,7 +281,7 @@ class SessionTable(Generic[M]):
             newest = max(newest, present.version)
         if arriving.version <= newest:
             raise Outdated(
-                f"session {arriving.id!r}: a newer state of it is here, or has been; reset it"
+                f"session {arriving.id!r}: this replica has, or had, a newer state of it; reset it"
             )
 
     def expect(self, arriving: Session[M]) -> None:

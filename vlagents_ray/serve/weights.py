@@ -522,7 +522,8 @@ class ModelWeights:
         with CAPTURES.pushes:
             if self._asleep:
                 raise PolicyUnavailable(
-                    "weights: the policy sleeps; give wake() the new values, or call it first"
+                    "weights: expected a policy that is awake, got one that sleeps; give wake() "
+                    "the new values, or call it first"
                 )
             with beside_acts(self._device):
                 yield

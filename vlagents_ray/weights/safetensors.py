@@ -134,7 +134,9 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
             data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_duplicate_keys
         )
     except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
+        raise MalformedMessage(
+            f"safetensors: expected a JSON document as the header ({error})"
+        ) from error
     if not isinstance(document, dict):
         raise MalformedMessage(
             "safetensors: expected an object with a value for each name, got "

@@ -540,8 +540,9 @@ def completed(
     """
     if not allow_same and all(_is_equal(value, current[name]) for name, value in new.items()):
         raise UnchangedWeights(
-            f"weights: all {len(new)} values equal those that the policy holds; push what the "
-            "optimizer changes, or allow it with allow_same=True"
+            f"weights: expected values that differ from the policy's, got {len(new)} equal ones; "
+            "push the parameters that the optimizer changes, or allow equal values with "
+            "allow_same=True"
         )
 
     missing = {name: value for name, value in current.items() if name not in new}

@@ -124,7 +124,7 @@ def entry(cls: type[T], value: Any, where: str) -> T:
     values = closed(cls, {"key": value} if isinstance(value, str) else value, where, ConfigError)
     known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
     if "key" in known and not values.get("key"):
-        raise ConfigError(f"{where}: no key; say where it lies in their observation")
+        raise ConfigError(f"{where}: expected a key of the client's observation, got none; add it")
     if values.get("layout", "hwc") not in get_args(Layout):
         raise ConfigError(
             f"{where}.layout: expected one of {get_args(Layout)}, got {values['layout']!r}"
@@ -545,7 +545,7 @@ class KeyMapping:
             for name in needed:
                 if not any(matches(name, pattern) for pattern in patterns):
                     sentences.append(
-                        f"{kind} {name!r}: the policy needs it, the mapping gives "
+                        f"{kind} {name!r}: the policy needs it, the mapping provides "
                         f"{sorted(patterns)}; add it to mapping.{setting}"
                     )
         if contract.gripper and self.gripper is None:
@@ -673,6 +673,7 @@ class KeyMapping:
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
     """Log the cameras of a client that the mapping does not read."""
     logger.warning(
-        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the "
-        f"mapping reads {list(read)}; if the policy takes them, add them to mapping.cameras"
+        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not "
+        f"receive, as the mapping reads only {list(read)}; if the policy needs them, add them to "
+        "mapping.cameras"
     )

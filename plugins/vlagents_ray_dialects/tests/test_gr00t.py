@@ -341,7 +341,7 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(
         with PolicyClient(port, n15=True) as client:
             for _ in range(2):
                 client.get_action_n15(so100(9, "abcd"))
-    [said] = [one for one in caplog.messages if "which the policy does not get" in one]
+    [said] = [one for one in caplog.messages if "which the policy does not receive" in one]
     assert said.startswith("gr00t: a client sends the cameras ['video/wrist']")
 
 

@@ -268,15 +268,15 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(
                 more["images"] |= {"side": image(0)}
                 send(socket, "observation", more, 1)
                 assert receive(socket).kind == "action"
-    said = sorted(one for one in caplog.messages if "which the policy does not get" in one)
+    said = sorted(one for one in caplog.messages if "which the policy does not receive" in one)
     assert [one.partition(", which")[0] for one in said] == [
         "openpi: a client sends the cameras ['images/cam_low']",
         "openvla: a client sends the cameras ['top']",
         "vla_eval: a client sends the cameras ['images/side']",
     ]
     assert (
-        "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes "
-        "them"
+        "the mapping reads only ['observation/image', 'observation/wrist_image']; if the policy "
+        "needs them"
     ) in said[0]
 
 

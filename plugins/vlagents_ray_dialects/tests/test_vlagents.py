@@ -377,7 +377,7 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(
         with Client(port) as robot:
             for _ in range(2):
                 robot.act(document(5))
-    [said] = [one for one in caplog.messages if "which the policy does not get" in one]
+    [said] = [one for one in caplog.messages if "which the policy does not receive" in one]
     assert said.startswith("vlagents: a client sends the cameras ['cameras/")
 
 

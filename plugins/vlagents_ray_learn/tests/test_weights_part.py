@@ -221,7 +221,9 @@ def test_the_part_is_on_unless_a_deployment_turns_it_off(start: Start) -> None:
         PartArgs(**{PART: None}), PartContext(replica.engine, "without", "node", dict)
     )
     assert not any("weights" in getattr(route, "path", "") for route in parts.routes())
-    with pytest.raises(LookupError, match="part 'weights': this replica has no method 'push'"):
+    with pytest.raises(
+        LookupError, match="part 'weights': expected a method for other replicas, got 'push'"
+    ):
         asyncio.run(parts.call(PART, "push", gains(5), PushOptions()))
     parts.close()
 

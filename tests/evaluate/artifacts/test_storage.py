@@ -167,7 +167,7 @@ def test_a_file_system_without_locks_is_named(
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr("fcntl.flock", no_locks)
-    with pytest.raises(ConfigError, match=r"its file system knows no locks .*--out .*-o flock"):
+    with pytest.raises(ConfigError, match=r"expected a file system with locks, .*--out .*-o flock"):
         Store(resolve(config()))
 
 

@@ -120,10 +120,13 @@ def test_what_does_not_change_the_outcome_keeps_the_key(
 @pytest.mark.parametrize(
     ("second", "said"),
     [
-        ({"envs": [LINE], "env_options": {"width": 8}}, "are in two suites of one name"),
+        (
+            {"envs": [LINE], "env_options": {"width": 8}},
+            "expected each case once in suites of one name",
+        ),
         (
             {"name": "all", "envs": [LINE, OTHER_LINE], "seeds": [100]},
-            "stand in two suites with the same settings",
+            "expected each episode once, got .* in two suites with the same settings",
         ),
     ],
 )
@@ -138,14 +141,14 @@ def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(
 def test_policies_whose_episodes_would_share_their_files_are_refused(config: Config) -> None:
     [policy] = config().policies
     policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
-    with pytest.raises(ConfigError, match="would share files"):
+    with pytest.raises(ConfigError, match="expected names whose files differ"):
         plan_cases(config().model_copy(update={"policies": policies}))
 
 
 def test_a_pattern_stands_for_the_tasks_that_match() -> None:
     assert expand("tabletop/*") == [f"tabletop/{task}" for task in Tabletop.tasks()]
     assert expand("tabletop") == ["tabletop"]
-    with pytest.raises(UnknownEnv, match="matches none of the tasks of 'tabletop'"):
+    with pytest.raises(UnknownEnv, match=r"expected tasks of 'tabletop', .*, which matches none"):
         expand("tabletop/x*")
 
 
@@ -257,11 +260,11 @@ def test_a_batch_has_no_latency_to_measure() -> None:
         ({"envs": ["a", "b", "a"]}, "named twice"),
         (
             {"policies": [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]},
-            "two policies are named",
+            "policies: expected different names",
         ),
         (
             {"policy_options": {"seed": 3, "checkpoint_step": 20}},
-            r"\['seed'\] are set episode by episode",
+            r"expected none that the evaluation sets for each episode, got \['seed'\]",
         ),
     ],
 )

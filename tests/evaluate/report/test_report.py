@@ -218,7 +218,7 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
     assert "100.0 % solved" in page.words
 
 
-@pytest.mark.parametrize(("better", "verdict"), [(4, ", not told apart"), (20, "")])
+@pytest.mark.parametrize(("better", "verdict"), [(4, ", not significant"), (20, "")])
 def test_the_headline_of_two_policies_is_their_difference(
     better: int, verdict: str, tmp_path: Path
 ) -> None:

@@ -188,7 +188,7 @@ def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
         store.begin_run({})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 3})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
-        with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
+        with pytest.raises(ConfigError, match=r"expected the checkpoint 'a' .*, got 'b'"):
             store.note_policy("policy", {"policy": "act", "checkpoint": "b"})
         assert Results.load(config().out).policies == {
             "policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}
@@ -264,7 +264,7 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
         (
             {"checkpoint": "runs/1"},
             {"checkpoint": "runs/2"},
-            r"played by checkpoint 'runs/2'.* are of 'runs/1'",
+            r"expected the checkpoint 'runs/1' .*, got 'runs/2'",
         ),
         (
             {"checkpoint": "runs/1", "weights": "a"},

@@ -301,7 +301,7 @@ def test_a_case_that_stopped_early_says_after_how_many_and_at_which_error_rate(
         ([(None, None), (None, None)], None),
         ([(0, 0), (0, 0)], None),
         ([(3, 3), (3, 3)], "version 3 (digest 3)"),
-        ([(0, 0), (2, 3)], "versions 0 to 3, one after the other"),
+        ([(0, 0), (2, 3)], "versions 0 to 3 in turn"),
     ],
 )
 def test_pushed_weights_are_named_with_the_checkpoint(

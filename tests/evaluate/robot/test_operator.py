@@ -221,7 +221,7 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     assert verdict["ending"] == "stopped by the operator"
     assert person.answer("repeat", verdict, note="I was away") == 200
     again = person.until("scene")
-    assert again["trial"]["message"] == "played again: I was away"
+    assert again["trial"]["message"] == "repeated: I was away"
     assert again["trial"]["attempt"] == 2
     assert arm.applied == applied
     person.answer("end", again)

@@ -220,7 +220,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     )
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
-    [told] = [line for line in person.printed if "played again" in line]
+    [told] = [line for line in person.printed if "repeated" in line]
     assert told.strip() == f"played again: it could not be played ({code})"
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert attempt.cause == "policy"
@@ -311,7 +311,7 @@ def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
         raise EOFError
 
     config = plan(tmp_path / "out")
-    with pytest.raises(TrialsInterrupted, match="after 0 of 8 trials; go on with --resume"):
+    with pytest.raises(TrialsInterrupted, match="after 0 of 8 trials; continue with --resume"):
         evaluate_on_robot(config, ScriptedPerson(nobody), robot=arm, agent_factory=Policies())
     assert applied == [0]
     assert arm.applied == 0
@@ -423,7 +423,7 @@ def test_another_plan_or_key_is_refused(tmp_path: Path, changes: dict[str, Any])
             plan(tmp_path / "out"), ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies()
         )
     other = plan(tmp_path / "out", resume=True, **changes)
-    with pytest.raises(ConfigError, match="is of another plan, robot or key"):
+    with pytest.raises(ConfigError, match="expected a log of this plan, robot and key"):
         evaluate_on_robot(other, ScriptedPerson(typed([])), agent_factory=Policies())
 
 

@@ -186,7 +186,7 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
     capacity.report_shortage(WANTED, running=1)
     clock.now = 1101.0
     with pytest.raises(
-        ConfigError, match=r"no room for a worker in 100 s: each needs .*64.* lower `workers`"
+        ConfigError, match=r"expected .*64.* for each worker within 100 s, .* lower `workers`"
     ):
         capacity.report_shortage(WANTED, running=1)
 

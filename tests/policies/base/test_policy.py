@@ -225,7 +225,9 @@ def test_the_named_network_is_quantized_once_loaded_and_no_weights_can_be_pushed
     policy = Quantizable.from_config({"checkpoint": "none", "quantization": "float8"})
     policy.initialize()
     assert policy.model == {"weights": "float8"}
-    with pytest.raises(NotTrainable, match="quantization 'float8': weights of 8 bits"):
+    with pytest.raises(
+        NotTrainable, match="quantization 'float8': a learner cannot push to 8-bit weights"
+    ):
         policy.parameters()
 
 

@@ -154,7 +154,7 @@ DOCUMENTS = [
         {},
         "send multipart/form-data, in it the document as part 'obs' and each image",
     ),
-    (b'{"state": {"joints": [1, 2], "joints": [3, 4]}}', {}, "the key 'joints' stands twice"),
+    (b'{"state": {"joints": [1, 2], "joints": [3, 4]}}', {}, "the key 'joints' occurs twice"),
     (gzip.compress(b"{}"), {"content-encoding": "gzip"}, "content-encoding: got 'gzip', want none"),
     (gzip.compress(b"{}"), {}, "body: got gzip, want it uncompressed"),
     (b"{}", {"content-encoding": "br"}, "content-encoding: got 'br', want none"),

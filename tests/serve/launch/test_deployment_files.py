@@ -38,7 +38,7 @@ def application(args: str) -> str:
         (application("{policy: noop, batch: {max_size: 0}}"), "max_size"),
         (
             application("{policy: noop, dialects: {vlagents: {}, gr00t: {port: 8080}}}"),
-            "share port 8080",
+            "expected a port for each dialect, got 8080",
         ),
         (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
         (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),

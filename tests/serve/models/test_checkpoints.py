@@ -101,7 +101,7 @@ def test_a_batch_is_run_checkpoint_by_checkpoint(
         ({"steps": True}, {"checkpoint_step": -1}, "a number of training steps"),
         ({"steps": True}, {"checkpoint_step": True}, "a number of training steps"),
         ({"steps": True}, {"checkpoint_step": "../../b"}, "a number of training steps"),
-        ({}, {"checkpoint": "b"}, "none but its own"),
+        ({}, {"checkpoint": "b"}, "expected none, as there is only one"),
     ],
 )
 def test_what_is_not_offered_is_refused_with_what_is(

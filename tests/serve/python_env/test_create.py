@@ -202,7 +202,7 @@ class TestWithoutAGpu:
         create(tmp_path / "env")
         monkeypatch.setattr(making, "_uv", uv)
         with pytest.raises(
-            ConfigError, match=r"bring CUDA packages \(nvidia-cublas==13.0, …\).*NAME.cpu.txt"
+            ConfigError, match=r"include CUDA packages \(nvidia-cublas==13.0, …\).*NAME.cpu.txt"
         ):
             make_environment(requirements, tmp_path / "env")
         assert len(asked) == 1
@@ -315,7 +315,7 @@ def test_missing_requirements_and_a_folder_of_something_else_are_refused(
         match=r"expected a requirements file, got '/no/such\.txt', which does not exist",
     ):
         make_environment(Path("/no/such.txt"), tmp_path / "env")
-    with pytest.raises(ConfigError, match="holds no Python environment"):
+    with pytest.raises(ConfigError, match="expected a new folder or a Python environment"):
         make_environment(requirements, tmp_path)
 
 

@@ -133,10 +133,14 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "mode", "said"),
     [
-        ("#!/bin/sh\necho hello\n", 0o755, "no Python interpreter, or a broken one: hello"),
-        ("#!/bin/sh\nexit 1\n", 0o755, "it said nothing"),
+        (
+            "#!/bin/sh\necho hello\n",
+            0o755,
+            "expected a Python interpreter, got .*, which is another program, or broken: hello",
+        ),
+        ("#!/bin/sh\nexit 1\n", 0o755, "no output"),
         ("#!/bin/sh\n", 0o644, "Permission denied"),
-        ("not a program", 0o755, "no Python interpreter"),
+        ("not a program", 0o755, "expected a Python interpreter"),
         (
             '#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n',
             0o755,

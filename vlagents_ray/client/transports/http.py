@@ -116,8 +116,8 @@ class HttpTransport:
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
             raise ConfigError(
-                f"{self._url.geturl()}: answers, but is no vlagents_ray server "
-                f"({str(metadata)[:80]})"
+                f"{self._url.geturl()}: expected a vlagents_ray server, got another one "
+                f"({str(metadata)[:80]}); check the URL"
             )
         return metadata
 
@@ -136,7 +136,8 @@ class HttpTransport:
         document = _json(body)
         if not isinstance(document, dict):
             raise ConfigError(
-                f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})"
+                f"{self._url.geturl()}: expected a vlagents_ray server, got another one "
+                f"({body[:80]!r}); check the URL"
             )
         return document
 
@@ -266,12 +267,12 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
     text = body[:200].decode(errors="replace").strip()
     if status == 413:
         return MessageTooLarge(
-            f"a proxy takes no body as large ({text}); raise its limit, or send JPEG"
+            f"a proxy rejects bodies of this size ({text}); raise its limit, or send JPEG"
         )
     if status in (401, 403):  # without a JSON document, as when a WebSocket is refused
         return (Unauthorized if status == 401 else Forbidden)(
-            f"the server refuses this API key, or that there is none (HTTP {status}); set api_key "
-            f"or {KEY_VARIABLE}"
+            f"the server rejects this API key, or requires one (HTTP {status}); set api_key or "
+            f"{KEY_VARIABLE}"
         )
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")

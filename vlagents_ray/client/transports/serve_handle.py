@@ -292,7 +292,7 @@ class PlasmaTransport(UnixTransport):
         if node is None:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the "
-                "cluster; a Ray client (ray://) is none: use http://"
+                "cluster, not a Ray client (ray://); use http://"
             )
 
         address = read_address(PlasmaAddress, metadata.get("plasma"))

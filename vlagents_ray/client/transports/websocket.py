@@ -130,7 +130,9 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
             raise refusal(
                 error.response.status_code, kind, bytes(error.response.body or b"")
             ) from error
-        raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
+        raise PolicyUnavailable(
+            f"{url}: the handshake was rejected with HTTP {error.response.status_code}"
+        ) from error
     except (OSError, InvalidHandshake, TimeoutError) as error:
         if isinstance(error, InvalidHandshake):
             require_plain(urlsplit(url), timeout_s)

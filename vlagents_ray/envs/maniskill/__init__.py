@@ -308,7 +308,7 @@ def _described(
     if not reconfigure:
         deviations.append("reconfigure is False: scenes are kept from episode to episode")
     if max_steps != task_limit:
-        deviations.append(f"max_steps is {max_steps}, the task's own is {task_limit}")
+        deviations.append(f"max_steps is {max_steps}, the task's limit is {task_limit}")
     return simulator.describe() | {
         "reconfigure": reconfigure,
         "protocol": {**PROTOCOL, "deviations": deviations},

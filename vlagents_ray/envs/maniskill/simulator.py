@@ -410,7 +410,8 @@ class Simulator:
                 )
             if "success" not in self.env.get_info():
                 raise ConfigError(
-                    f"{self.name} does not say what success is: there is nothing to evaluate"
+                    f"{self.name}: expected a task that reports success, got one without; choose "
+                    "another"
                 )
 
             sizes = {}

@@ -199,7 +199,8 @@ class TrajectoryRecorder(EpisodeObserver):
 
         if self._grippers and (obs.gripper is None) != (self._grippers[0] is None):
             raise EnvFailed(
-                "env step: an observation has a gripper, another of the same episode has none"
+                "env step: expected a gripper in all observations of an episode or in none, got "
+                "both"
             )
 
         # The cameras are those of the reset; a later observation may lack them.

@@ -20,7 +20,7 @@ from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
 from vlagents_ray.registry import target_of
 
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
-_RESUME = "what was recorded is kept: go on with --resume"
+_RESUME = "finished episodes are kept: continue with --resume"
 _FULL = f"make room; {_RESUME}"
 _REFUSED = "make it writable, or choose another folder"
 _CURES = {
@@ -75,8 +75,8 @@ def inside(home: Path, path: str) -> Path:
     resolved_path = (home / require_below(path)).resolve()
     if not resolved_path.is_relative_to(home.resolve()):
         raise ConfigError(
-            f"{home / path}: is a symbolic link out of the folder of results; if you trust it, "
-            "copy what it leads to into the folder in its place"
+            f"{home / path}: expected a file in the folder of results, got a symbolic link that "
+            "leads out of it; if you trust it, replace it with a copy of its target"
         )
     return resolved_path
 

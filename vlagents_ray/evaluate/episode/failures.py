@@ -274,7 +274,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
         if not is_finite(obs, 0.0):
             error_class = errors.EnvFailed
         raise error_class(
-            f"env {where}: the observation does not fit the env's own contract: {error}"
+            f"env {where}: the observation contradicts the env's contract: {error}"
         ) from error
     except TypeError as error:  # such as a gripper that is not a number
         raise error_class(

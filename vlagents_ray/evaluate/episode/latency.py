@@ -67,9 +67,9 @@ class ChunkExecutor:
         needs_neutral = self._clock.latency != 0 and stopping(env.action) != "zero"
         if needs_neutral and self._clock.neutral is None:
             raise ConfigError(
-                "clock: the env's contract does not say that its actions are relative, so that "
-                "zeros may be a pose to go to; give clock.neutral, the action that is executed "
-                "before the first answer comes"
+                "clock: expected clock.neutral, the action before the first answer, or an env "
+                "whose contract declares relative actions, got neither; give clock.neutral, as "
+                "zeros might be a pose to move to"
             )
 
         self._plan = ChunkBuffer()

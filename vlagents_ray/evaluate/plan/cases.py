@@ -174,8 +174,8 @@ def _tasks_of_robot(robot: RobotConfig, pattern: str) -> list[str]:
     tasks = fnmatch.filter(robot.tasks, pattern)
     if not tasks:
         raise UnknownEnv(
-            f"{pattern!r}: matches none of the plan's `robot.tasks`, which are "
-            f"{sorted(robot.tasks)}"
+            f"expected tasks of the plan's `robot.tasks`, {sorted(robot.tasks)}, got {pattern!r}, "
+            "which matches none"
         )
     return tasks
 
@@ -186,7 +186,8 @@ def _require_distinct(cases: list[EvalCase]) -> None:
     repeated = sorted({env for (_, _, env), number in names.items() if number > 1})
     if repeated:
         raise ConfigError(
-            f"suites: {repeated} are in two suites of one name; give each suite another `name`"
+            f"suites: expected each case once in suites of one name, got {repeated} in two; give "
+            "each suite another `name`"
         )
 
     names_by_path: dict[tuple[str, ...], tuple[str, ...]] = {}
@@ -195,16 +196,16 @@ def _require_distinct(cases: list[EvalCase]) -> None:
         other = names_by_path.setdefault(path, name)
         if other != name:
             raise ConfigError(
-                f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another "
-                "name"
+                f"expected names whose files differ, got {' '.join(name)!r} and "
+                f"{' '.join(other)!r}; rename one"
             )
 
     fingerprints = Counter(case.fingerprint for case in cases)
     repeated = sorted({case.env for case in cases if fingerprints[case.fingerprint] > 1})
     if repeated:
         raise ConfigError(
-            f"suites: {repeated} stand in two suites with the same settings, so that these are the "
-            "same episodes; leave them out of one of the two"
+            f"suites: expected each episode once, got {repeated} in two suites with the same "
+            "settings; leave them out of one of the two"
         )
 
 
@@ -228,5 +229,7 @@ def expand(pattern: str) -> list[str]:
     envs = [f"{suite}/{task}" for task in cls.tasks()]
     matching = fnmatch.filter(envs, pattern)
     if not matching:
-        raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {envs}")
+        raise UnknownEnv(
+            f"expected tasks of {suite!r}, {envs}, got {pattern!r}, which matches none"
+        )
     return matching

@@ -127,7 +127,10 @@ class PolicyConfig(_PlanModel):
             reserved.add("checkpoint_step")
         conflicts = sorted(reserved & self.options.keys())
         if conflicts:
-            raise ValueError(f"options: {conflicts} are set episode by episode; leave them out")
+            raise ValueError(
+                "options: expected none that the evaluation sets for each episode, got "
+                f"{conflicts}; leave them out"
+            )
         return self
 
 
@@ -312,7 +315,10 @@ class EvalConfig(_PlanModel):
         names = [policy.name for policy in policies]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise ValueError(f"two policies are named {repeated}; give each another `name`")
+            raise ValueError(
+                f"policies: expected different names, got {repeated} twice; give each another "
+                "`name`"
+            )
         return policies
 
     @property

@@ -160,7 +160,7 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
         return None
 
     [difference] = differences
-    verdict = "" if difference.decided else ", not told apart"
+    verdict = "" if difference.decided else ", not significant"
     low, high = (charts.points(bound) for bound in difference.interval)
     return Figure(
         f"{charts.points(difference.pairs.difference)} points",
@@ -190,7 +190,10 @@ def _solved(summary: Summary) -> Figure:
     known = sorted(
         (rate for rate in rates if rate.rate is not None), key=lambda rate: rate.rate or 0.0
     )
-    note = f"{quantity(len(cases), 'task')} that stopped apart: no rate in common"
+    note = (
+        f"{quantity(len(cases), 'task')} that stopped after different numbers of episodes: no "
+        "common rate"
+    )
     return Figure(f"{percent(known[0])} to {percent(known[-1])} %", name, note)
 
 
@@ -287,7 +290,7 @@ def latency(summary: Summary) -> Latency | None:
         rows.append((name, times, reset_ms, sum(result.acts for result in results)))
 
     bars = dict(itertools.islice(timed.items(), MOST_BARS))
-    chart = charts.bar_chart(bars, "One act of the policy, by stage") if bars else None
+    chart = charts.bar_chart(bars, "Time of one call of the policy, by stage") if bars else None
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
 

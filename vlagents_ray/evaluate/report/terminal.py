@@ -288,7 +288,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     if summary.state == RUNNING:
         lines.append("still running")
     elif summary.state != "complete":
-        lines.append(f"{summary.state}: go on with --resume")
+        lines.append(f"{summary.state}: continue with --resume")
 
     lines.append(f"results: {summary.out}")
     written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
@@ -326,8 +326,8 @@ def _losses(summary: Summary) -> list[str]:
     lines = []
     if total.policy_errors:
         lines.append(
-            f"{total.policy_errors} episodes ended by an error of the policy; they count as no "
-            "success"
+            f"{total.policy_errors} episodes ended with an error of the policy; they count as "
+            "failures"
         )
     if total.retries:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
@@ -365,8 +365,8 @@ def _early_stops(summary: Summary) -> list[str]:
             )
     if not summary.has_one_rate_each:
         lines.append(
-            "cases that stopped after different numbers of episodes have no rate in common: quote "
-            "each alone"
+            "cases that stopped after different numbers of episodes have no common rate: quote "
+            "each separately"
         )
     return lines
 

@@ -15,7 +15,7 @@ _OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that the identity
 _SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
 MIX = (
-    "bring the old files back, give a new folder (--out), or mix both and have the report say so "
+    "restore the old files, give a new folder (--out), or mix both and have the report say so "
     "(--accept-changes)"
 )
 

@@ -298,9 +298,9 @@ def _changes_between(
         value, other_value = case.settings.get(name), other.settings.get(name)
         if value != other_value:
             raise ConfigError(
-                f"compare: {case.env!r} had {name} {value!r} for {case.contender!r}, but "
-                f"{other_value!r} for {other.contender!r}; evaluate both alike, or name the "
-                "suites apart"
+                f"compare: expected the same {name} of {case.env!r} for all policies, got "
+                f"{value!r} for {case.contender!r} and {other_value!r} for {other.contender!r}; "
+                "evaluate both with the same, or give the suites different names"
             )
 
     changes = program_changes(f"env {case.env}", case.program or None, other.program or None)
@@ -311,17 +311,17 @@ def _changes_between(
     )
     if changes and not accept_changes:
         raise ConfigError(
-            f"compare: {case.contender!r} and {other.contender!r} were not played in the same "
-            "environment:\n"
-            f"{listed(changes)}\nevaluate both in the same one, {_COMPARE_ALL_THE_SAME}"
+            f"compare: expected {case.contender!r} and {other.contender!r} in the same "
+            f"environment, got different ones:\n{listed(changes)}\nevaluate both in the same one, "
+            f"{_COMPARE_ALL_THE_SAME}"
         )
 
     mixed = _mixed(results, case, other)
     if mixed and not accept_changes:
         raise ConfigError(
-            f"compare: episodes of {case.contender!r} and {other.contender!r} in {case.env!r} were "
-            f"played with {' and '.join(mixed)}, as --accept-changes allowed; evaluate both again "
-            f"in a new folder, {_COMPARE_ALL_THE_SAME}"
+            f"compare: expected episodes of {case.contender!r} and {other.contender!r} in "
+            f"{case.env!r} with the same files, got {' and '.join(mixed)}, as --accept-changes "
+            f"allowed; evaluate both again in a new folder, {_COMPARE_ALL_THE_SAME}"
         )
     return changes
 

@@ -237,9 +237,9 @@ def lock(out: Path) -> int:
             if error.errno not in _NO_LOCKS:
                 raise
             raise ConfigError(
-                f"{out}: its file system knows no locks ({error.strerror}), so that two "
-                "evaluations could write to one folder; choose another one with --out (Lustre: "
-                "have it mounted with `-o flock`)"
+                f"{out}: expected a file system with locks, got one without ({error.strerror}), "
+                "where two evaluations could write to one folder; choose another folder with "
+                "--out (Lustre: have it mounted with `-o flock`)"
             ) from error
         return file
 

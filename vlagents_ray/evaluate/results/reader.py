@@ -268,8 +268,8 @@ class Results:
         if not selected:
             known = sorted({f"{case.contender} in {case.env}" for case in self.cases})
             raise ConfigError(
-                f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: "
-                f"{known}"
+                f"{self.out}: expected episodes of {contender or 'any policy'} in "
+                f"{env or 'any env'}, got none: {known}"
             )
         return self.among(selected)
 
@@ -294,8 +294,8 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
         if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:
             raise
         raise ConfigError(
-            f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends "
-            "it; else take a copy of the whole folder from where it was written"
+            f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume "
+            "repairs it; otherwise copy the whole folder again from where it was written"
         ) from error
 
 

@@ -180,9 +180,9 @@ class Store(AbstractContextManager["Store"]):
         (known,) = row
         if result.checkpoint != known:
             raise ConfigError(
-                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results "
-                f"in {self.out} are of {known!r}; serve that one again, or choose another out "
-                "folder"
+                f"policy: expected the checkpoint {known!r} of the results in {self.out}, got "
+                f"{result.checkpoint!r} in {result.key}; serve the first again, or choose another "
+                "out folder"
             )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
@@ -212,7 +212,7 @@ class Store(AbstractContextManager["Store"]):
             name = result.checkpoint or "weights"
             change = Change(f"policy {case.contender}", name, known, result.weights)
             self._accept_or_raise(
-                owner, [change], f"{result.key} was played by other weights than the results in"
+                owner, [change], f"{result.key} was run with other weights than the results in"
             )
             self._weights[owner] = result.weights
 
@@ -278,9 +278,9 @@ class Store(AbstractContextManager["Store"]):
         # its settings name.
         if any(change.was is not None for change in changes):
             raise ConfigError(
-                f"the worker on {made.host} has other files than this process, or they were edited "
-                f"since the start:\n{listed(changes)}\ngive both the same files, and go on with "
-                "--resume"
+                f"expected the files of this process on the worker at {made.host}, got others, or "
+                f"they were edited since the start:\n{listed(changes)}\ngive both the same files, "
+                "and continue with --resume"
             )
 
         # Another worker of this run may have made the env; descriptions may differ between nodes.
@@ -330,9 +330,9 @@ class Store(AbstractContextManager["Store"]):
             field = changed(known, metadata, swept=swept)
             if field in ("policy", "checkpoint"):
                 raise ConfigError(
-                    f"policy {name!r}: the server has {field} {metadata.get(field)!r}, the results "
-                    f"in {self.out} are of {known.get(field)!r}; serve that one again, or choose "
-                    "another out folder"
+                    f"policy {name!r}: expected {field} {known.get(field)!r}, as in the results "
+                    f"in {self.out}, got {metadata.get(field)!r} from the server; serve the "
+                    "first again, or choose another out folder"
                 )
             changes = policy_changes(f"policy {name}", known, metadata, swept=swept)
             self._accept_or_raise(
@@ -391,7 +391,7 @@ class Store(AbstractContextManager["Store"]):
         if not runs and self._plan.resume:
             folders = {file.parent.name for file in self.out.parent.glob(f"*/{FILE}")}
             log.warning(
-                "%s: has no results to resume (--resume), so that the evaluation begins there%s",
+                "%s: has no results to resume (--resume), so a new evaluation begins there%s",
                 self.out,
                 did_you_mean(self.out.name, folders - {self.out.name}),
             )
@@ -415,15 +415,15 @@ class Store(AbstractContextManager["Store"]):
         if differences:
             listing = "\n".join(differences)
             raise ConfigError(
-                f"{self.out} has results of other settings:\n{listing}\n"
-                "take the old settings, or choose another out folder"
+                f"{self.out}: expected results of these settings, got results of "
+                f"others:\n{listing}\nuse the old settings, or choose another out folder"
             )
 
         self._accept_or_raise(
             "plan",
             self._other_plan(db),
             "this plan is not that of the results in",
-            "plan all of it; give a new folder (--out); or go on with this plan and have the "
+            "plan all of it; give a new folder (--out); or continue with this plan and have the "
             "report say so (--accept-changes)",
         )
         self._accept_or_raise(

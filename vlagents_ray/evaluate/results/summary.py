@@ -268,7 +268,7 @@ def pushed_of(case: CaseResults) -> str | None:
     first, last = min(versions), max(versions)
     if first == last:
         return f"version {last} ({fingerprints[last]})"
-    return f"versions {first} to {last}, one after the other"
+    return f"versions {first} to {last} in turn"
 
 
 def cause_of(error: str) -> str:

@@ -274,7 +274,7 @@ class TerminalOperator(Operator):
 
     def _look(self, trial: VisibleTrial, obs: Obs) -> None:
         if not trial.start:
-            self._say("  this scene has no start picture yet: it is taken when you begin")
+            self._say("  this scene has no start picture yet: one is taken when you begin")
         for camera, name in distinct(obs.cameras).items():
             if name in trial.start:
                 self._say(f"  {save_overlay(trial.start[name], obs.cameras[camera])}")
@@ -357,7 +357,7 @@ class PageOperator(Operator):
                 self._ending = "The evaluation is complete: close this page"
             elif issubclass(kind, KeyboardInterrupt):
                 self._ending = (
-                    "The evaluation was interrupted: --resume goes on with it, at a new address"
+                    "The evaluation was interrupted: --resume continues it, at a new address"
                 )
             else:
                 self._ending = "The evaluation ended with an error: see the terminal"

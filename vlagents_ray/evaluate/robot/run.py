@@ -162,7 +162,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
 
         if not hmac.compare_digest(lines[0]["plan"], identity):
             raise ConfigError(
-                f"{self._path}: is of another plan, robot or key; take those, or another out folder"
+                f"{self._path}: expected a log of this plan, robot and key, got another's; use "
+                "those, or choose another out folder"
             )
         self.started = float(lines[0]["at"])
         unfinished_attempts: set[tuple[int, int]] = set()
@@ -378,7 +379,7 @@ def play_trials(
                 run.play()
         except KeyboardInterrupt:
             raise TrialsInterrupted(
-                f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with "
+                f"interrupted after {len(log.finished)} of {len(trials)} trials; continue with "
                 f"--resume --out {plan.out}"
             ) from None
     return _write_results(plan, log, "complete")
@@ -496,7 +497,7 @@ class _RemainingTrials:
             played = play(trial, self._robot, self._factory, self._operator, recording)
         except VLAgentsError as error:
             failure = explain(error)
-            reason, cause = f"it could not be played ({failure.code})", "policy"
+            reason, cause = f"it could not be run ({failure.code})", "policy"
             if failure.code == "env_failed":
                 reason, cause = failure.message, "worker"
             repetition = {"again": reason, "cause": cause}
@@ -556,7 +557,7 @@ class _RemainingTrials:
         earlier_attempts = self._log.of(trial.number)
         message = self._message
         if earlier_attempts:
-            message = f"played again: {earlier_attempts[-1].seen['again']}"
+            message = f"repeated: {earlier_attempts[-1].seen['again']}"
 
         return VisibleTrial(
             number=trial.number,
@@ -590,7 +591,7 @@ class _RemainingTrials:
             if difference is not None:
                 raise ConfigError(
                     f"the {difference} of a policy has changed since its earlier trials; serve all "
-                    "policies as before and go on with --resume, or choose another out folder"
+                    "policies as before and continue with --resume, or choose another out folder"
                 )
 
 

@@ -176,10 +176,9 @@ class CapacityMonitor:
         self._warned = True
         needed = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
-            f"the cluster found no room for a worker in {self._place_s:g} s: each "
-            f"needs {needed}, free are {ray.available_resources()} of {ray.cluster_resources()}; "
-            "lower `workers` or `worker.cpus`, or raise `place_timeout_s` if the cluster is still "
-            "growing"
+            f"expected {needed} for each worker within {self._place_s:g} s, got "
+            f"{ray.available_resources()} free of {ray.cluster_resources()}; lower `workers` or "
+            "`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
         if idle_too_long:
             raise ConfigError(message)

@@ -63,7 +63,7 @@ class WorkerPool(Workers):
         # The API key of this process's environment, which workers on other nodes do not inherit.
         self._credentials = Credentials()
         self._head = HeadMonitor(
-            "what was played is kept: go on with --resume when there is a cluster again"
+            "finished episodes are kept: continue with --resume when a cluster is running again"
         )
         self._placement = Placement()
         self._failed_starts = 0  # in a row

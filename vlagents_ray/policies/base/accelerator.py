@@ -69,8 +69,8 @@ def torch_device(name: str = "auto") -> Any:
         if needs_gpu:
             raise _unusable(f"torch {torch.__version__}", reason) from error
         raise ConfigError(
-            f"device {name!r}: not here ({reason}); use 'auto' or 'cpu', or give the replica a GPU "
-            "with resources: {num_gpus: 1}"
+            f"device {name!r}: not available ({reason}); use 'auto' or 'cpu', or give the replica "
+            "a GPU with resources: {num_gpus: 1}"
         ) from error
 
     described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
@@ -165,8 +165,8 @@ def jax_device(name: str = "auto") -> Any:
         if name == "auto":
             raise _unusable(f"jax {jax.__version__}", str(error).splitlines()[0]) from error
         raise ConfigError(
-            f"device {name!r}: not here, JAX sees {jax.devices()}; use 'auto' or 'cpu', or install "
-            "the jaxlib of your accelerator and give the replica a GPU with resources: "
+            f"device {name!r}: not available, JAX finds {jax.devices()}; use 'auto' or 'cpu', or "
+            "install the jaxlib of your accelerator and give the replica a GPU with resources: "
             "{num_gpus: 1}"
         ) from error
 
@@ -205,9 +205,9 @@ def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
 
     if kind != "cuda" or not offers_cuda:
         raise ConfigError(
-            f"device {name!r}: this onnxruntime offers {runtime.get_available_providers()}; "
-            "replace it by `pip uninstall onnxruntime && pip install onnxruntime-gpu`, or set "
-            "device: cpu with resources: {num_gpus: 0}"
+            f"device {name!r}: this onnxruntime supports only "
+            f"{runtime.get_available_providers()}; replace it with `pip uninstall onnxruntime && "
+            "pip install onnxruntime-gpu`, or set device: cpu with resources: {num_gpus: 0}"
         )
 
     device = {

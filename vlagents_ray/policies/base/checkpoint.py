@@ -166,9 +166,7 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
     if all(_HUB_ID.fullmatch(name) for name in names) and not Path(checkpoint).exists():
         return names[0] != names[1]
-    log.warning(
-        "adapter: whether its base %r is the checkpoint %r cannot be told from their names", *names
-    )
+    log.warning("adapter: the names do not show whether its base %r is the checkpoint %r", *names)
     return False
 
 

@@ -60,7 +60,7 @@ def unfinished(path: Path) -> str | None:
         entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
         files = [entry for entry in entries if entry.is_file()]
         if not files:
-            return f"{path.name}: no file is there"
+            return f"{path.name}: expected a file, got none"
         if all(file.suffix in _TEXT for file in files):
             return f"{path.name}: holds no weights, only {[file.name for file in files]}"
 
@@ -92,7 +92,7 @@ def _safetensors(file: Path) -> str | None:
     with file.open("rb") as opened:
         length = int.from_bytes(opened.read(8), "little")
         if size < 8 + length:
-            return f"has {size} bytes, its header alone has {8 + length}"
+            return f"expected at least {8 + length} bytes, those of its header, got {size}"
         ends = [end for _, end in _data_offsets(opened.read(length))]
     expected_size = 8 + length + max(ends, default=0)
     return None if size == expected_size else f"has {size} bytes, its header says {expected_size}"

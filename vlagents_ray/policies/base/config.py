@@ -45,7 +45,7 @@ class ModelConfig(BaseModel, extra="forbid"):
         description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'",
     )
     dtype: DType = Field(
-        default="auto", description="of the weights; 'auto': the family's own choice"
+        default="auto", description="dtype of the weights; 'auto': the default of the model family"
     )
     matmul: Matmul = Field(
         default="high",
@@ -60,15 +60,20 @@ class ModelConfig(BaseModel, extra="forbid"):
     )
     adapters: dict[str, str] = Field(
         default={},
-        description="LoRA adapters by name, PEFT's folders or hub ids, that sessions may act with "
-        "over the checkpoint; usually set by the `checkpoints` of a deployment",
+        description=(
+            "LoRA adapters by name, as PEFT's folders or hub ids, that sessions may choose for the "
+            "checkpoint; usually set by the `checkpoints` of a deployment"
+        ),
     )
     compile: CompileMode = Field(
         default="auto",
-        description="'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on "
-        "a GPU also of what torch.compile makes of it, if that is faster, and on a CPU that alone; "
-        "what fails, or computes something else, runs without; 'require': true, with an error "
-        "then; 'auto': 'graphs' on a GPU, false on a CPU, with adapters, or if the family has none",
+        description=(
+            "'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on a GPU "
+            "also graphs of the torch.compile'd forward pass, if they are faster, and on a CPU "
+            "torch.compile alone; a part that cannot be compiled, or whose results differ, runs "
+            "uncompiled; 'require': like true, but such a part is an error; 'auto': 'graphs' on a "
+            "GPU, false on a CPU, with adapters, or if the family has no graphs"
+        ),
     )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
@@ -78,16 +83,20 @@ class ModelConfig(BaseModel, extra="forbid"):
     )
     state: list[str] | None = Field(
         default=None,
-        description="parts of the proprioception that make up the model's state vector, in its "
-        "order; 'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the "
-        "family's convention",
+        description=(
+            "parts of the proprioception that make up the model's state vector, in its order; "
+            "'gripper' means `Obs.gripper`, 'gripper_closed' means 1 - `Obs.gripper`; unset: the "
+            "convention of the model family"
+        ),
     )
 
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="chunk",
-        description="an `act` returns: a whole chunk; the next row of one that is kept here, where "
-        "the model is asked every `execute` acts; or one row, the model being asked at each act "
-        "and the chunks averaged",
+        description=(
+            "result of `act`: a whole chunk; the next row of a chunk that the policy keeps, where "
+            "the model runs every `execute` calls; or one row, the average of the chunks of the "
+            "model, which runs at each call"
+        ),
     )
     execute: int | None = Field(
         default=None, ge=1, description="rows of each chunk that are used; unset: all"
@@ -98,24 +107,29 @@ class ModelConfig(BaseModel, extra="forbid"):
     )
 
     max_samples: int = Field(
-        default=1024, ge=0, description="of its distribution that an observation may ask for"
+        default=1024,
+        ge=0,
+        description="samples of its distribution that an observation may request",
     )
     max_rows: int = Field(
         default=64, ge=1, description="rows in one forward pass, at most; samples count as rows"
     )
     batch_sizes: list[int] | None = Field(
         default=None,
-        description="the only numbers of rows to run, ascending; each is run, or compiled, when "
-        "the model is loaded, smaller batches are padded; unset: if the model is compiled those "
-        "of the deployment's `batch`, else any",
+        description=(
+            "the only batch sizes to run, ascending; each is run, or compiled, when the model is "
+            "loaded, and smaller batches are padded; unset: the sizes of the deployment's `batch` "
+            "if the model is compiled, else any"
+        ),
     )
 
     @model_validator(mode="after")
     def _step_has_a_place(self) -> Self:
         if (STEP in self.checkpoint) != (self.checkpoint_step is not None):
             raise ValueError(
-                f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give "
-                f"both the place {STEP} and the step that belongs there, or neither"
+                f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: "
+                f"expected either both {STEP} in the checkpoint and a step, or neither; add or "
+                "remove one"
             )
         return self
 

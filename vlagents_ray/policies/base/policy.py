@@ -371,8 +371,8 @@ class ModelPolicy(Agent, abc.ABC):
         quantization = self.config.quantization
         if quantization is not None:
             raise NotTrainable(
-                f"quantization {quantization!r}: weights of 8 bits cannot be replaced by a "
-                "learner's; leave it out"
+                f"quantization {quantization!r}: a learner cannot push to 8-bit weights; leave it "
+                "out"
             )
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 

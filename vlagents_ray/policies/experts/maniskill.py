@@ -9,7 +9,7 @@ from vlagents_ray.policies.experts import sim_vector
 
 _UNIT_M = 0.1  # motion commanded by an action of 1.0
 _OPEN, _CLOSED = 1.0, -1.0
-_CURE = "this expert is for the env's own robot, in the control mode pd_ee_delta_pose"
+_CURE = "this expert needs the env's default robot, in the control mode pd_ee_delta_pose"
 
 
 class _CubeExpert:

@@ -111,5 +111,6 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         return Checkpoint.model_validate_json((folder / CONFIG).read_text(encoding="utf-8"))
     except ValidationError as error:
         raise ConfigError(
-            f"{folder / CONFIG}: is no checkpoint of the reference policy: {error}"
+            f"{folder / CONFIG}: expected a checkpoint of the reference policy, got an error: "
+            f"{error}"
         ) from error

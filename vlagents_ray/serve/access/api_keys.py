@@ -51,7 +51,7 @@ class NoKey(enum.Enum):
     """The reason why a request needs no API key, used in place of a `Caller`."""
 
     OPEN = "the server has no keys"
-    INSIDE = "it comes from the same Ray cluster, or from the replica itself"
+    INSIDE = "it was loaded from the same Ray cluster, or by the replica itself"
 
 
 class Keys:
@@ -133,7 +133,7 @@ class Keys:
                 key = known_key
         if key is None:
             self.audit.refused("", "an unknown key")
-            raise Unauthorized("the server does not know this API key; ask its operator for one")
+            raise Unauthorized("the server has no such API key; ask its operator for one")
 
         caller = Caller(self, digest, key.name, app)
         caller.admit(free=True)
@@ -249,13 +249,13 @@ class Keys:
         if left_s <= 0 and self._keys:
             self._keys = {}
             logger.critical(
-                "all keys are refused: for %g s no key file could be read: %s", _CLOSE_S, error
+                "all keys are rejected, as no key file could be read for %g s: %s", _CLOSE_S, error
             )
         elif is_first or now - self._reminded >= _REMIND_S:
             if left_s > 0:
                 consequence = f"the keys stay as they were for {left_s:.0f} s more"
             else:
-                consequence = "all keys are refused"
+                consequence = "all keys are rejected"
             logger.error("the key file cannot be read; %s: %s", consequence, error)
         else:
             return
@@ -360,8 +360,8 @@ class Caller:
             raise Forbidden(f"key {self.name!r} is for {sorted(key.apps)}, not for {self.app!r}")
         if scope is not None and scope not in key.scopes:
             raise Forbidden(
-                f"key {self.name!r}: lacks the scope {scope!r}; use one of `keys new NAME --scope "
-                f"{scope}`"
+                f"key {self.name!r}: expected the scope {scope!r}, which this key lacks; use a "
+                f"key of `keys new NAME --scope {scope}`"
             )
         if not free:
             self._keys.take(key)
@@ -466,8 +466,8 @@ def warn_of_plain_http(host: str) -> None:
     if not is_loopback(host):
         logger.warning(
             "host %s: API keys cross the network unencrypted, where others may read them. Serve "
-            "with --tls-cert and --tls-key, or state that TLS ends elsewhere, with --plain-http "
-            "(`access: {plain_http: true}`)",
+            "with --tls-cert and --tls-key, or declare with --plain-http (`access: {plain_http: "
+            "true}`) that TLS ends elsewhere",
             host,
         )
 

@@ -122,7 +122,7 @@ def parse_keys(text: str, where: str = "keys") -> list[Key]:
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise ConfigError(
-            f"keys: {double} stand there more than once; each needs a name of its own"
+            f"keys: expected different names, got {double} more than once; rename all but one"
         )
     return keys
 
@@ -201,7 +201,7 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
         """Return the keys with the new one in place of a revoked one of the same name."""
         if any(other.name == name and not other.revoked for other in keys):
             raise ConfigError(
-                f"key {name!r} is there already; choose another name, or revoke it first"
+                f"key {name!r} exists already; choose another name, or revoke it first"
             )
         return [*(other for other in keys if other.name != name), key]
 

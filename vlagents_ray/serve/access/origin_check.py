@@ -42,9 +42,9 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
         )
     if host is not None and not _is_name_of_server(host, hosts):
         raise Forbidden(
-            f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if "
-            "it is the server's, state it under `access: {hosts: [...]}`, use the server's "
-            "address, or serve with keys"
+            f"host {host[:100]!r}: this name may belong to another site that points it here; if "
+            "it is the server's, add it to `access: {hosts: [...]}`, use the server's address, "
+            "or serve with keys"
         )
 
 

@@ -88,9 +88,10 @@ class BatchArgs(_DeploymentModel):
     )
     sizes: list[Annotated[int, Field(le=MOST_ROWS)]] | None = Field(
         default=None,
-        description="for compiled models: the only batch sizes to run, ascending; smaller batches "
-        "are padded up to "
-        "the next one. The largest is max_size, which may then be left out",
+        description=(
+            "for compiled models: the only batch sizes to run, ascending; smaller batches are "
+            "padded to the next size. The largest is max_size, which may then be omitted"
+        ),
     )
     patience: float = Field(
         default=0.1,
@@ -114,7 +115,8 @@ class BatchArgs(_DeploymentModel):
             )
         if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
             raise ValueError(
-                f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out"
+                f"max_size: expected the largest of sizes {self.sizes}, got {self.max_size}; "
+                "leave it out"
             )
         self.max_size = self.sizes[-1]
         return self
@@ -127,9 +129,11 @@ class CheckpointArgs(_DeploymentModel):
 
     choices: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="by name, the settings that take the place of those in `config`; or `adapter` "
-        "alone, a PEFT folder "
-        "or hub id (org/name, org/name@COMMIT) of a LoRA adapter over the checkpoint in `config`",
+        description=(
+            "for each name, settings that replace those in `config`; or only `adapter`, a PEFT "
+            "folder or hub id (org/name, org/name@COMMIT) of a LoRA adapter for the checkpoint in "
+            "`config`"
+        ),
     )
     steps: bool = Field(
         default=False, description="any step of a checkpoint whose path holds {step}"
@@ -191,8 +195,9 @@ class StreamArgs(_DeploymentModel):
     enabled: bool = True
     ports: tuple[Port, Port] | None = Field(
         default=None,
-        description="first and last port to choose from; unset: any. Each replica of a node takes "
-        "one",
+        description=(
+            "first and last port to choose from; unset: any. Each replica of a node uses one"
+        ),
     )
 
     @model_validator(mode="after")
@@ -222,9 +227,11 @@ class LimitArgs(_DeploymentModel):
         default=CallLimits().act_s,
         gt=0,
         le=MOST_S,
-        description="a batch of acts, or a reset, that takes longer, and longer than ten times the "
-        "longest so far, "
-        "makes the replica unhealthy: Serve replaces it, and sessions go on elsewhere",
+        description=(
+            "a batch of acts, or a reset, that takes longer than this, and than ten times the "
+            "longest so far, makes the replica unhealthy: Serve replaces it, and its sessions "
+            "continue in other replicas"
+        ),
     )
     warm_up_s: float = Field(
         default=CallLimits().warm_up_s,
@@ -237,7 +244,7 @@ class LimitArgs(_DeploymentModel):
         default=CallLimits().load_s,
         gt=0,
         le=MOST_S,
-        description="that loading a checkpoint may take",
+        description="time limit for loading a checkpoint",
     )
     body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024, le=MOST_BYTES)
     reply_bytes: int = Field(
@@ -251,9 +258,10 @@ class LimitArgs(_DeploymentModel):
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description="of the images and bytes of one request, decoded, each as often as it is "
-        "named; with the rate of a "
-        "key it bounds what that has decoded in a second",
+        description=(
+            "decoded size of the images and bytes of one request, each as often as it is named; "
+            "with the rate of a key it limits the bytes that are decoded for the key in a second"
+        ),
     )
     in_flight_bytes: int = Field(
         default=DEFAULT_LIMITS.in_flight_bytes,
@@ -299,9 +307,8 @@ class AccessArgs(_DeploymentModel):
 
     keys_file: str | None = Field(
         default=None,
-        description="path of the API keys, on every node the same; unset: what "
-        "VLAGENTS_RAY_KEYS_FILE or "
-        "VLAGENTS_RAY_KEYS say where the replica runs",
+        description="path of the API keys, the same on every node; unset: the value of "
+        "VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS where the replica runs",
     )
     insecure: bool = Field(
         default=False, description="accept clients on other machines without keys"
@@ -314,14 +321,13 @@ class AccessArgs(_DeploymentModel):
     hosts: list[Annotated[str, AfterValidator(str.lower)]] = Field(
         default_factory=list,
         description="without keys: names in the public DNS by which clients reach the server; its "
-        "addresses, names "
-        "without a dot and those of private networks need not be stated",
+        "addresses, names without a dot and names of private networks need not be listed",
     )
 
     @model_validator(mode="after")
     def _one(self) -> AccessArgs:
         if self.keys_file is not None and self.insecure:
-            raise ValueError("keys_file and insecure exclude each other; keep one")
+            raise ValueError("expected keys_file or insecure, got both; keep one")
         return self
 
     def keys(self) -> Keys | None:
@@ -395,7 +401,7 @@ class ResourceArgs(_DeploymentModel):
     num_gpus: float = Field(default=0.0, ge=0, le=MOST_CPUS)
     memory: float | None = Field(default=None, gt=0, le=MOST_BYTES, description="bytes")
     custom: dict[str, Annotated[float, Field(ge=0, le=1e12)]] = Field(
-        default_factory=dict, description="the cluster's own resources, by name"
+        default_factory=dict, description="custom resources of the cluster, by name"
     )
 
 
@@ -403,12 +409,11 @@ class ServerArgs(_DeploymentModel):
     """The settings of a server for one policy."""
 
     policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
-    config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
+    config: dict[str, Any] = Field(default_factory=dict, description="settings of the policy")
     wrappers: list[str | dict[str, dict[str, Any]]] = Field(
         default=[],
-        description="what changes the policy's observations, the first being the nearest to the "
-        "robot: names, or "
-        "{name: settings}",
+        description="wrappers of the policy, the one nearest to the robot first: names, or {name: "
+        "settings}",
     )
     checkpoints: CheckpointArgs = CheckpointArgs()
     replicas: int | None = Field(
@@ -425,12 +430,13 @@ class ServerArgs(_DeploymentModel):
         default=EnvironmentArgs(), description="the Python that the policy runs in"
     )
     dialects: DialectArgs = Field(
-        default=DialectArgs(), description="other systems' clients that may connect"
+        default=DialectArgs(), description="protocols of other systems whose clients may connect"
     )
     parts: PartArgs = Field(
         default=PartArgs(),
-        description="parts of the replica that plug-ins add; null turns one off that is on by "
-        "default",
+        description=(
+            "parts of the replica that plug-ins add; null turns off a part that is on by default"
+        ),
     )
 
     @property
@@ -455,5 +461,5 @@ class ServerArgs(_DeploymentModel):
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:
         if self.replicas is not None and self.autoscaling is not None:
-            raise ValueError("replicas and autoscaling exclude each other; keep one")
+            raise ValueError("expected replicas or autoscaling, got both; keep one")
         return self

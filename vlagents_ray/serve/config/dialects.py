@@ -60,9 +60,10 @@ class PortConfig(DialectConfig):
     )
     host: str | None = Field(
         default=None,
-        description="the address that it listens at; default: that of the server which "
-        "`vlagents-ray serve` starts, "
-        "and 127.0.0.1 under `serve deploy`",
+        description=(
+            "the address to listen on; default: the address of the server that `vlagents-ray "
+            "serve` starts, and 127.0.0.1 under `serve deploy`"
+        ),
     )
 
 
@@ -71,7 +72,7 @@ class KeylessPortConfig(PortConfig):
 
     without_key: bool = Field(
         default=False,
-        description="with API keys on: accept clients here without one, as the protocol has no key",
+        description="with API keys: accept clients of this protocol without one, as it has no key",
     )
 
 
@@ -88,7 +89,9 @@ class DialectArgs(RegisteredArgs):
         for port, number in Counter(ports.values()).items():
             if number > 1:
                 sharing = " and ".join(name for name in ports if ports[name] == port)
-                raise ValueError(f"{sharing} share port {port}; each needs one of its own")
+                raise ValueError(
+                    f"expected a port for each dialect, got {port} for {sharing}; change one"
+                )
         return self
 
     def gateways(self) -> dict[str, PortConfig]:
@@ -193,6 +196,6 @@ def _presets_by_dialect() -> Iterator[Mapping[str, Mapping[str, Any]]]:
         try:
             dialect = dialect_class(name)
         except VLAgentsError as error:
-            logger.warning("dialect %r: its presets are left out: %s", name, error)
+            logger.warning("dialect %r: its presets are not available: %s", name, error)
             continue
         yield dialect.presets

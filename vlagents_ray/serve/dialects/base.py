@@ -231,7 +231,7 @@ class RouteDialect(Dialect):
         """Serve WebSockets at the server's root for all dialects with this protocol there,
         beginning with this one.
         """
-        raise NotImplementedError(f"{self.name} states a root and does not serve it")
+        raise NotImplementedError(f"{self.name} declares a root and does not serve it")
 
     def sender(self, session_id: str = "") -> Sender:
         """Return the sender of a connection or, given a session's name, of a request.
@@ -313,9 +313,9 @@ class PortDialect(Dialect):
             isinstance(context.check, NoKey) or config.without_key
         ):
             raise ConfigError(
-                f"dialects.{name}: the server requires API keys, and this protocol has none; "
-                "remove the dialect, or accept all clients that reach its port, with without_key: "
-                "true"
+                f"dialects.{name}: expected a protocol with API keys, as the server requires "
+                "them, got one without; remove the dialect, or accept all clients that reach its "
+                "port, with without_key: true"
             )
 
     @classmethod

@@ -118,7 +118,8 @@ def read_deployment(
             raise ConfigError(f"deployment file {path.absolute()} does not exist{hint}")
         if overrides:
             raise ConfigError(
-                f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}"
+                f"expected no settings besides the file {source!r}, got {sorted(overrides)}; edit "
+                "the file"
             )
         return _checked(read_yaml(path), source, step_follows)
 

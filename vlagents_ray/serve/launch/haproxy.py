@@ -94,8 +94,8 @@ class Tls:
             context.load_cert_chain(self.certificate, self.key, password=_refuse_passwords)
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             raise ConfigError(
-                f"TLS: {self.certificate} and {self.key} are no certificate and its key without a "
-                f"password, both in PEM ({error})"
+                "TLS: expected a certificate and its key without a password, both in PEM, got "
+                f"{self.certificate} and {self.key} ({error})"
             ) from error
         try:
             if self.client_ca is not None:
@@ -163,8 +163,8 @@ class PublicListener:
         is_enabled = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
         if not is_enabled or self.settings() not in os.environ.get(_BALANCE, ""):
             raise ConfigError(
-                f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in "
-                f"there; leave ray.init() and {_BALANCE} to this function"
+                f"host {self.host}: expected a listener for it in {_BALANCE}, got none; leave "
+                f"ray.init() and {_BALANCE} to this function"
             )
 
 

@@ -89,7 +89,7 @@ def shut_down(client: Any) -> None:
     deadline = time.monotonic() + _SHUTDOWN_S
     while not ray.wait([ending], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
         if time.monotonic() > deadline:
-            log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
+            log.warning("Serve has not ended within %g s and keeps running", _SHUTDOWN_S)
             break
     private.forget_serve(client)
 
@@ -172,7 +172,7 @@ def running_server(
         if running:
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL "
-                f"(serve://{running[0]} inside the cluster), or `serve deploy` one file that holds "
+                f"(serve://{running[0]} inside the cluster), or `serve deploy` one file with "
                 "those and yours"
             )
         stack.push(session.unless_lost(lambda: shut_down(client)))
@@ -219,7 +219,7 @@ def _with_access(
 ) -> Deployment:
     """Return the deployment with the access settings of the command line, if any."""
     if keys_file is not None and insecure:
-        raise ConfigError("keys and insecure exclude each other; keep one")
+        raise ConfigError("expected keys or insecure, got both; keep one")
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         access = dict(app.args.get("access") or {})
@@ -412,8 +412,8 @@ def own_ray(
     """
     if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
-            f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs "
-            "whatever it is sent, would be open to other machines without Ray's token; unset it"
+            f"{session.MODE}={os.environ[session.MODE]}: without Ray's token, other machines "
+            "could run any code through a port of each replica; unset it"
         )
     if not is_free(host, port):
         raise ConfigError(
@@ -511,7 +511,7 @@ def wait_until_ready(
 
         if time.monotonic() > deadline:
             states = {name: str(status[name].status) for name in apps if name in status}
-            causes = [f"not running in time: {states}", missing()]
+            causes = [f"not running within the time limit: {states}", missing()]
             raise PolicyUnavailable("; ".join(filter(None, causes)))
         if time.monotonic() >= remind_at:
             remind_at = time.monotonic() + _REMIND_S
@@ -535,7 +535,7 @@ def _deploy_failure(app: Any) -> str:
     for text in (app.message, *(deployment.message for deployment in app.deployments.values())):
         lines += [line.strip() for line in (text or "").splitlines() if line.strip()]
     # The last line of Serve's message is the error below its traceback.
-    return lines[-1] if lines else "Serve gives no reason"
+    return lines[-1] if lines else "Serve reports no reason"
 
 
 def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:

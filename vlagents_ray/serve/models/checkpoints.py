@@ -163,7 +163,11 @@ class Checkpoints:
         names = sorted({*self._choices, *self._adapters})
         offered = [f"one of {names}"] if names else []
         offered += [f"a {STEP}"] if self._steps else []
-        return " or ".join([*offered, "none, for its own"]) if offered else "none but its own"
+        return (
+            " or ".join([*offered, "none, for its own"])
+            if offered
+            else "none, as there is only one"
+        )
 
 
 def resolved(settings: Mapping[str, Any]) -> str | None:

@@ -208,7 +208,7 @@ class LoadedModel:
         process ends.
         """
         if not self.busy.acquire(timeout=wait_s):
-            logger.error("%s: still busy after %g s; it is left as it is", self.choice, wait_s)
+            logger.error("%s: still busy after %g s; it is not closed", self.choice, wait_s)
             return
         try:
             self.closed = True

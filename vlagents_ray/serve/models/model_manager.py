@@ -254,7 +254,7 @@ class ModelCache:
 
 def too_late(choice: CheckpointChoice) -> DeadlineExceeded:
     """Return the error for a reset whose caller no longer waits."""
-    return DeadlineExceeded(f"{choice} was not loaded in time; ask again, or allow more time")
+    return DeadlineExceeded(f"{choice} was not loaded in time; try again, or allow more time")
 
 
 class ModelManager:
@@ -492,7 +492,9 @@ class ModelManager:
             return session.model
         if errors:
             raise errors[0]
-        raise UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
+        raise UnknownSession(
+            f"session {session.id!r}: loading {choice} takes too long; reset the session"
+        )
 
     def release_model(self, session: Session[LoadedModel]) -> None:
         """Release the model of a session that has no episode."""
@@ -531,7 +533,7 @@ class ModelManager:
                 else:
                     _run_callbacks(task)
             except Exception:
-                logger.exception("the checkpoints' thread goes on")
+                logger.exception("the thread of the checkpoints continues")
 
     def _next_task(self) -> LoadTask | EvictTask | DueCallbacks | None:
         """Wait for the next task, or for callbacks that are due, and return them; None after

@@ -215,7 +215,7 @@ class Child:
             if not line:
                 runner.join(_EXIT_S)
                 output = "".join(self._last_lines).strip()
-                raise PolicyFailed(f"{self._describe_end()}; it said:\n{output}")
+                raise PolicyFailed(f"{self._describe_end()}; last output:\n{output}")
             document: dict[str, Any] = json.loads(line)
             if "step" not in document:
                 break

@@ -68,7 +68,8 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
         return interpreter
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(
-            f"{folder}: is there and holds no Python environment; name another folder"
+            f"{folder}: expected a new folder or a Python environment, got another folder; name a "
+            "new one"
         )
     progress(f"making {folder} with Python {python or platform.python_version()}")
     _uv(["venv", "--quiet", "--python", python or sys.executable, str(folder)])
@@ -332,10 +333,11 @@ def require_no_cuda(python: Path, arguments: Sequence[str]) -> None:
     cuda_packages = _CUDA.findall(plan)
     if cuda_packages:
         raise ConfigError(
-            "stopped before downloading several GB: the requirements bring CUDA packages "
-            f"({', '.join(cuda_packages[:3])}, …), but this machine shows no NVIDIA GPU; name CPU "
-            "builds in a file NAME.cpu.txt beside NAME.txt, and where they are with PIP_FIND_LINKS "
-            "or PIP_INDEX_URL, or take these, --cuda: they run on a CPU, too"
+            "stopped before downloading several GB: the requirements include CUDA packages "
+            f"({', '.join(cuda_packages[:3])}, …), but this machine has no visible NVIDIA GPU; "
+            "name CPU builds in a file NAME.cpu.txt next to NAME.txt, and their index in "
+            "PIP_FIND_LINKS or PIP_INDEX_URL, or install the CUDA packages with --cuda: they "
+            "also run on a CPU"
         )
 
 

@@ -105,19 +105,21 @@ def probe(
         )
     except subprocess.TimeoutExpired as error:
         raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter that runs here (no answer in "
-            f"{_TIMEOUT_S} s; is the machine busy?)"
+            "environment.python: expected a Python interpreter that runs on this machine, got "
+            f"{python!r} (no answer in {_TIMEOUT_S} s; is the machine busy?)"
         ) from error
     except OSError as error:
         raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
+            "environment.python: expected a Python interpreter that runs on this machine, got "
+            f"{python!r} ({error})"
         ) from error
 
     last_line = done.stdout.strip().rpartition("\n")[2]
     if not last_line.startswith("VLA{"):
-        output = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+        output = (done.stderr or done.stdout).strip()[-500:] or "no output"
         raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter, or a broken one: {output}"
+            f"environment.python: expected a Python interpreter, got {python!r}, which is another "
+            f"program, or broken: {output}"
         )
 
     versions: dict[str, Any] = json.loads(last_line[3:])
@@ -172,7 +174,7 @@ def check_policy(
             interpreter.
     """
     if environment.python is None:
-        raise ConfigError("environment: names no interpreter to ask")
+        raise ConfigError("environment: expected an interpreter, got none; set environment.python")
 
     arguments = {"policy": policy, "config": dict(config), "wrappers": list(wrappers)}
     interpreter = probe(environment.python, arguments, environment.env_vars)

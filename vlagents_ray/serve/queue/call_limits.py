@@ -156,8 +156,7 @@ class PolicyCalls:
         self.require_device()
         if self.failed_batches >= FAILED_BATCHES:
             raise PolicyFailed(
-                f"the last {self.failed_batches} batches failed as a whole; the server's log says "
-                "why"
+                f"the last {self.failed_batches} batches failed as a whole; see the server's log"
             )
 
     def overdue(self) -> PolicyCall | None:

@@ -250,7 +250,8 @@ class ReplicaParts:
         opened = self._parts.get(part)
         if opened is None or method not in opened.sibling_methods:
             raise LookupError(
-                f"part {part!r}: this replica has no method {method!r} of it for other replicas"
+                f"part {part!r}: expected a method for other replicas, got {method!r}, which it "
+                "does not have"
             )
         call = getattr(opened, method)
         if inspect.iscoroutinefunction(call):

@@ -155,7 +155,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         """
         config = {**self._args.config, **(settings or {})}
         if self._configured:
-            logger.info("new settings, to be loaded beside the present ones: %s", config)
+            logger.info("new settings, to be loaded next to the present ones: %s", config)
         self._engine.models.configure(config)
         if self._configured:
             return
@@ -382,7 +382,7 @@ class PolicyReplica(ClientApi, SiblingApi):
                 self._gateways = await self._gateway.description.remote()
             except (ray.exceptions.RayError, RayServeException) as error:
                 self._gateways = {}
-                logger.info("the gateway does not say where it listens: %s", error)
+                logger.info("the gateway did not report its port: %s", error)
             await asyncio.sleep(_GATEWAY_POLL_S)
 
 

@@ -72,7 +72,7 @@ def test_both_replicas_sleep_and_wake_with_new_weights(server: Server, target: s
     ):
         weights.sleep()
         waiting = [threads.submit(acts, server, "http") for _ in range(4)]
-        with pytest.raises(PolicyUnavailable, match="the policy sleeps"):
+        with pytest.raises(PolicyUnavailable, match="got one that sleeps"):
             weights.push(gain(20))
         newest = 20.0 + len(target)
         version = weights.wake(gain(newest))

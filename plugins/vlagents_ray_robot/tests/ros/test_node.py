@@ -387,7 +387,9 @@ def test_a_policy_for_another_robot_is_refused(
                 == 2
             )
         assert double.on(COMMANDS) == []
-    assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
+    assert (
+        "camera 'front': the policy needs it, the env provides ['top']" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("stop", ["joints", "nothing"])

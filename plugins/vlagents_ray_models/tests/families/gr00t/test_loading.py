@@ -42,7 +42,7 @@ def copied(checkpoint: Checkpoint, tmp_path: Path) -> Path:
     [
         ({}, rf"embodiment: got None, want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
         ({"embodiment": "ours"}, rf"got 'ours', want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
-        ({"embodiment": tiny.LIBERO, "device": "tpu:1"}, "device 'tpu:1': not here"),
+        ({"embodiment": tiny.LIBERO, "device": "tpu:1"}, "device 'tpu:1': not available"),
         (
             {"embodiment": tiny.LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"},
             "no such file",

@@ -149,7 +149,7 @@ def test_lerobot_eval_gives_each_environment_a_session_of_its_own(ended: dict[st
 def test_a_command_refuses_what_does_not_fit_before_it_moves(ended: dict[str, Ended]) -> None:
     done = ended["refused"]
     assert done.status == 1
-    assert "camera 'top': the policy needs it, the env gives ['side']" in done.log
+    assert "camera 'top': the policy needs it, the env provides ['side']" in done.log
     assert "the policy was made for 20 Hz, the env runs at 30.0 Hz" in done.log
     assert "--policy.cameras" in done.log
 
@@ -280,7 +280,9 @@ def test_other_actions_a_missing_task_and_training_are_refused(
 ) -> None:
     env = MirrorEnvConfig()
     env.features["action"] = PolicyFeature(FeatureType.ACTION, (4,))
-    with pytest.raises(ContractMismatch, match=r"action\.dim: the policy gives 3, the env takes 4"):
+    with pytest.raises(
+        ContractMismatch, match=r"action\.dim: the policy returns 3, the env accepts 4"
+    ):
         make_policy(VlagentsConfig(url=server.url, state=["joints", "gripper"]), env_cfg=env)
     made = policy()
     with pytest.raises(ConfigError, match=r"--policy\.instruction"):
