@@ -41,7 +41,7 @@ def main():
     )
     summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=CALIBRATED)))
     print("success, 95 % interval".ljust(24), *(f"{turn}°".ljust(15) for turn in TURNS))
-    for policy, group in groupby(summary.cases, lambda case: case.contender):
+    for policy, group in groupby(summary.cases, lambda case: case.policy_id):
         cases = list(group)
         print(policy.ljust(24), *(str(case.success_once).ljust(15) for case in cases))
         print("".ljust(24), *(f"{case.mean_steps:.1f} steps".ljust(15) for case in cases))

@@ -308,7 +308,7 @@ class FlowRun:
         self._evaluated.load_parameters(self._evaluated.parameters() | self._learner.state())
         newest = evaluation.play(self._learner.version).totals[-1]
         print(
-            f"{newest.contender}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out "
+            f"{newest.policy_id}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out "
             "episodes solved"
         )
 
@@ -390,7 +390,7 @@ def compare_runs(
             gains = []
             for folder in folders:
                 results = Results.load(folder / f"within_{ticks}")
-                versions = sorted(results.contenders, key=lambda name: int(name.partition("@")[2]))
+                versions = sorted(results.policy_ids, key=lambda name: int(name.partition("@")[2]))
                 total = compare(results, versions[-1], versions[0]).total
                 pairs = total.pairs
                 before, after = (pairs.both + pairs.only_b, pairs.both + pairs.only_a)

@@ -293,9 +293,9 @@ class LearnRun:
             track=mine.track,
         )
         summary = TrainingEvaluation(_url(method), plan).play(version)
-        [newest] = [total for total in summary.totals if total.contender == f"{method}@{version}"]
+        [newest] = [total for total in summary.totals if total.policy_id == f"{method}@{version}"]
         print(
-            f"{newest.contender}: {newest.success_once.rate:.1%} of {mine.held_out} held-out "
+            f"{newest.policy_id}: {newest.success_once.rate:.1%} of {mine.held_out} held-out "
             "episodes solved"
         )
         return summary

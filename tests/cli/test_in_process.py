@@ -102,7 +102,7 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "a short evaluation, in this process without Ray (--workers 1 runs" in done.stdout
-    cases = {case.contender: case for case in Results.load(folder / "runs" / "runs").cases}
+    cases = {case.policy_id: case for case in Results.load(folder / "runs" / "runs").cases}
     actions = {
         name: [one.result.actions_sha256 for one in case.episodes] for name, case in cases.items()
     }

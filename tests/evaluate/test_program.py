@@ -414,7 +414,7 @@ def test_a_report_of_two_folders_keeps_a_policy_apart_that_is_not_the_same_in_bo
     again: dict[str, Any] = change() or {}
     played(tmp_path / "b", envs=["eval_fakes:Line"], env_options={}, **again)
     results = combined([Results.load(tmp_path / name) for name in ("a", "b")])
-    assert results.contenders == ["own (a)", "own (b)"]
+    assert results.policy_ids == ["own (a)", "own (b)"]
 
 
 @pytest.mark.parametrize("way", ["a class", "a partial", "a mapping", "a mapping of partials"])

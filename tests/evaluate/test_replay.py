@@ -273,7 +273,7 @@ def test_pushed_weights_are_asked_for_again(config: Config, tmp_path: Path) -> N
     results = play(config(episodes=1).model_copy(update={"policies": [policy]}))
     recorded = find(results, f"{LINE}#0")
     [case] = plan_cases(recorded.config(tmp_path / "again"))
-    assert (case.contender, case.fingerprint) == ("policy@3", recorded.case.case_id)
+    assert (case.policy_id, case.fingerprint) == ("policy@3", recorded.case.case_id)
 
 
 def test_a_policy_that_was_served_for_the_run_is_served_again_and_a_server_is_asked_again(

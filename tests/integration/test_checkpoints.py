@@ -265,7 +265,7 @@ def test_a_sweep_evaluates_each_checkpoint_on_one_server(
         "workers": 2,
     }
     summary = evaluate(flat_config(**settings, steps=[3, 4], out=tmp_path / "results"))
-    assert [(group.contender, group.episodes) for group in summary.totals] == [
+    assert [(group.policy_id, group.episodes) for group in summary.totals] == [
         ("policy@3", 3),
         ("policy@4", 3),
     ]

@@ -152,7 +152,7 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "runs" / "nightly" / "summary.json").read_text())
     cases = {
-        (one["contender"], one["suite"], one["env"]): one["success_once"]
+        (one["policy_id"], one["suite"], one["env"]): one["success_once"]
         for one in summary["cases"]
     }
     assert summary["state"] == "complete"

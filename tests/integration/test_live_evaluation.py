@@ -73,9 +73,9 @@ def test_it_shows_cases_sessions_and_failures_while_it_runs(ray_home: Path, tmp_
 
 
 def finished(out: Path) -> dict[str, int]:
-    """Episodes of each contender."""
+    """Episodes of each policy_id."""
     with suppress(ConfigError):
-        return {case.contender: len(case.counted) for case in Results.load(out).cases}
+        return {case.policy_id: len(case.counted) for case in Results.load(out).cases}
     return {}
 
 

@@ -246,7 +246,7 @@ def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
     failing = failing_cases(summary.results.among(results))
     if failing:
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
-        names = ", ".join(f"{case.contender} in {case.task}" for case in failing)
+        names = ", ".join(f"{case.policy_id} in {case.task}" for case in failing)
         fail(
             f"every episode ended with an error of the policy: {names}; the first error: "
             f"{error.strip()}",
@@ -459,7 +459,7 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
 def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> None:
     """Print the number of cases and episodes, and the time that they take."""
     cases = [row.case for row in forecast]
-    policies = len({case.contender for case in cases})
+    policies = len({case.policy_id for case in cases})
     envs = len({(case.suite.name, case.env) for case in cases})
     factors = (
         f"{counted(policies, 'policy', 'policies')} at each checkpoint x "
@@ -506,7 +506,7 @@ def _forecast_table(forecast: Sequence[Forecast]) -> Table:
             episode_seconds = f"{row.seconds:.3g}"
             time = _time(row.remaining * row.seconds)
         rows.add_row(
-            row.case.contender,
+            row.case.policy_id,
             " ".join(filter(None, row.case.name[1:])),
             str(len(row.case.suite.seeds)),
             str(row.case.planned),
@@ -529,7 +529,7 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
         The forecasts, in the order of the cases.
     """
     recorded_cases = [] if results is None else results.cases
-    names = [(recorded.contender, recorded.suite, recorded.env) for recorded in recorded_cases]
+    names = [(recorded.policy_id, recorded.suite, recorded.env) for recorded in recorded_cases]
     forecast = []
     for case in planned:
         finished = 0

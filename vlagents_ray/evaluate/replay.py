@@ -124,7 +124,7 @@ def find(results: Results, name: str | None) -> Recorded:
 
     if len(matching) > 1:
         keys = [
-            f"{recorded.episode.result.full_key} ({recorded.case.contender})"
+            f"{recorded.episode.result.full_key} ({recorded.case.policy_id})"
             for recorded in matching
         ]
         raise ConfigError(

@@ -132,7 +132,7 @@ class TrackerFeed:
         groups = []
         for case, group in zip(results.cases, summary.cases, strict=True):
             groups.append((case.case_id, [case], group))
-        for policy, total in zip(results.contenders, summary.totals, strict=True):
+        for policy, total in zip(results.policy_ids, summary.totals, strict=True):
             groups.append((policy, results.of(policy), total))
 
         with closing(sqlite3.connect(self._plan.out / FILE, timeout=WAIT_S)) as db:

@@ -72,7 +72,7 @@ def test_a_run_trains_the_flow_alone_and_writes_results_and_a_checkpoint(
     [one] = learned
     assert one.acts
     assert 0 < one.log_ratio < 1e-4, "the policy and the learner agree before the first step"
-    assert Results.load(tmp_path / "run" / "within_16").contenders == [f"{method}@0", f"{method}@1"]
+    assert Results.load(tmp_path / "run" / "within_16").policy_ids == [f"{method}@0", f"{method}@1"]
 
     sizes = flow.read_checkpoint(flow.CHECKPOINT).sizes
     old = read_network(sizes, flow.CHECKPOINT).state_dict()

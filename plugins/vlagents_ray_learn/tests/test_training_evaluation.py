@@ -51,8 +51,8 @@ def served() -> Iterator[Replicas]:
     found.close()
 
 
-def episodes(out: Path, contender: str) -> list[EpisodeResult]:
-    return [one.result for case in Results.load(out).of(contender) for one in case.episodes]
+def episodes(out: Path, policy_id: str) -> list[EpisodeResult]:
+    return [one.result for case in Results.load(out).of(policy_id) for one in case.episodes]
 
 
 def test_each_version_is_a_checkpoint_of_the_results(plan: EvalConfig, agent: Proportional) -> None:
@@ -60,7 +60,7 @@ def test_each_version_is_a_checkpoint_of_the_results(plan: EvalConfig, agent: Pr
     for version, gain in ((1, 0.1), (20, 1.0)):
         agent.tree["gain"][:] = gain
         summary = evaluation.play(version)
-    assert summary.results.contenders == ["reach@1", "reach@20"]
+    assert summary.results.policy_ids == ["reach@1", "reach@20"]
     assert [group.success_once.successes for group in summary.totals] == [0, 4]
     assert {one.policy_version for one in episodes(plan.out, "reach@20")} == {20}
     written = json.loads((plan.out / "summary.json").read_text())
@@ -184,7 +184,7 @@ def test_no_results_are_made_again_and_none_are_taken_for_those_of_other_weights
         ConfigError, match=r"pushed_weights: the results have {.*'version': 1}, now"
     ):
         again.play(1)
-    assert again.play(2).results.contenders == ["reach@1", "reach@2"]
+    assert again.play(2).results.policy_ids == ["reach@1", "reach@2"]
 
 
 def test_an_evaluation_that_was_cut_short_goes_on(plan: EvalConfig, agent: Proportional) -> None:

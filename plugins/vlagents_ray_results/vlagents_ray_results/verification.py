@@ -210,7 +210,7 @@ def _check_cases(results: Results) -> Finding:
     known_keys: set[str] = set()
     rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
     for case in results.cases:
-        name = f"{case.contender} in {case.task}"
+        name = f"{case.policy_id} in {case.task}"
         env_and_policy = case.settings.get("env"), case.settings.get("policy")
         has_fingerprint = fingerprint(case.settings) == case.case_id
         if not has_fingerprint or env_and_policy != (case.env, case.policy):

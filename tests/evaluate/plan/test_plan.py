@@ -53,7 +53,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
         return usual.model_copy(update={"policies": [PolicyConfig.model_validate(given)]})
 
     [case] = plan_cases(pushed("a"))
-    assert (case.contender, case.policy_options) == ("policy@3", {}), (
+    assert (case.policy_id, case.policy_options) == ("policy@3", {}), (
         "the policy is asked for no checkpoint"
     )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
@@ -65,7 +65,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
 
 def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
     jobs = plan_jobs(plan_cases(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
-    assert [(job.case.contender, job.key.env) for job in jobs] == [
+    assert [(job.case.policy_id, job.key.env) for job in jobs] == [
         ("policy@10", LINE),
         ("policy@10", OTHER_LINE),
         ("policy@20", LINE),

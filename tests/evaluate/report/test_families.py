@@ -211,7 +211,7 @@ def test_no_output_pools_episodes_of_two_clocks(
         assert found or output == "report --json", (
             f"{output} has no rate of one clock, {expected:.3f}"
         )
-    a, b = results.contenders[0], results.contenders[-1]
+    a, b = results.policy_ids[0], results.policy_ids[-1]
     with pytest.raises(ConfigError, match="several clocks"):
         compare(results, a, b)
 

@@ -102,7 +102,7 @@ def test_cases_fill_with_their_intervals(document: ProgressDocument, played: Pla
     assert said["done"] == 3
     [case] = [one for one in said["cases"] if one["done"]]
     rate = rate_of([Results.load(played.config.out).cases[0]], "success_once")
-    assert (case["policy"], case["task"]) == (first.case.contender, f"one {first.key.env}")
+    assert (case["policy"], case["task"]) == (first.case.policy_id, f"one {first.key.env}")
     assert (case["successes"], case["episodes"], case["rate"]) == (2, 3, rate.rate)
     assert (case["low"], case["high"]) == rate.interval
     assert {one["rate"] for one in said["cases"] if not one["done"]} == {None}
@@ -173,7 +173,7 @@ def test_a_training_waits_between_its_versions_and_has_a_learning_curve(tmp_path
     assert curve["policy"] == "learner"
     assert [point["step"] for point in curve["points"]] == [1000, 2000]
     totals = {
-        group.contender: group.success_once for group in summarize(Results.load(tmp_path)).totals
+        group.policy_id: group.success_once for group in summarize(Results.load(tmp_path)).totals
     }
     assert [point["rate"] for point in curve["points"]] == [
         totals[f"learner@{step}"].rate for step in (1000, 2000)

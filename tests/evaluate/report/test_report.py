@@ -230,7 +230,7 @@ def test_the_headline_of_two_policies_is_their_difference(
         {"policies": policies, "suites": [{"envs": [LINE], "episodes": 40}], "out": tmp_path}
     )
     page = page_of(
-        record(config, lambda case, seed: 7 if case.contender == "b" or seed >= better else None)
+        record(config, lambda case, seed: 7 if case.policy_id == "b" or seed >= better else None)
     )
     assert f"+{100 * better / 40:.1f} points b less a{verdict} 95 % [" in page.words
     assert "solved by the best" not in page.words
@@ -284,7 +284,7 @@ def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     fewer = runs(tmp_path, episodes=4, resume=True, accept_changes=True)
     with Store(resolve(fewer)):
         page = page_of(Results.load(tmp_path))
-    assert page.text.count("(solved)") == 3 * 3 * 2  # contenders, tasks, episodes
+    assert page.text.count("(solved)") == 3 * 3 * 2  # policy_ids, tasks, episodes
     assert "In brackets: beyond the point" in page.words
 
 
@@ -292,9 +292,9 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
     tmp_path: Path,
 ) -> None:
     results = record(runs(tmp_path, steps=[3000, 1000, 2000]), better_later)
-    assert results.contenders == ["base", "learner@1000", "learner@2000", "learner@3000"]
+    assert results.policy_ids == ["base", "learner@1000", "learner@2000", "learner@3000"]
     page = page_of(results)
-    places = [page.section("Success").index(f"{name} 12") for name in results.contenders]
+    places = [page.section("Success").index(f"{name} 12") for name in results.policy_ids]
     assert places == sorted(places)
     words = page.section("Learning curve")
     assert "base (no steps)" in words

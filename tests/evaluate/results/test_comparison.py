@@ -90,7 +90,7 @@ def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
     assert comparable(results)[0] == []
 
 
-def test_no_shared_episode_and_unknown_contenders_are_no_comparison(tmp_path: Path) -> None:
+def test_no_shared_episode_and_unknown_policies_are_no_comparison(tmp_path: Path) -> None:
     results = combined(
         [folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", envs=[OTHER_LINE])]
     )
@@ -110,7 +110,7 @@ def test_a_misspelt_policy_is_answered_with_the_nearest_name(tmp_path: Path) -> 
 
 def test_folders_are_read_as_one(tmp_path: Path) -> None:
     results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b")])
-    assert results.contenders == ["a", "b"]
+    assert results.policy_ids == ["a", "b"]
     assert compare(results, "a", "b").total.pairs == Pairs(both=2, neither=2)
     videos = [video for case in results.cases for one in case.episodes for video in one.videos]
     assert len(videos) == 4
@@ -121,7 +121,7 @@ def test_folders_are_read_as_one(tmp_path: Path) -> None:
 def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
     first = folder(tmp_path / "first", "pi0")
     second = folder(tmp_path / "second", "pi0", reset_options={"instruction": "go"})
-    assert combined([first, second]).contenders == ["pi0 (first)", "pi0 (second)"]
+    assert combined([first, second]).policy_ids == ["pi0 (first)", "pi0 (second)"]
 
 
 def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
@@ -135,11 +135,11 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
         return results.among([replace(case, episodes=episodes)])
 
     first = played("first", LINE, "runs/last", "a")
-    assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).contenders == ["pi0"]
+    assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).policy_ids == ["pi0"]
     another = played("another", OTHER_LINE, "runs/best", "b")
-    assert combined([first, another]).contenders == ["pi0"]  # the page names both
+    assert combined([first, another]).policy_ids == ["pi0"]  # the page names both
     other = combined([first, played("later", OTHER_LINE, "runs/last", "b")])
-    assert other.contenders == ["pi0 (first)", "pi0 (later)"]
+    assert other.policy_ids == ["pi0 (first)", "pi0 (later)"]
     assert ("pi0 (later)", "b") in configuration(other).checkpoints
 
 

@@ -114,7 +114,7 @@ def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None
     assert written["state"] == "interrupted"
     assert [case["env"] for case in written["cases"]] == [LINE, OTHER_LINE]
     [total] = written["totals"]
-    assert (total["contender"], total["env"]) == ("act", "total")
+    assert (total["policy_id"], total["env"]) == ("act", "total")
     assert total["success_once"]["wilson_95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)
     assert written["config"]["suites"][0]["episodes"] == 3
     assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}

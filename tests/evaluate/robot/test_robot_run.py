@@ -43,7 +43,7 @@ KEY = b"a key of the plan"
 
 
 def names_by_trial(config: EvalConfig) -> list[str]:
-    return [trial.job.case.contender for trial in schedule(plan_cases(config), KEY)]
+    return [trial.job.case.policy_id for trial in schedule(plan_cases(config), KEY)]
 
 
 def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
@@ -82,7 +82,7 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "hidden"}
     assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
-    assert found.contenders == list(NAMES), "and then it is told"
+    assert found.policy_ids == list(NAMES), "and then it is told"
     assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
     assert {one.result.weights for case in found.of(NAMES[0]) for one in case.episodes} == {
         f"digest-of-{NAMES[0]}"
@@ -109,7 +109,7 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
         key = tmp_path / str(number) / "trials.key"
         assert key.stat().st_mode & 0o777 == 0o600
         drawn = [
-            trial.job.case.contender for trial in schedule(plan_cases(config), key.read_bytes())
+            trial.job.case.policy_id for trial in schedule(plan_cases(config), key.read_bytes())
         ]
         assert policies.made[:2] == sorted(NAMES), (
             "each is rehearsed, in an order that tells nothing"

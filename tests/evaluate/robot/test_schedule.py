@@ -30,7 +30,7 @@ def drawn(
 
 
 def order(trials: list[Trial]) -> list[tuple[str, int, str]]:
-    return [(trial.job.case.env, trial.scene, trial.job.case.contender) for trial in trials]
+    return [(trial.job.case.env, trial.scene, trial.job.case.policy_id) for trial in trials]
 
 
 def orders_by_task(trials: list[Trial]) -> dict[str, list[list[str]]]:

@@ -44,14 +44,14 @@ class EvalCase:
         return self.robot, self.robot.tasks[self.env]
 
     @property
-    def contender(self) -> str:
+    def policy_id(self) -> str:
         """The policy id with its checkpoint: "pi0", or "pi0@20000" in a sweep."""
-        return contender(self.policy.name, self.step)
+        return policy_id(self.policy.name, self.step)
 
     @property
     def name(self) -> tuple[str, str, str]:
-        """(contender, suite, env): no two cases of one evaluation have the same."""
-        return self.contender, self.suite.name, self.env
+        """(policy_id, suite, env): no two cases of one evaluation have the same."""
+        return self.policy_id, self.suite.name, self.env
 
     @property
     def policy_options(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def env_program(case: EvalCase, code: Callable[[str], Program] = code_of_class) 
     return program | files_named(settings, folders=False)
 
 
-def contender(policy: str, step: int | None) -> str:
+def policy_id(policy: str, step: int | None) -> str:
     """Return the policy id of a policy at a step: "pi0", or "pi0@20000" in a sweep."""
     return policy if step is None else f"{policy}@{step}"
 

@@ -18,7 +18,7 @@ NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
 _GLYPH = 96  # the width of a glyph
-_EDGE = 6  # the margin beyond the ends of a glyph's axis, so that a dot at an end is whole
+_EDGE = 6  # the margin beyond the ends of a glyph's axis, so that a dot at an end fits
 _LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # the largest differences of the axes
 
 
@@ -44,8 +44,8 @@ def bounds(values: tuple[float, float] | None) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """Return the kind of the rate's interval: a confidence sequence if cases could stop early, else
-    Wilson's.
+    """Return the name of the rate's interval: a confidence sequence if cases could stop early,
+    otherwise Wilson's interval.
     """
     if rate.error_rate is None:
         return "95 % Wilson interval"
@@ -61,7 +61,7 @@ def points(difference: float | None) -> str:
 
 
 def p_value(p: float) -> str:
-    """Return a p-value with its significant digits; never 0."""
+    """Return a p-value with its significant digits; a very small one as "< 0.0001"."""
     if p < 1e-4:
         return "< 0.0001"
     if p < 0.01:
@@ -76,9 +76,9 @@ def number(value: float | None, digits: int = 1) -> str:
     return NONE if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
 
 
-def quantity(n: int, thing: str) -> str:
-    """Return a number of things: "1 episode", "2 episodes"."""
-    return f"{number(n, 0)} {thing}" if n == 1 else f"{number(n, 0)} {thing}s"
+def quantity(n: int, noun: str) -> str:
+    """Return a number with a noun, in the plural if it is not 1: "1 episode", "2 episodes"."""
+    return f"{number(n, 0)} {noun}" if n == 1 else f"{number(n, 0)} {noun}s"
 
 
 def duration(seconds: float) -> str:
@@ -118,7 +118,7 @@ class Series:
 
     name: str
     points: Sequence[tuple[float, Rate]]
-    level: bool = False  # whether it is one rate, which does not depend on x
+    level: bool = False  # whether it is a single rate, which does not depend on x
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +152,8 @@ class RateChart:
 
 @dataclass(frozen=True, slots=True)
 class BarChart:
-    """Bars made of parts, all on one scale. A bar is (name, its sum, [(style, value, width in
-    per cent)]).
+    """Bars that consist of segments, all on one scale. A bar is (name, sum of its values, [(style,
+    value, width in per cent)]).
     """
 
     title: str
@@ -163,8 +163,8 @@ class BarChart:
 
 @dataclass(frozen=True, slots=True)
 class Glyph:
-    """A dot with its interval on an axis, for the cell of a table; decoration, as the numbers
-    are beside it.
+    """A dot with its interval on an axis, for the cell of a table. It is decoration, as the next
+    cells have the numbers.
     """
 
     axis: str
@@ -174,18 +174,18 @@ class Glyph:
 
 
 def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
-    """Return the lines of `series`, in their order, on a common axis from the least x to the
-    largest.
+    """Return a chart with a line for each of `series`, in their order, on a common axis from the
+    smallest x to the largest.
     """
     all_x: list[float] = []
     for line in series:
         all_x += [x for x, _ in line.points]
-    left, right = min(all_x, default=0.0), max(all_x, default=0.0)
-    if left == right:
-        left, right = left - 1, right + 1
+    low_x, high_x = min(all_x, default=0.0), max(all_x, default=0.0)
+    if low_x == high_x:
+        low_x, high_x = low_x - 1, high_x + 1
 
     def x_of(x: float) -> float:
-        return PLOT.left + (PLOT.right - PLOT.left) * (x - left) / (right - left)
+        return PLOT.left + (PLOT.right - PLOT.left) * (x - low_x) / (high_x - low_x)
 
     curves = []
     for index, line in enumerate(series):
@@ -208,13 +208,13 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
             band = f"{_path([*lows, *reversed(highs)])}Z"
         curves.append(Curve(style, path, band, dots))
 
-    x_ticks = [(x_of(tick), short(tick)) for tick in ticks(left, right)]
+    x_ticks = [(x_of(tick), short(tick)) for tick in ticks(low_x, high_x)]
     return RateChart(title, x_label, x_ticks, curves)
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
-    """Return a bar for each of `rows`, at least one; a row has its values by the names of its
-    segments.
+    """Return a chart with a bar for each of `rows`, of which there is at least one. A row maps the
+    names of its segments to their values.
     """
     names: dict[str, None] = {}  # of all segments
     for values in rows.values():
@@ -246,7 +246,7 @@ def interval_glyph(rate: Rate) -> Glyph:
 
 
 def difference_limit(intervals: Iterable[tuple[float, float]]) -> float:
-    """Return the largest difference on the common axis of these intervals, which is symmetric
+    """Return the largest difference on the common axis of these intervals. The axis is symmetric
     around 0.
     """
     largest = max((max(abs(low), abs(high)) for low, high in intervals), default=1.0)
@@ -277,14 +277,14 @@ def difference_labels(limit: float) -> tuple[str, str, str]:
 
 
 def ticks(low: float, high: float, intervals: int = 6) -> list[float]:
-    """Return round numbers within [low, high] at equal distances, which divide it into at most
-    so many `intervals`.
+    """Return round numbers within [low, high] at equal distances, which divide it into at most the
+    given number of `intervals`.
     """
     if high <= low:
         return [low]
     shortest = (high - low) / intervals
     magnitude = 10 ** math.floor(math.log10(shortest))
-    # The tolerances keep the ticks at the ends in spite of floating point.
+    # The tolerances keep ticks at the ends that rounding errors would remove.
     distances = (factor * magnitude for factor in (1, 2, 2.5, 5, 10))
     distance = next(value for value in distances if value >= shortest * (1 - 1e-9))
     first = math.ceil(low / distance - 1e-9)

@@ -1,4 +1,4 @@
-"""The episodes: a table of all, videos of solved and unsolved ones, and errors."""
+"""The sections about episodes: a table of all, videos of solved and unsolved ones, and errors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.registry import require
 
-BUDGET = 24 * 2**20  # bytes of the videos in one page
-POSTER = 224  # the most pixels of a poster's side
-SMALL = 128  # a video whose sides have fewer pixels is enlarged without blurring
-MOST_UNSOLVED, MOST_SOLVED = 24, 12  # videos
-MOST_LISTED = 20_000  # episodes
-AT_ONCE = 500  # rows when the page opens; its script shows more
+BUDGET = 24 * 2**20  # most bytes of all videos that a page embeds
+POSTER = 224  # longest side of a poster, pixels
+SMALL = 128  # a video whose sides are shorter, in pixels, is enlarged without blurring
+MOST_UNSOLVED, MOST_SOLVED = 24, 12  # most videos of unsolved and of solved episodes
+MOST_LISTED = 20_000  # most episodes in the table
+AT_ONCE = 500  # rows that are visible when the page opens; its script shows more
 MOST_ERRORS = 500
 MOST_LOGS = 50
 _OUTCOMES = {
@@ -39,21 +39,21 @@ CaseEpisode = tuple[CaseResults, Episode]  # an episode with its case
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """A video."""
+    """A video on the page."""
 
     label: str
-    source: str | None  # its URL
-    still: str | None  # URL of its last frame; None: the file does not play
+    source: str | None  # the URL of the video
+    still: str | None  # the URL of its last frame; None if the file cannot be decoded
     style: str | None  # a class of the stylesheet
     tall: float | None  # height / width
 
 
-Card = tuple[CaseResults, Episode, Player]  # of a gallery
+Card = tuple[CaseResults, Episode, Player]  # an entry of a gallery
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRow:
-    """An episode of the table."""
+    """A row of the table of episodes."""
 
     case: CaseResults
     episode: Episode
@@ -68,7 +68,7 @@ class Episodes:
 
     rows: list[EpisodeRow]
     left_out: int
-    all_count: bool  # in the rates
+    all_count: bool  # whether the success rates include all episodes
     solved: list[Card]
 
 
@@ -78,9 +78,9 @@ class Failures:
 
     unsolved: int
     cards: list[Card]
-    inlined: int  # videos in the page
-    linked: int  # videos beside the page
-    outside: int  # videos that are not shown, as they are symbolic links out of the folder
+    inlined: int  # number of videos that the page embeds
+    linked: int  # number of videos that the page links to
+    outside: int  # number of videos that are omitted, as they are links out of the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +88,11 @@ class Errors:
     """Errors of the policies, and failures of infrastructure."""
 
     of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
-    # The first `MOST_LOGS` that failed by infrastructure.
+    # The first `MOST_LOGS` attempts that failed because of infrastructure.
     attempts: list[tuple[CaseResults, Attempt]]
-    failed: int  # attempts
-    repeated: int  # attempts
-    lost: int  # episodes
+    failed: int  # number of attempts that failed
+    repeated: int  # number of attempts that were repeated
+    lost: int  # number of episodes without a result
 
 
 class Gallery:
@@ -103,12 +103,12 @@ class Gallery:
         self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0
-        # Paths that are symbolic links out of their folder of results: not shown.
+        # Paths that are symbolic links out of their folder of results, and therefore not shown.
         self.outside: set[str] = set()
 
     def cards(self, episodes: Sequence[CaseEpisode], limit: int) -> list[Card]:
-        """Return at most `limit` of these episodes with a video, from tasks and policies in
-        turns.
+        """Return at most `limit` of these episodes that have a video, sampled in turn from the
+        tasks and policies.
         """
         by_case: dict[str, list[CaseEpisode]] = {}
         for case, episode in episodes:
@@ -120,7 +120,7 @@ class Gallery:
         for case, episode in filter(None, itertools.chain.from_iterable(rounds)):
             if len(cards) == limit:
                 break
-            label = f"{case.task}, episode {episode.result.key.episode}, {case.contender}"
+            label = f"{case.task}, episode {episode.result.key.episode}, {case.policy_id}"
             player = self.player(episode.videos[0], label)
             if player is not None:
                 cards.append((case, episode, player))
@@ -149,7 +149,7 @@ class Gallery:
         return Player(label, source, poster(frame), style, height / width)
 
     def link(self, video: str) -> str | None:
-        """Return the page's link to the file; None without one."""
+        """Return the page's link to the file; None if there is no such file."""
         path = self._file(video)
         if path is None:
             return None
@@ -166,9 +166,9 @@ class Gallery:
 
 
 def episodes(results: Results, gallery: Gallery) -> Episodes | None:
-    """Return all episodes, or None without any."""
-    order = {name: index for index, name in enumerate(results.contenders)}
-    cases = sorted(results.cases, key=lambda case: order[case.contender])
+    """Return all episodes; None if there are none."""
+    order = {name: index for index, name in enumerate(results.policy_ids)}
+    cases = sorted(results.cases, key=lambda case: order[case.policy_id])
     played: list[CaseEpisode] = []
     for case in cases:
         played += [(case, episode) for episode in case.episodes]
@@ -186,9 +186,9 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
 
 
 def _row(case: CaseResults, episode: Episode, gallery: Gallery) -> EpisodeRow:
-    kind = outcome(episode.result)
-    words = f"({_OUTCOMES[kind]})" if episode.beyond else _OUTCOMES[kind]
-    style = {"success": "good", "failure": None}.get(kind, "bad")
+    result = outcome(episode.result)
+    words = f"({_OUTCOMES[result]})" if episode.beyond else _OUTCOMES[result]
+    style = {"success": "good", "failure": None}.get(result, "bad")
     links = []
     for number, video in enumerate(episode.videos, 1):
         link = gallery.link(video)
@@ -211,7 +211,7 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 
 
 def errors(results: Results) -> Errors | None:
-    """Return the errors with their logs; None without any."""
+    """Return the errors with their logs; None if there are none."""
     of_policies = errors_of_policies(results)
     attempts: list[tuple[CaseResults, Attempt]] = []
     for case in results.cases:
@@ -230,12 +230,12 @@ def errors(results: Results) -> Errors | None:
 
 
 def last_frame(video: Path) -> np.ndarray | None:
-    """Return the last frame, (H, W, 3) uint8 RGB; None if the file does not play."""
+    """Return the last frame, (H, W, 3) uint8 RGB; None if the file cannot be decoded."""
     av = require("av")
     try:
         with av.open(str(video)) as container:
             frames = collections.deque(container.decode(video=0), maxlen=1)
-    except (OSError, ValueError):  # PyAV's errors of broken files are of these kinds
+    except (OSError, ValueError):  # PyAV's errors for broken files derive from these
         return None
     return np.asarray(frames[0].to_ndarray(format="rgb24")) if frames else None
 

@@ -25,7 +25,7 @@ class EvaluationPage(ABC):
         address: tuple[str, int],
         keys: Keys | None,
     ) -> AbstractContextManager[str]:
-        """Serve the page for the length of the context, which yields its URL.
+        """Return a context manager that serves the page and yields its URL.
 
         Args:
             document: The progress and the results.

@@ -1,9 +1,9 @@
 """`report.html`: an evaluation as one self-contained page.
 
 Python computes the content: this module, `success` and `episodes`, with the geometry of `charts`.
-`templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections,
-`elements.html.j2` and `charts.html.j2` have their common parts. `report.css` and `report.js` are
-written into the page.
+`templates/page.html.j2` is the page. `sections.html.j2` has a macro for each of its sections, and
+`elements.html.j2` and `charts.html.j2` have the elements that sections share. The contents of
+`report.css` and `report.js` are embedded in the page.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from vlagents_ray.evaluate.report.success import (
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, by_timing, rate_of
-from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, stated, summarize
+from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, reported, summarize
 
 FILE = "report.html"
-STAGES = {  # of `act.info["timing"]`, in their order
+STAGES = {  # the stages in `act.info["timing"]`, in their order, and their names on the page
     "decode_ms": "decode",
     "queue_ms": "queue",
     "inference_ms": "inference",
@@ -70,8 +70,8 @@ class Section(NamedTuple):
     """A part of the page with a heading in the table of contents."""
 
     title: str
-    macro: str  # of sections.html.j2
-    view: Any  # its argument; None or empty: the page has no such section
+    macro: str  # the name of a macro of sections.html.j2
+    view: Any  # the argument of the macro; if it is None or empty, the section is left out
 
     @property
     def anchor(self) -> str:
@@ -82,15 +82,15 @@ class Section(NamedTuple):
 def write_report(
     results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False
 ) -> Path:
-    """Write the report of one folder, or of several (`combined`), to an HTML file, whole or not at
-    all.
+    """Write the report of one folder, or of several (`combined`), to an HTML file. A file that
+    cannot be written completely is not written at all.
 
     Args:
         results: The results.
         path: The file. Missing folders are made.
-        inline: Whether the page contains the videos, up to `episodes.BUDGET` bytes; others are
-            links, relative to `path`.
-        accept_changes: Compare policies although something changed between them (`compare`); the
+        inline: Whether the page embeds the videos, up to `episodes.BUDGET` bytes. It links to the
+            other videos, relative to `path`.
+        accept_changes: Compare policies even if something changed between them (`compare`); the
             page shows these changes.
 
     Returns:
@@ -147,8 +147,8 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
     """Return the headline of a comparison of two policy ids, which is their difference; None for
     any other report.
 
-    The rate of the better one would be too high, as it is chosen by its rate. Differences do not
-    allow for cases that may stop early.
+    The rate of the better policy would be biased upwards, as the policy is chosen by its rate. The
+    intervals of differences are not valid for cases that may stop early.
     """
     may_stop = any(group.success_once.error_rate is not None for group in summary.cases)
     if compared is None or may_stop:
@@ -172,11 +172,12 @@ def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
 def _solved(summary: Summary) -> Figure:
     """Return the headline without a comparison.
 
-    It is a rate, if the cases have a common one, of synchronous episodes if there are any.
+    It is a success rate if the cases have a common one, otherwise the range of their rates. If
+    there are synchronous episodes, it is about them.
     """
     best = summary.best[0]
     timing, group = next(iter(summary.parts(best).items()))
-    name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
+    name = "solved" if len(summary.results.policy_ids) == 1 else f"solved by the best, {best}"
     if len(by_timing(summary.results.cases)) > 1:
         name += f", {timing}"
 
@@ -187,19 +188,19 @@ def _solved(summary: Summary) -> Figure:
 
     cases = by_timing(summary.results.of(best))[timing]
     rates = [rate_of([case], "success_once") for case in cases]
-    known = sorted(
+    known_rates = sorted(
         (rate for rate in rates if rate.rate is not None), key=lambda rate: rate.rate or 0.0
     )
     note = (
         f"{quantity(len(cases), 'task')} that stopped after different numbers of episodes: no "
         "common rate"
     )
-    return Figure(f"{percent(known[0])} to {percent(known[-1])} %", name, note)
+    return Figure(f"{percent(known_rates[0])} to {percent(known_rates[-1])} %", name, note)
 
 
 @cache
 def _templates() -> Environment:
-    # Names and errors are foreign text, so every value in a template is escaped.
+    # Names and errors may contain any text, so every value in a template is escaped.
     loader = PackageLoader(__package__ or "")
     env = Environment(
         loader=loader,
@@ -233,11 +234,11 @@ def _templates() -> Environment:
         difference_labels=charts.difference_labels,
     )
 
-    # Nothing in these two is escaped: they are our own files, and no templates.
+    # These two files are not escaped, as they are part of the package and contain no foreign text.
     folder = files(__package__ or "")
-    for kind in ("css", "js"):
-        text = (folder / f"report.{kind}").read_text("utf-8")
-        env.globals[kind] = Markup(text.strip())  # noqa: S704
+    for suffix in ("css", "js"):
+        text = (folder / f"report.{suffix}").read_text("utf-8")
+        env.globals[suffix] = Markup(text.strip())  # noqa: S704
     return env
 
 
@@ -247,22 +248,22 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """The stages of an answer of each policy, and the env's times: medians over the episodes'
-    medians.
+    """The times of the stages of an answer for each policy, and of the env. Each is the median of
+    the episodes' medians.
     """
 
     chart: BarChart | None  # None: no server reported its stages
-    stages: list[str]  # those that any policy has
+    stages: list[str]  # the stages that any policy reported
     # (policy id, ms, the env's reset in ms, answers)
     rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
-    timed: int  # policy ids with stages; the chart shows the first `MOST_BARS`
+    timed: int  # number of policy ids with stages; the chart shows the first `MOST_BARS`
 
 
 def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was played."""
     counted: dict[str, list[EpisodeResult]] = {}  # by policy id
-    for name in summary.results.contenders:
+    for name in summary.results.policy_ids:
         results = summary.results.only(name).counted
         if results:
             counted[name] = results
@@ -302,7 +303,7 @@ class Env:
     """Envs with equal descriptions, and their contract."""
 
     tasks: list[str]
-    constants: Mapping[str, Any] | None  # of the benchmark
+    constants: Mapping[str, Any] | None  # the constants of the benchmark's protocol
     described: Mapping[str, Any]
     settings: Mapping[str, Any]
     contract: str | None  # as YAML
@@ -314,7 +315,7 @@ class Configuration:
 
     runs: tuple[Run, ...]
     changes: list[Change]  # of files or weights, between episodes
-    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
+    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files by path)
     # (policy id, checkpoint, commit, digest or version of its weights)
     checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
@@ -361,24 +362,24 @@ def configuration(results: Results) -> Configuration:
     for case in results.cases:
         if case.program:
             programs[case.env] = case.program
-        commit = stated(case, "revision")
+        commit = reported(case, "revision")
         identities = (
-            stated(case, "checkpoint"),
+            reported(case, "checkpoint"),
             None if commit is None else f"commit {commit}",
-            stated(case, "weights"),
+            reported(case, "weights"),
             pushed_of(case),
         )
         for identity in identities:
             if identity is not None:
-                checkpoints[case.contender, identity] = None
+                checkpoints[case.policy_id, identity] = None
 
     processes: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}  # (run, pid)
     for worker in results.workers:
-        kind = (worker.host, worker.policy, worker.transport, worker.renderer or "none")
-        processes.setdefault(kind, set()).add((worker.run, worker.pid))
+        description = (worker.host, worker.policy, worker.transport, worker.renderer or "none")
+        processes.setdefault(description, set()).add((worker.run, worker.pid))
 
     last_runs = _last_runs(results)
-    versions: list[Mapping[str, Any]] = []  # of each folder, those that are known
+    versions: list[Mapping[str, Any]] = []  # for each folder, the versions that are known
     for run in last_runs:
         versions.append({name: text for name, text in run.versions.items() if text is not None})
 
@@ -387,7 +388,9 @@ def configuration(results: Results) -> Configuration:
         changes=results.accepted_changes,
         programs=list(programs.items()),
         checkpoints=list(checkpoints),
-        workers=[(*kind, len(members)) for kind, members in sorted(processes.items())],
+        workers=[
+            (*description, len(members)) for description, members in sorted(processes.items())
+        ],
         versions=versions,
         policies=[(name, _yaml(metadata)) for name, metadata in results.policies.items()],
         settings=[(str(run.config.get("out")), _yaml(run.config)) for run in last_runs],
@@ -417,8 +420,8 @@ def repeat(results: Results) -> Repeat:
 
 
 def _last_runs(results: Results) -> list[Run]:
-    """Return the last run of each folder; earlier runs had the same settings, as far as results
-    depend on them.
+    """Return the last run of each folder. Earlier runs had the same settings, except those on which
+    results do not depend.
     """
     return list({run.config.get("out"): run for run in results.runs}.values())
 

@@ -22,8 +22,8 @@ from vlagents_ray.evaluate.results.statistics import Rate
 STARTING = "starting"
 _FAILURES = 24  # most failures in the document, the newest ones
 _TEXT = 300  # most characters of an error or an instruction
-_EVERY_S = 1.0  # least time between two readings of the results
-_SHARE = 0.04  # of a core, for reading them
+_EVERY_S = 1.0  # shortest time between two readings of the results, s
+_SHARE = 0.04  # largest share of a core for reading the results
 WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 
 
@@ -38,21 +38,21 @@ class ResultsDocument:
     reason = ""
     """The error that ended the evaluation."""
 
-    # Whether further evaluations follow each other, as those of a training's checkpoints.
+    # Whether further evaluations follow, such as those of a training's checkpoints.
     goes_on = False
 
     def __init__(self, out: Path) -> None:
         """Describe the results in the folder `out`, which need not exist yet."""
         self._out = out
-        self._numbers: dict[str, int] = {}  # of the videos by their paths, in their order
+        self._numbers: dict[str, int] = {}  # the number of each video by its path, in order
         self._document: dict[str, Any] = {}
         self._read_at, self._took_s = float("-inf"), 0.0
 
     def read(self) -> dict[str, Any]:
-        """Return {"evaluation": the document}; the same object as before if nothing in it has
-        changed.
+        """Return {"evaluation": the document}; the same object as before if nothing has changed.
 
-        It may take as long as reading the folder of results, on average at most 4 % of a core.
+        A call may take as long as reading the folder of results. On average, calls use at most 4 %
+        of a core.
         """
         age_s = time.monotonic() - self._read_at
         if self.is_due(rested=age_s >= max(_EVERY_S, self._took_s / _SHARE)):
@@ -63,8 +63,8 @@ class ResultsDocument:
         return self._document
 
     def video(self, number: int) -> Path | None:
-        """Return the file of a video in the document; None if there is none, or it is a link out
-        of the folder.
+        """Return the file of a video in the document; None if there is no such file, or if it is a
+        link out of the folder.
         """
         if not 0 <= number < len(self._numbers):
             return None
@@ -75,18 +75,20 @@ class ResultsDocument:
         return path if path.is_file() else None
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether to read the results; `rested` is whether that keeps to the share of a
-        core.
+        """Return whether to read the results.
+
+        Args:
+            rested: Whether reading them now would stay within the share of a core.
         """
         return rested
 
     def state(self, results: Results | None) -> str:
-        """Return the state of the evaluation: "starting", or that of its last run."""
+        """Return the state of the evaluation: "starting", or the state of its last run."""
         return results.runs[-1].state if results is not None and results.runs else STARTING
 
     def _describe(self) -> dict[str, Any]:
         results = None
-        with contextlib.suppress(ConfigError):  # the file is being made
+        with contextlib.suppress(ConfigError):  # raised while the file is being created
             results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
         cases = () if results is None else results.cases
@@ -96,8 +98,8 @@ class ResultsDocument:
             now = time.time()
             run = results.runs[-1]
             played = sum(episode.run == run.run for episode in results.episodes)
-            left = sum(_planned(case) - _done(case) for case in cases)
-            left_s = seconds_left(left, played, now - run.started)
+            remaining = sum(_planned(case) - _done(case) for case in cases)
+            left_s = seconds_left(remaining, played, now - run.started)
             ends = None if left_s is None else now + left_s
 
         unsolved: list[tuple[CaseResults, Episode]] = []
@@ -113,7 +115,7 @@ class ResultsDocument:
             "reason": self.reason[:_TEXT],
             "ends": ends,
             "goes_on": self.goes_on,
-            "contenders": [] if results is None else results.contenders,
+            "policy_ids": [] if results is None else results.policy_ids,
             "tasks": list(dict.fromkeys(case.task for case in cases)),
             "done": sum(_done(case) for case in cases),
             "planned": sum(_planned(case) for case in cases),
@@ -128,7 +130,7 @@ class ResultsDocument:
         result = episode.result
         return {
             "key": result.full_key,
-            "policy": case.contender,
+            "policy": case.policy_id,
             "task": case.task,
             "episode": result.key.episode,
             "seed": result.key.seed,
@@ -147,7 +149,7 @@ class ResultsDocument:
 
 def _case(case: CaseResults) -> dict[str, Any]:
     return {
-        "policy": case.contender,
+        "policy": case.policy_id,
         "task": case.task,
         "done": _done(case),
         "planned": _planned(case),
@@ -157,10 +159,10 @@ def _case(case: CaseResults) -> dict[str, Any]:
 
 
 def _curves(results: Results) -> list[dict[str, Any]]:
-    """Return the success rates at each step or version of each policy that has any."""
+    """Return the success rate at each step or version, for each policy that has steps."""
     points: dict[str, list[dict[str, Any]]] = {}  # by policy
-    for contender in results.contenders:
-        cases = results.of(contender)
+    for policy_id in results.policy_ids:
+        cases = results.of(policy_id)
         policy, step = cases[0].policy, cases[0].step
         if step is None:
             continue
@@ -171,12 +173,14 @@ def _curves(results: Results) -> list[dict[str, Any]]:
 
 
 def _done(case: CaseResults) -> int:
-    """Return the number of episodes with a result, those that infrastructure lost included."""
+    """Return the number of episodes that ended, including those lost to infrastructure."""
     return sum(not episode.beyond for episode in case.episodes)
 
 
 def _planned(case: CaseResults) -> int:
-    """Return the number of episodes; of a case that stopped early, without those it spared."""
+    """Return the number of planned episodes; for a case that stopped early, without those that are
+    no longer needed.
+    """
     return case.planned if case.stopped_at is None else _done(case)
 
 
@@ -230,7 +234,7 @@ class ProgressDocument(ResultsDocument, Progress):
         self._shown.end()
 
     def close(self) -> None:
-        """Note that no evaluation follows: the state is that of the last run."""
+        """Note that no evaluation follows, so that the state is the state of the last run."""
         if self._state != STOPPED:
             self._change(ENDED)
 
@@ -240,7 +244,9 @@ class ProgressDocument(ResultsDocument, Progress):
         self._change(STOPPED)
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether to read the results: if anything changed, at once if it was the end."""
+        """Return whether to read the results: if anything has changed, and immediately after the
+        end.
+        """
         is_final = self._changed and self._state in (ENDED, STOPPED)
         is_due = is_final or (rested and (self._changed or self._state == RUNNING))
         if is_due:

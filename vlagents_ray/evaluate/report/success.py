@@ -14,46 +14,47 @@ from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of, summarize
 
-MOST_PAIRS = 15  # shown unfolded: those of six policy ids
-# pairs, those of 40 policy ids; of more, such as a whole training's, only the main ones.
+MOST_PAIRS = 15  # most pairs that are shown unfolded: the pairs of six policy ids
+# Most pairs that are all compared: the pairs of 40 policy ids. Of more, such as those of a whole
+# training, only the main ones are compared.
 MOST_COMPARED = 780
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Rows of the table: one for each policy id."""
+    """Rows of the table, one for each policy id."""
 
     name: str
     groups: list[Group]
-    is_sum: bool = False  # of the tasks above it
+    is_sum: bool = False  # whether it is the sum of the tasks above it
 
 
 @dataclass(frozen=True, slots=True)
 class SuccessTable:
-    """Each task, each suite if there are several, and all."""
+    """Success rates for each task, for each suite if there are several, and for all tasks."""
 
     blocks: list[Block]
-    several: bool  # policy ids
-    stopped: int | None  # cases that stopped early; None: none could
-    pooled: bool  # every policy has one rate for all its cases
-    some_lost: bool  # infrastructure kept episodes from ending
+    several: bool  # whether there are several policy ids
+    stopped: int | None  # number of cases that stopped early; None if none could
+    pooled: bool  # whether every policy has one rate for all its cases
+    some_lost: bool  # whether episodes were lost to infrastructure
 
 
 @dataclass(frozen=True, slots=True)
 class LearningCurve:
-    """Success over the training step."""
+    """Success rates against training steps."""
 
     chart: RateChart
-    # (policy, step, rate); no step: a policy without checkpoints.
+    # (policy, step, rate); the step is None for a policy without checkpoints.
     rows: list[tuple[str, float | None, Rate]]
 
 
 def success_table(summary: Summary) -> SuccessTable:
-    """Return the table of success rates, with what a note below it has to say."""
+    """Return the table of success rates, with the facts for the note below it."""
     total = summary.total
     return SuccessTable(
         list(_blocks(summary)),
-        several=len(summary.results.contenders) > 1,
+        several=len(summary.results.policy_ids) > 1,
         stopped=None if total.success_once.bounds is None else total.stopped,
         pooled=summary.has_one_rate_each,
         some_lost=total.infra_failures > 0,
@@ -61,19 +62,21 @@ def success_table(summary: Summary) -> SuccessTable:
 
 
 def learning_curves(summary: Summary) -> list[LearningCurve]:
-    """Return success over the training steps of each policy with several; empty if none has."""
+    """Return success rates against training steps for each policy with several steps; empty if no
+    policy has several.
+    """
     curves = [_learning_curve(title, cases) for title, cases in _parts_with_a_rate(summary)]
     return [curve for curve in curves if curve is not None]
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:
-    """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the
-    sum of all.
+    """Yield a block for each task in the order of the plan, the sum of each suite after its tasks,
+    and finally the sum of all tasks.
     """
-    order = {name: number for number, name in enumerate(summary.results.contenders)}
+    order = {name: number for number, name in enumerate(summary.results.policy_ids)}
 
     def in_order(groups: list[Group]) -> list[Group]:
-        return sorted(groups, key=lambda group: order[group.contender])
+        return sorted(groups, key=lambda group: order[group.policy_id])
 
     suites: dict[str, dict[str, list[Group]]] = {}  # the groups of each env of each suite
     for group in summary.cases:
@@ -92,7 +95,7 @@ def _blocks(summary: Summary) -> Iterator[Block]:
         is_one_suite = len({case.suite for case in cases}) == 1
         is_one_task = is_one_suite and len({case.env for case in cases}) == 1
         if is_one_task or (is_one_suite and len(suites) > 1):
-            continue  # it is above, as the only row, or as the sum of its suite
+            continue  # this sum is already there, as the only task or the sum of its suite
         name = "all" if len(timings) == 1 else f"all {timing}"
         yield Block(name, in_order(_by_policy_id(cases, TOTAL)), is_sum=True)
 
@@ -101,13 +104,13 @@ def _by_policy_id(cases: Sequence[CaseResults], suite: str) -> list[Group]:
     """Return the sum of the cases of each policy id."""
     by_policy_id: dict[str, list[CaseResults]] = {}
     for case in cases:
-        by_policy_id.setdefault(case.contender, []).append(case)
+        by_policy_id.setdefault(case.policy_id, []).append(case)
     return [group_of((name, suite, TOTAL), members) for name, members in by_policy_id.items()]
 
 
 def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CaseResults]]]:
-    """Yield the cases of each chart: all, and each suite; single tasks if a suite has no common
-    rate.
+    """Yield the title and the cases of each chart: all cases, then each suite, or each task of a
+    suite without a common rate.
     """
     timings = by_timing(summary.results.cases)
     for timing, cases in timings.items():
@@ -137,8 +140,8 @@ def _all_have_rates(cases: Sequence[CaseResults]) -> bool:
 
 
 def _learning_curve(title: str, cases: Sequence[CaseResults]) -> LearningCurve | None:
-    """Return a curve for each policy with several steps, a level line for each other; None if no
-    policy has several.
+    """Return a curve for each policy with several steps and a level line for each other policy;
+    None if no policy has several steps.
     """
     by_policy: dict[str, dict[int, list[CaseResults]]] = {}
     without_steps: dict[str, list[CaseResults]] = {}
@@ -177,7 +180,7 @@ def _learning_curve(title: str, cases: Sequence[CaseResults]) -> LearningCurve |
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A row of the table: success rate of A less that of B."""
+    """A row of the table: the success rate of A minus the success rate of B."""
 
     a: str
     b: str
@@ -194,16 +197,16 @@ class ComparisonPart:
 
     timing: str
     shown: list[Difference]
-    by_suite: list[list[Difference]]  # of those shown, each with its suites
+    by_suite: list[list[Difference]]  # the suites of each shown comparison that has several
     folded: list[Difference]
 
 
 @dataclass(frozen=True, slots=True)
 class Comparisons:
-    """The pairs of policy ids, the main ones first."""
+    """The comparisons of all pairs of policy ids, the main pairs first."""
 
     parts: list[ComparisonPart]
-    left_out: int  # pairs beyond the main ones, if there are very many
+    left_out: int  # pairs besides the main ones that are not compared, if there are very many
     several_timings: bool
     reasons: list[str]  # reasons why other pairs are not compared
     changes: list[Change]  # accepted differences between environments of compared policies
@@ -211,25 +214,26 @@ class Comparisons:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """The comparisons of the episodes with one timing, whose p-values are adjusted for one
-    another.
+    """The comparisons of the episodes with one timing. Their p-values are adjusted for the number
+    of comparisons.
     """
 
     timing: str
     comparisons: list[Comparison]  # the main ones first
-    main: int  # the number of these
-    # Pairs beyond the main ones, if there are very many; their number is in the adjustment.
+    main: int  # number of the main ones
+    # Pairs besides the main ones that are not compared, if there are very many. The adjustment
+    # includes their number.
     left_out: int
     reasons: list[str]  # reasons why other pairs are not compared
 
 
 def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
-    """Compare all policy ids, apart for each timing; of very many pairs only the main ones."""
+    """Compare all policy ids, separately for each timing; of very many pairs only the main ones."""
     members = []
     for timing, cases in by_timing(summary.results.cases).items():
         results = summary.results.among(cases)
         of_timing = summarize(results)
-        all_pairs = list(itertools.combinations(results.contenders, 2))
+        all_pairs = list(itertools.combinations(results.policy_ids, 2))
         candidates = all_pairs
         chosen_of = None
         if len(all_pairs) > MOST_COMPARED:
@@ -261,7 +265,7 @@ def families_json(summary: Summary, *, accept_changes: bool = False) -> list[dic
 
 def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparisons | None:
     """Return all comparisons; None for a single policy id."""
-    if len(summary.results.contenders) < 2:
+    if len(summary.results.policy_ids) < 2:
         return None
     parts: list[ComparisonPart] = []
     reasons: list[str] = []
@@ -309,18 +313,18 @@ def _difference(comparison: Comparison, line: Line) -> Difference:
 
 
 def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return each checkpoint with the one before it, and the best of all with the best of each
-    other policy; only those among `pairs`.
+    """Return the main pairs among `pairs`: each checkpoint with the one before it, and the best
+    policy id with the best one of each other policy.
     """
     policies: dict[str, str] = {}  # by policy id
     steps: dict[str, int | None] = {}
     for case in summary.results.cases:
-        policies[case.contender] = case.policy
-        steps[case.contender] = case.step
+        policies[case.policy_id] = case.policy
+        steps[case.policy_id] = case.step
 
     main = []
     # The checkpoints of a policy are in the order of their steps.
-    for earlier, later in itertools.pairwise(summary.results.contenders):
+    for earlier, later in itertools.pairwise(summary.results.policy_ids):
         if policies[earlier] == policies[later] and steps[earlier] is not None:
             main.append((later, earlier))
 
@@ -335,6 +339,6 @@ def _main_pairs(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tupl
 
 
 def _later_first(results: Results, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return the pairs with the later checkpoint as A, so that progress is a gain."""
-    order = {name: number for number, name in enumerate(results.contenders)}
+    """Return the pairs with the later checkpoint as A, so that progress is positive."""
+    order = {name: number for number, name in enumerate(results.policy_ids)}
     return [(a, b) if order[a] > order[b] else (b, a) for a, b in pairs]

@@ -31,14 +31,14 @@ from vlagents_ray.evaluate.results.summary import (
 )
 
 LINE_EVERY_S = 5.0
-MOST_ROWS = 12  # of the table of a running evaluation
+MOST_ROWS = 12  # most rows in the table of a running evaluation
 
 
 class Progress:
-    """The callbacks of a running evaluation, from one thread. This class shows nothing: override
-    some.
+    """The callbacks of a running evaluation, which are called on one thread.
 
-    The classes of `progress_for` show them: live on a terminal, in plain lines elsewhere.
+    The methods of this class do nothing; derived classes override some. Those of `progress_for`
+    show the progress, live on a terminal and in plain lines elsewhere.
     """
 
     def begin(self, cases: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
@@ -80,7 +80,7 @@ class Progress:
 
 
 class _CountedProgress(Progress):
-    """Counts for both displays, and prints errors and retries as lines."""
+    """Keeps the counts of both displays, and prints errors and retries as lines."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -90,15 +90,15 @@ class _CountedProgress(Progress):
         """Start the counts from the rates of earlier runs."""
         self._started = monotonic()
         self._cases = {case.fingerprint: case for case in cases}
-        # These two by the case's fingerprint:
+        # The keys of these two are the cases' fingerprints.
         self._rates = {case_id: recorded.get(case_id, Rate(0, 0)) for case_id in self._cases}
         self._infra_failed = dict.fromkeys(self._cases, 0)
         self._steps = 0
-        self._played = 0  # in this run
+        self._played = 0  # episodes of this run
         self._left = left
         self._retries = 0
         self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
-        self._is_one_policy = len({case.contender for case in cases}) == 1
+        self._is_one_policy = len({case.policy_id for case in cases}) == 1
 
     def episode(self, case: EvalCase, result: EpisodeResult) -> None:
         """Count an episode; print an error of the policy if its cause is new."""
@@ -119,10 +119,10 @@ class _CountedProgress(Progress):
 
         if result.status == "policy_error":
             error = (result.error or "").strip().partition("\n")[0]
-            cause = case.contender, cause_of(error)
+            cause = case.policy_id, cause_of(error)
             if cause not in self._causes:
                 self._causes.add(cause)
-                where = f"{case.contender} failed in {case.env} episode {result.key.episode}"
+                where = f"{case.policy_id} failed in {case.env} episode {result.key.episode}"
                 self._print(f"{where}, counted as no success: {error}")
 
     def retry(self, job: Job, failure: Failure) -> None:
@@ -144,8 +144,8 @@ class _CountedProgress(Progress):
         )
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        """Return (name, "done/planned", success so far), of many cases only for those being
-        played.
+        """Return a row (name, "done/planned", success so far) for each case; if there are many
+        cases, only for those of which some but not all episodes have ended.
         """
         show_all = len(self._cases) <= MOST_ROWS
         rows: list[tuple[str, str, str]] = []
@@ -154,8 +154,8 @@ class _CountedProgress(Progress):
             done = rate.episodes + self._infra_failed[case_id]
             is_being_played = 0 < done < case.planned
             if len(rows) < MOST_ROWS and (show_all or is_being_played):
-                contender, suite, env = case.name
-                names = (suite, env) if self._is_one_policy else (contender, suite, env)
+                policy_id, suite, env = case.name
+                names = (suite, env) if self._is_one_policy else (policy_id, suite, env)
                 rows.append((" ".join(filter(None, names)), f"{done}/{case.planned}", str(rate)))
         return rows
 
@@ -189,7 +189,7 @@ class LiveProgress(_CountedProgress):
         self._live.start()
 
     def end(self) -> None:
-        self._live.stop()  # the last state stays on the terminal
+        self._live.stop()  # which leaves the last state on the terminal
 
     def _drawing(self) -> Rows:
         table = Table("env", "episodes", "success so far", box=None)
@@ -220,24 +220,24 @@ class LineProgress(_CountedProgress):
 
 
 def progress_for(console: Console) -> Progress:
-    """Choose the display for `console`: a live table on a terminal, else a line every five
+    """Return the display for `console`: a live table on a terminal, otherwise a line every five
     seconds.
     """
     return LiveProgress(console) if console.is_terminal else LineProgress(console)
 
 
 def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
-    """Estimate the time of `episodes` further episodes, s; None if none are left or none was
-    played.
+    """Estimate the time of `episodes` further episodes, s; None if no episode is left, or if none
+    has ended yet.
     """
     return episodes * elapsed_s / played if episodes > 0 and played else None
 
 
 def results_table(summary: Summary) -> Table:
-    """Make a table of success, length and speed: for each policy id a row for each env, and one
-    for all together.
+    """Return the table of success, length and speed. Each policy id has a row for each env, and a
+    row for all envs together.
     """
-    names = summary.results.contenders
+    names = summary.results.policy_ids
     interval = "the Wilson 95 % interval"
     error_rate = summary.total.success_once.error_rate
     if error_rate is not None:
@@ -254,7 +254,7 @@ def results_table(summary: Summary) -> Table:
         table.add_column(title, justify="right", no_wrap=True)
 
     for name, total in zip(names, summary.totals, strict=True):
-        rows = [(group, "") for group in summary.cases if group.contender == name]
+        rows = [(group, "") for group in summary.cases if group.policy_id == name]
         if len(rows) > 1:
             groups_by_timing = summary.parts(name)
             if len(groups_by_timing) == 1:
@@ -275,7 +275,7 @@ def print_summary(console: Console, summary: Summary) -> None:
         console: The console.
         summary: The result of `evaluate`.
     """
-    # Imported late, as Jinja is not needed before all is played.
+    # Imported late, as Jinja is needed only after the last episode.
     from vlagents_ray.evaluate.report.page import FILE
 
     console.print(results_table(summary))
@@ -315,13 +315,13 @@ def _speed(summary: Summary) -> list[str]:
     if summary.env_busy is not None and summary.policy_busy is not None:
         lines.append(
             f"envs busy for {summary.env_busy:.0%} of the workers' time, "
-            f"the policy for {summary.policy_busy:.0%} of one replica's"
+            f"the policy for {summary.policy_busy:.0%} of one replica's time"
         )
     return lines
 
 
 def _losses(summary: Summary) -> list[str]:
-    """Return the lines about episodes and attempts that errors ended."""
+    """Return the lines about episodes and attempts that ended with errors."""
     total = summary.total
     lines = []
     if total.policy_errors:
@@ -333,8 +333,8 @@ def _losses(summary: Summary) -> list[str]:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
     if total.infra_failures:
         lines.append(
-            f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries "
-            "them again"
+            f"{total.infra_failures} episodes lost to infrastructure and excluded from all rates; "
+            "--resume tries them again"
         )
         lines.append(
             "once with lost: the bounds if all lost episodes had failed, or had been solved"
@@ -347,7 +347,7 @@ def _pushed_weights(summary: Summary) -> list[str]:
     for case in summary.results.cases:
         versions = pushed_of(case)
         if versions is not None:
-            weights[case.contender] = versions
+            weights[case.policy_id] = versions
     return [
         f"{name}: weights pushed by a learner, {versions}" for name, versions in weights.items()
     ]
@@ -357,7 +357,7 @@ def _early_stops(summary: Summary) -> list[str]:
     lines = []
     for group in summary.cases:
         if group.stopped:
-            name = " ".join(filter(None, (group.contender, group.suite, group.env)))
+            name = " ".join(filter(None, (group.policy_id, group.suite, group.env)))
             error_rate = group.success_once.error_rate or 0
             lines.append(
                 f"{name}: stopped after {group.episodes} of {group.planned} (error rate "
@@ -393,7 +393,7 @@ def _clock_gaps(summary: Summary) -> list[str]:
 
 
 def _cells(group: Group, timing: str, *, some_lost: bool) -> list[str]:
-    """Return the cells of a row, from the column "env" on."""
+    """Return the cells of a row, beginning with the column "env"."""
     cells = [
         " ".join(filter(None, (group.suite, group.env, timing))),
         f"{group.episodes}/{group.planned}",

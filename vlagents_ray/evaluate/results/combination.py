@@ -12,7 +12,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.changes import changed
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, Worker
-from vlagents_ray.evaluate.results.summary import stated
+from vlagents_ray.evaluate.results.summary import reported
 
 
 def require_distinct(folders: Iterable[Path]) -> None:
@@ -100,7 +100,7 @@ def _require_different_evaluations(folders: Sequence[Results]) -> None:
             first = first_folders.setdefault(case.case_id, results.out)
             if first is not results.out:
                 raise ConfigError(
-                    f"report: {first} and {results.out} both have {case.contender!r} in "
+                    f"report: {first} and {results.out} both have {case.policy_id!r} in "
                     f"{case.env!r} with the same settings; put parts of one evaluation into one "
                     f"folder first: `vlagents-ray merge {first} {results.out} --out OUT`, with "
                     "--accept-changes if code or weights changed between them"
@@ -114,17 +114,17 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
     all_cases: list[CaseResults] = []
     for results in folders:
         all_cases += results.cases
-    counts = Counter((case.contender, case.suite, case.env) for case in all_cases)
+    counts = Counter((case.policy_id, case.suite, case.env) for case in all_cases)
     clashing = {
-        case.policy for case in all_cases if counts[case.contender, case.suite, case.env] > 1
+        case.policy for case in all_cases if counts[case.policy_id, case.suite, case.env] > 1
     }
 
     known_weights: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
     for case in all_cases:
-        weights, checkpoint = stated(case, "weights"), stated(case, "checkpoint")
+        weights, checkpoint = reported(case, "weights"), reported(case, "checkpoint")
         if weights is None:
             continue
-        if known_weights.setdefault((case.contender, checkpoint), weights) != weights:
+        if known_weights.setdefault((case.policy_id, checkpoint), weights) != weights:
             clashing.add(case.policy)
 
     swept = {case.policy for case in all_cases if case.step is not None}

@@ -100,7 +100,7 @@ def compare(
     Args:
         results: Results that hold both.
         a: A policy id: the policy's name, with "@STEP" in a sweep over checkpoints; one of
-            `results.contenders`.
+            `results.policy_ids`.
         b: The other policy id.
         timing: "synchronous" or "in real time", for results that have episodes of both, which are
             never pooled.
@@ -190,7 +190,7 @@ def comparable(
     why it does not; by default of all pairs.
     """
     if policy_pairs is None:
-        policy_pairs = list(itertools.combinations(results.contenders, 2))
+        policy_pairs = list(itertools.combinations(results.policy_ids, 2))
     accepted, reasons = [], []
     for a, b in policy_pairs:
         try:
@@ -210,16 +210,16 @@ def clock_gaps(results: Results) -> list[Comparison]:
     """
     strata: dict[tuple[str, str], Strata] = {}  # by the names of A and B
     cases: dict[tuple[str, str], list[CaseResults]] = {}
-    order = {name: number for number, name in enumerate(results.contenders)}
-    for case in sorted(results.cases, key=lambda case: order[case.contender]):
+    order = {name: number for number, name in enumerate(results.policy_ids)}
+    for case in sorted(results.cases, key=lambda case: order[case.policy_id]):
         counterpart = synchronous_twin(results, case)
         if counterpart is None:
             continue
         pairs = _pairs(case, counterpart)
         if pairs.total:
             names = (
-                f"{case.contender}, {case.suite} in real time",
-                f"{case.contender}, {counterpart.suite}".rstrip(", "),
+                f"{case.policy_id}, {case.suite} in real time",
+                f"{case.policy_id}, {counterpart.suite}".rstrip(", "),
             )
             strata.setdefault(names, {})[case.env] = pairs
             cases.setdefault(names, []).append(case)
@@ -245,11 +245,11 @@ def _shared(
     results: Results, a: str, b: str, *, accept_changes: bool
 ) -> tuple[dict[str, Strata], list[Change]]:
     """Return the pairs of outcomes by suite and env, and the accepted changes between the two."""
-    unknown = sorted({a, b} - set(results.contenders))
+    unknown = sorted({a, b} - set(results.policy_ids))
     if unknown:
         raise ConfigError(
-            f"compare: expected two of the policies {results.contenders}, got {unknown}"
-            + did_you_mean(unknown[0], results.contenders)
+            f"compare: expected two of the policies {results.policy_ids}, got {unknown}"
+            + did_you_mean(unknown[0], results.policy_ids)
         )
 
     cases_of_b = {(case.suite, case.env): case for case in results.of(b)}
@@ -299,7 +299,7 @@ def _changes_between(
         if value != other_value:
             raise ConfigError(
                 f"compare: expected the same {name} of {case.env!r} for all policies, got "
-                f"{value!r} for {case.contender!r} and {other_value!r} for {other.contender!r}; "
+                f"{value!r} for {case.policy_id!r} and {other_value!r} for {other.policy_id!r}; "
                 "evaluate both with the same, or give the suites different names"
             )
 
@@ -311,7 +311,7 @@ def _changes_between(
     )
     if changes and not accept_changes:
         raise ConfigError(
-            f"compare: expected {case.contender!r} and {other.contender!r} in the same "
+            f"compare: expected {case.policy_id!r} and {other.policy_id!r} in the same "
             f"environment, got different ones:\n{listed(changes)}\nevaluate both in the same one, "
             f"{_COMPARE_ALL_THE_SAME}"
         )
@@ -319,7 +319,7 @@ def _changes_between(
     mixed = _mixed(results, case, other)
     if mixed and not accept_changes:
         raise ConfigError(
-            f"compare: expected episodes of {case.contender!r} and {other.contender!r} in "
+            f"compare: expected episodes of {case.policy_id!r} and {other.policy_id!r} in "
             f"{case.env!r} with the same files, got {' and '.join(mixed)}, as --accept-changes "
             f"allowed; evaluate both again in a new folder, {_COMPARE_ALL_THE_SAME}"
         )
@@ -343,15 +343,15 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     for either, counted in zip((case, other), counted_by_case, strict=True):
         programs = {episode.policy_program for episode in counted} - {None}
         if len(programs) > 1:
-            mixed.append(f"{len(programs)} versions of the files of {either.contender!r}")
+            mixed.append(f"{len(programs)} versions of the files of {either.policy_id!r}")
 
         weights = {episode.result.weights for episode in counted} - {None}
         if len(weights) > 1:
-            mixed.append(f"{len(weights)} weights of {either.contender!r}")
+            mixed.append(f"{len(weights)} weights of {either.policy_id!r}")
 
         of_policy = [str(change) for change in accepted if change.is_setting_of(either.policy)]
         if of_policy:
-            mixed.append(f"several settings of {either.contender!r} ({'; '.join(of_policy)})")
+            mixed.append(f"several settings of {either.policy_id!r} ({'; '.join(of_policy)})")
 
     of_env = [str(change) for change in accepted if change.is_statement_of(case.env)]
     if of_env:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import contender
+from vlagents_ray.evaluate.plan.cases import policy_id
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import Change
@@ -119,9 +119,9 @@ class CaseResults:
     stopped_at: int | None = None
 
     @property
-    def contender(self) -> str:
+    def policy_id(self) -> str:
         """The policy id: the policy's name, with "@STEP" in a sweep over checkpoints."""
-        return contender(self.policy, self.step)
+        return policy_id(self.policy, self.step)
 
     @property
     def task(self) -> str:
@@ -215,7 +215,7 @@ class Results:
         return cls(out, tuple(cases), tuple(runs), policies, tuple(workers))
 
     @property
-    def contenders(self) -> list[str]:
+    def policy_ids(self) -> list[str]:
         """The policy ids: policies without steps first, then the checkpoints of each policy by
         their step.
         """
@@ -225,11 +225,11 @@ class Results:
             return case.step is not None, policies.index(case.policy), case.step or 0
 
         ordered = sorted(self.cases, key=rank)
-        return list(dict.fromkeys(case.contender for case in ordered))
+        return list(dict.fromkeys(case.policy_id for case in ordered))
 
-    def of(self, contender: str) -> list[CaseResults]:
+    def of(self, policy_id: str) -> list[CaseResults]:
         """Return the cases of one policy id, in the order of the plan."""
-        return [case for case in self.cases if case.contender == contender]
+        return [case for case in self.cases if case.policy_id == policy_id]
 
     def file(self, path: str) -> Path:
         """Return the absolute path of an episode's file with the relative `path`; it need not
@@ -248,11 +248,11 @@ class Results:
         """Return the same results with these cases only."""
         return replace(self, cases=tuple(cases))
 
-    def only(self, contender: str | None = None, env: str | None = None) -> Results:
+    def only(self, policy_id: str | None = None, env: str | None = None) -> Results:
         """Select the cases of a policy or an env.
 
         Args:
-            contender: A policy id; None for all.
+            policy_id: The id of a policy; None for all.
             env: The full name of an env; None for all.
 
         Returns:
@@ -263,12 +263,12 @@ class Results:
         """
         selected = []
         for case in self.cases:
-            if contender in (None, case.contender) and env in (None, case.env):
+            if policy_id in (None, case.policy_id) and env in (None, case.env):
                 selected.append(case)
         if not selected:
-            known = sorted({f"{case.contender} in {case.env}" for case in self.cases})
+            known = sorted({f"{case.policy_id} in {case.env}" for case in self.cases})
             raise ConfigError(
-                f"{self.out}: expected episodes of {contender or 'any policy'} in "
+                f"{self.out}: expected episodes of {policy_id or 'any policy'} in "
                 f"{env or 'any env'}, got none: {known}"
             )
         return self.among(selected)

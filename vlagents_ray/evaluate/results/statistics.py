@@ -1,12 +1,12 @@
 """Statistics of success: rates, their paired comparison, and valid early stopping.
 
-A confidence sequence holds at all numbers of episodes together: the chance that it ever misses the
-true rate is at most the error rate, so the evaluation may stop after any episode. An interval for a
-fixed number of episodes, such as Wilson's, is not valid then.
+A confidence sequence is valid at all numbers of episodes simultaneously: the probability that it
+ever misses the true rate is at most the error rate, so the evaluation may stop after any episode.
+An interval for a fixed number of episodes, such as Wilson's, is not valid then.
 
 Quick episodes end first, and failures take longest, so the finished episodes are a biased sample.
-Therefore only an unbroken prefix of the planned order counts, and the end of a case depends on its
-outcomes alone.
+Therefore only an unbroken prefix of the planned order counts, and the end of a case depends only on
+its outcomes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 
 Z_95 = 1.959963984540054  # two-sided 95 % quantile of the standard normal distribution
-ERROR_RATE = 0.05  # of the intervals
+ERROR_RATE = 0.05  # probability that an interval misses the true value
 _PSEUDO_EPISODES = 2.0
 
 
@@ -59,8 +59,8 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     centre = (rate + z * z / (2 * trials)) / scale
     half_width = z / scale * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
 
-    # Without a success the lower bound is exactly 0, and without a failure the upper one exactly 1;
-    # floating point would leave 1e-17.
+    # Without a success the lower bound is exactly 0, and without a failure the upper one is exactly
+    # 1. Floating point would give 1e-17 and 1 - 1e-16.
     low = 0.0 if successes == 0 else centre - half_width
     high = 1.0 if successes == trials else centre + half_width
     return low, high
@@ -86,7 +86,7 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high): the Wilson 95 % interval, unless there are other `bounds`; (0, 1) if
+        """(low, high): `bounds` if there are any, otherwise the Wilson 95 % interval; (0, 1) if
         there is no common rate.
         """
         if not self.pooled:
@@ -113,7 +113,7 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Counts of the episodes that both A and B played, by the policy that solved the task. Counts
+    """Counts of the episodes that both A and B ran, by which of them solved the task. Two objects
     can be added.
 
     Raises:
@@ -153,9 +153,7 @@ class Pairs:
         return mcnemar(self.only_a, self.only_b)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the four numbers, with `pairs` (their sum), `difference` and `p_value`, for
-        JSON.
-        """
+        """Return the four counts for JSON, with `pairs` (their sum), `difference` and `p_value`."""
         counts = {
             "both": self.both,
             "only_a": self.only_a,
@@ -181,7 +179,8 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
     Args:
         only_a: The number of episodes that A solved and B did not.
         only_b: The number of episodes that B solved and A did not.
-        mid: Count the observed table half, which is less conservative, and no longer exact. M. W.
+        mid: Count only half of the probability of the observed table. This mid-p test is less
+            conservative, but no longer exact. M. W.
             Fagerland, S. Lydersen, P. Laake, "The McNemar test for binary matched-pairs data", BMC
             Medical Research Methodology 13:91 (2013).
 
@@ -197,14 +196,14 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
         )
 
     n = only_a + only_b
-    # The numbers of ways to choose k of n, and up to k of n: integers, which are exact for any
-    # number of episodes.
+    # The numbers of ways to choose k of n, and at most k of n. They are integers, so they are exact
+    # for any number of episodes.
     ways = tail = 1
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
 
-    # Both tails contain the observed table, of which half is counted.
+    # Both tails contain the observed table, of which half is counted in each.
     if mid and n and only_a == only_b:
         return 1.0 - ways / (2 << n)
     return min(1.0, (2 * tail - ways * mid) / (1 << n))
@@ -214,16 +213,16 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     """Compute the 95 % interval of a difference of success rates on the same episodes.
 
     Its bounds are percentiles of a paired bootstrap: episodes are drawn again with both of their
-    outcomes, env by env (a stratum each), as an evaluation has the same number of episodes of an
-    env however often it is repeated. B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap"
-    (1993), chapters 8 and 13.
+    outcomes, separately for each env (a stratum), since each repetition of an evaluation has the
+    same number of episodes of an env. B. Efron, R. J. Tibshirani, "An Introduction to the
+    Bootstrap" (1993), chapters 8 and 13.
 
-    It adds two episodes, half a one of each outcome: else 20 of 20 against none, or no episode that
-    distinguishes A from B, would give an interval of zero width, which claims certainty. A.
-    Agresti, Y. Min, "Simple improved confidence intervals for comparing matched proportions",
-    Statistics in Medicine 24 (2005).
+    Two episodes are added, half an episode of each of the four outcomes. Without them, 20 of 20
+    against none, or no episode that distinguishes A from B, would give an interval of zero width,
+    which claims certainty. A. Agresti, Y. Min, "Simple improved confidence intervals for comparing
+    matched proportions", Statistics in Medicine 24 (2005).
 
-    No random generator is used: the limit of infinitely many draws is the distribution of a sum of
+    No random generator is used. In the limit of infinitely many draws, the difference is a sum of
     independent steps of +1, -1 and 0, whose characteristic function is a product.
 
     Args:
@@ -237,21 +236,21 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     if n == 0:
         return -1.0, 1.0
 
-    # The sum of n steps is one of 2n + 1 values, from -n to n, so that as many points of the
+    # The sum of n steps is one of 2n + 1 values, from -n to n, so 2n + 1 points of the
     # characteristic function determine its distribution.
     turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))
     characteristic = np.ones_like(turns)
     for pairs in strata:
         if not pairs.total:
             continue
-        # What is added to each of the four outcomes, in proportion to the env's episodes.
+        # The count added to each of the four outcomes, in proportion to the env's episodes.
         added = _PSEUDO_EPISODES / 4 * pairs.total / n
         total = pairs.total + 4 * added
-        a = (pairs.only_a + added) / total
-        b = (pairs.only_b + added) / total
-        characteristic *= (a * turns + b / turns + (1 - a - b)) ** pairs.total
+        up = (pairs.only_a + added) / total
+        down = (pairs.only_b + added) / total
+        characteristic *= (up * turns + down / turns + (1 - up - down)) ** pairs.total
 
-    # Proportional to the chances of the sums -n, …, n.
+    # Proportional to the probabilities of the sums -n, …, n.
     weights = np.fft.fftshift(np.fft.fft(characteristic).real).clip(min=0.0)
     cumulative = np.cumsum(weights) / weights.sum()
     low, high = np.searchsorted(cumulative, [ERROR_RATE / 2, 1 - ERROR_RATE / 2]) - n
@@ -261,9 +260,10 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p-values for their number, by Holm's method.
 
-    If every hypothesis with an adjusted p-value below 5 % is rejected, the chance that any of these
-    rejections is wrong is at most 5 %, however the tests depend on one another. S. Holm, "A simple
-    sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
+    If every hypothesis with an adjusted p-value below 5 % is rejected, the probability that any of
+    these rejections is wrong is at most 5 %, however the tests depend on one another. S. Holm, "A
+    simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6
+    (1979).
 
     Args:
         p_values: One for each test, in [0, 1].
@@ -279,24 +279,24 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
-_HALVINGS = 60  # of an interval of length 1: below the resolution of a float
+_HALVINGS = 60  # halvings that take an interval of length 1 below the resolution of a float
 
 
 def confidence_sequence(
     successes: int, trials: int, error_rate: float = 0.05
 ) -> tuple[float, float]:
-    """Compute an interval of a success probability that is valid after every trial together.
+    """Compute an interval of a success probability that is valid after all trials simultaneously.
 
     It is {p : (n + 1) C(n, s) p^s (1 - p)^(n - s) > error_rate}: H. Robbins, "Statistical Methods
     Related to the Law of the Iterated Logarithm", Ann. Math. Statist. 41 (1970). It is the
-    beta-binomial mixture martingale with a uniform prior, of which J. Ville's inequality (1939)
-    bounds the chance to ever reach 1 / error_rate.
+    beta-binomial mixture martingale with a uniform prior. J. Ville's inequality (1939) bounds the
+    probability that it ever reaches 1 / error_rate.
 
     Args:
         successes: The number of trials that succeeded so far.
         trials: The number of trials so far.
-        error_rate: The largest chance, in (0, 1), that the interval misses the probability at any
-            number of trials.
+        error_rate: The largest probability, in (0, 1), that the interval misses the true value at
+            any number of trials.
 
     Returns:
         (low, high), each in [0, 1]; (0, 1) when there are no trials.
@@ -333,11 +333,14 @@ def confidence_sequence(
 
 def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float, float]:
     """Return bounds (low, high) of the success rate of several cases, each weighted by its
-    episodes.
+    number of episodes.
 
-    `counts` are the (successes, trials) of each case. Stopping determines the weights, so each case
-    gets an equal share of the error rate: then all their bounds hold at once, and so does any
-    weighted mean.
+    The weights depend on when each case stops. Therefore each case gets an equal share of the error
+    rate: all bounds are then valid simultaneously, and so is any weighted mean of them.
+
+    Args:
+        counts: The (successes, trials) of each case.
+        error_rate: The largest probability, in (0, 1), that the bounds miss the true rate.
     """
     counts = [(successes, trials) for successes, trials in counts if trials]
     total = sum(trials for _, trials in counts)
@@ -354,19 +357,23 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
 
 
 class Stopping:
-    """Decides when one case stops, from its episodes in any order."""
+    """Decides when a case stops. Its episodes may be added in any order."""
 
     def __init__(self, stop: StopConfig, seeds: Sequence[int], planned: int) -> None:
-        """Start without an outcome; `seeds` and `planned` episodes (of all seeds together) are
-        those of the case.
+        """Start without outcomes.
+
+        Args:
+            stop: The settings of early stopping.
+            seeds: The seeds of the case.
+            planned: The number of planned episodes of the case, over all seeds.
         """
         self._stop = stop
         self._seeds = list(seeds)
         self._episodes_per_seed = planned // len(seeds)
         self._outcomes: dict[int, bool] = {}  # by index in the plan
         self._in_order = 0  # the number of episodes in the unbroken prefix of the plan
-        self._successes = 0  # in that prefix
-        self.at: int | None = None  # the case stops after so many episodes; None: not yet
+        self._successes = 0  # the number of successes in that prefix
+        self.at: int | None = None  # the number of episodes after which the case stops
 
     def add_all(self, results: Iterable[EpisodeResult]) -> None:
         """Add the outcomes of several episodes."""
@@ -374,8 +381,8 @@ class Stopping:
             self.add(result)
 
     def add(self, result: EpisodeResult) -> None:
-        """Add the outcome of an episode. One that failed by infrastructure has none yet, and is
-        awaited.
+        """Add the outcome of an episode. An episode that failed because of infrastructure has no
+        outcome yet, so those after it do not count until it is repeated.
         """
         index = place_in_plan(result.key, self._seeds, self._episodes_per_seed)
         if index is not None and result.success_once is not None:
@@ -401,8 +408,8 @@ class Stopping:
 
 
 def place_in_plan(key: EpisodeKey, seeds: Sequence[int], episodes_per_seed: int) -> int | None:
-    """Return the index of an episode in its case's part of `plan_jobs`; None if it is no longer
-    planned.
+    """Return the index of an episode among the planned episodes of its case; None if it is no
+    longer planned.
     """
     first_seed = key.seed - key.episode
     if first_seed not in seeds or key.episode >= episodes_per_seed:
@@ -411,7 +418,7 @@ def place_in_plan(key: EpisodeKey, seeds: Sequence[int], episodes_per_seed: int)
 
 
 def _boundary(is_inside: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Return the first point from `inside` to `outside` that is not inside."""
+    """Return the first point on the way from `inside` to `outside` that is not inside."""
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         if middle in (inside, outside):

@@ -210,7 +210,7 @@ class Store(AbstractContextManager["Store"]):
             if result.weights == known:
                 continue
             name = result.checkpoint or "weights"
-            change = Change(f"policy {case.contender}", name, known, result.weights)
+            change = Change(f"policy {case.policy_id}", name, known, result.weights)
             self._accept_or_raise(
                 owner, [change], f"{result.key} was run with other weights than the results in"
             )

@@ -25,30 +25,30 @@ from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
 TOTAL = "total"
-Stated = Literal["checkpoint", "weights", "revision"]  # of an episode's result
+Reported = Literal["checkpoint", "weights", "revision"]  # fields of an episode's result
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
     """Aggregates over the episodes of one case, or of several.
 
-    Rates count an error of the policy as a failure. Episodes that failed by infrastructure are in
-    no rate.
+    Rates count an error of the policy as a failure. Episodes that failed because of infrastructure
+    are excluded from all rates.
     """
 
-    contender: str  # the policy id: its name, with "@STEP" in a sweep; or "total"
+    policy_id: str  # the name of the policy, with "@STEP" in a sweep; or "total"
     suite: str
     env: str  # or "total"
     planned: int
-    stopped: int  # cases that stopped early
+    stopped: int  # number of cases that stopped early
     success_once: Rate
     success_at_end: Rate
-    policy_errors: int  # episodes that an error of the policy ended; not successes
-    infra_failures: int  # episodes that failed by infrastructure; in no rate
-    retries: int  # attempts that failed by infrastructure and were repeated
-    steps: int  # actions executed in all episodes
-    mean_steps: float | None  # None if the episodes have no common rate, as `mean_return`
-    mean_return: float | None  # of the sums of rewards
+    policy_errors: int  # number of episodes that ended with an error of the policy; not successes
+    infra_failures: int  # number of episodes that failed because of infrastructure; in no rate
+    retries: int  # number of attempts that failed because of infrastructure and were repeated
+    steps: int  # number of actions executed in all episodes
+    mean_steps: float | None  # None if the episodes have no common rate; likewise `mean_return`
+    mean_return: float | None  # mean of the episodes' sums of rewards
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians
     policy_p95_ms: float | None  # median of the episodes' 95th percentiles
@@ -59,10 +59,10 @@ class Group:
         return self.success_once.episodes
 
     def with_lost(self, rate: Rate) -> tuple[float, float] | None:
-        """Return the bounds of one of the rates with lost episodes: all of them failures, or all
-        successes.
+        """Return the bounds of `rate` with the lost episodes, if all of them had failed and if all
+        had succeeded.
 
-        Losses may depend on the policy, such as those of a simulator that its actions break.
+        Losses may depend on the policy, for example if its actions make a simulator fail.
 
         Returns:
             (low, high) in [0, 1]; None if no episode was lost, or the episodes have no common rate.
@@ -90,9 +90,9 @@ class Summary:
 
     results: Results
     cases: tuple[Group, ...]
-    totals: tuple[Group, ...]  # one for each policy id, in the order of `results.contenders`
-    wall_seconds: float  # of all runs together, the start of the workers included
-    rollout_seconds: float  # from the first reset to the last step, of all runs together
+    totals: tuple[Group, ...]  # one for each policy id, in the order of `results.policy_ids`
+    wall_seconds: float  # sum over all runs, including the start of the workers
+    rollout_seconds: float  # sum over all runs of the time from the first reset to the last step
 
     @property
     def out(self) -> Path:
@@ -109,18 +109,18 @@ class Summary:
         """All episodes together."""
         return group_of((TOTAL, "", TOTAL), self.results.cases)
 
-    def parts(self, contender: str) -> dict[str, Group]:
+    def parts(self, policy_id: str) -> dict[str, Group]:
         """Return the totals of a policy id, by the clock of their episodes (`by_timing`)."""
         return {
-            timing: group_of((contender, "", TOTAL), cases)
-            for timing, cases in by_timing(self.results.of(contender)).items()
+            timing: group_of((policy_id, "", TOTAL), cases)
+            for timing, cases in by_timing(self.results.of(policy_id)).items()
         }
 
     @property
     def has_one_rate_each(self) -> bool:
         """Whether each policy id has one rate for all its cases with one clock."""
-        for contender in self.results.contenders:
-            groups = self.parts(contender).values()
+        for policy_id in self.results.policy_ids:
+            groups = self.parts(policy_id).values()
             if not all(group.success_once.pooled for group in groups):
                 return False
         return True
@@ -129,13 +129,13 @@ class Summary:
     def best(self) -> list[str]:
         """The policy ids, the best first, by the mean success rate of their cases with one clock.
 
-        The clock is the first of `by_timing`: that of the episodes that waited for the policy, if
-        there are any.
+        The clock is the first one of `by_timing`: the synchronous one, if any episodes waited for
+        the policy.
         """
-        rates: dict[str, list[float]] = {name: [] for name in self.results.contenders}
+        rates: dict[str, list[float]] = {name: [] for name in self.results.policy_ids}
         timings = list(by_timing(self.results.cases).values())
         for case in timings[0] if timings else []:
-            rates[case.contender].append(rate_of([case], "success_once").rate or 0.0)
+            rates[case.policy_id].append(rate_of([case], "success_once").rate or 0.0)
 
         means = {}
         for name, values in rates.items():
@@ -172,8 +172,8 @@ class Summary:
 
     @property
     def policy_busy(self) -> float | None:
-        """The share of `rollout_seconds` in which policies computed, above 1 with several
-        replicas; None as above.
+        """The share of `rollout_seconds` in which policies computed, which may exceed 1 with
+        several replicas; None if no time has passed.
         """
         computed_s = [result.policy_seconds for result in self.results.counted]
         return _share(computed_s, self.rollout_seconds)
@@ -201,7 +201,7 @@ class Summary:
 
     def _case_json(self, group: Group, case: CaseResults) -> dict[str, Any]:
         """Return the entry of a case, of which `group` is the aggregate."""
-        weights = {field: stated(case, field) for field in get_args(Stated)}
+        weights = {field: reported(case, field) for field in get_args(Reported)}
         return (
             group.to_json()
             | weights
@@ -220,26 +220,26 @@ class Summary:
 
 
 def summarize(results: Results) -> Summary:
-    """Aggregate results, those of earlier runs included."""
+    """Aggregate results, including those of earlier runs."""
     wall_s = rollout_s = 0.0
     for run in results.runs:
         played = [episode for episode in results.episodes if episode.run == run.run]
         begins = [episode.finished - episode.result.seconds for episode in played]
         last_end = max((episode.finished for episode in played), default=run.started)
 
-        # A killed run ended with its last episode.
+        # A run that was killed has no end of its own; it ended with its last episode.
         end = last_end if run.ended is None else run.ended
         wall_s += end - run.started
         rollout_s += last_end - min(begins, default=last_end)
 
-    cases = [group_of((case.contender, case.suite, case.env), [case]) for case in results.cases]
-    totals = [group_of((name, "", TOTAL), results.of(name)) for name in results.contenders]
+    cases = [group_of((case.policy_id, case.suite, case.env), [case]) for case in results.cases]
+    totals = [group_of((name, "", TOTAL), results.of(name)) for name in results.policy_ids]
     return Summary(results, tuple(cases), tuple(totals), wall_s, rollout_s)
 
 
-def stated(case: CaseResults, field: Stated) -> str | None:
-    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None
-    if the policy named none.
+def reported(case: CaseResults, field: Reported) -> str | None:
+    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None if
+    the policy did not report it.
     """
     for result in case.counted:
         value: str | None = getattr(result, field)
@@ -252,9 +252,9 @@ def pushed_of(case: CaseResults) -> str | None:
     """Return the pushed weights of a case's episodes, in words; None if only the checkpoint's
     weights acted.
 
-    The rate of a case of several versions describes none of them.
+    If several versions acted in a case, its rate describes none of them.
     """
-    fingerprints: dict[int, str | None] = {}  # by version, of the last acts
+    fingerprints: dict[int, str | None] = {}  # of the weights of the last actions, by version
     versions: set[int] = set()
     for result in case.counted:
         if result.policy_version is not None:
@@ -272,14 +272,14 @@ def pushed_of(case: CaseResults) -> str | None:
 
 
 def cause_of(error: str) -> str:
-    """Return the first line of an error, without the numbers and ids in which errors of one
+    """Return the first line of an error, without the numbers and ids in which errors with the same
     cause differ.
     """
     return re.sub(r"[0-9a-f]{8,}|\d+(\.\d+)?", "…", error.strip().partition("\n")[0])
 
 
 def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int]]:
-    """Return errors that ended episodes: (policy id, task, an error of the cause), and the
+    """Return the errors that ended episodes, one for each cause: (policy id, task, error) and the
     number of episodes.
     """
     by_cause: dict[tuple[str, str, str], list[str]] = {}  # by policy id, task and cause
@@ -287,7 +287,7 @@ def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int
         for result in case.counted:
             if result.status == "policy_error":
                 error = result.error or ""
-                key = (case.contender, case.task, cause_of(error))
+                key = (case.policy_id, case.task, cause_of(error))
                 by_cause.setdefault(key, []).append(error)
     return [
         ((policy, task, errors[0]), len(errors)) for (policy, task, _), errors in by_cause.items()
@@ -305,7 +305,7 @@ def failing_cases(results: Results) -> list[CaseResults]:
 
 
 def write_summary(summary: Summary) -> Path:
-    """Write summary.json into the folder of results, whole or not at all; return its path."""
+    """Write summary.json into the folder of results, completely or not at all; return its path."""
     path = summary.out / FILE
     text = json.dumps(summary.to_json(), indent=2) + "\n"
     with whole(path) as temporary:
@@ -349,12 +349,12 @@ def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median of the known values; None without any."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+    """Return the median of the values that are not None; None if all are."""
+    known_values = [value for value in values if value is not None]
+    return float(np.median(known_values)) if known_values else None
 
 
 def _share(seconds: Sequence[float | None], total_s: float) -> float | None:
-    """Return the share of `total_s` that the known `seconds` take; None if it is not known."""
-    known = [value for value in seconds if value is not None]
-    return sum(known) / total_s if known and total_s else None
+    """Return the sum of the known `seconds` as a share of `total_s`; None if none is known."""
+    known_s = [value for value in seconds if value is not None]
+    return sum(known_s) / total_s if known_s and total_s else None

@@ -452,10 +452,10 @@ class _RemainingTrials:
             return
 
         obs = self._robot.observe()
-        case_of_policy = {trial.job.case.contender: trial.job.case for trial in remaining}
+        case_of_policy = {trial.job.case.policy_id: trial.job.case for trial in remaining}
         # The order of the names reveals nothing about the order of the trials.
-        for contender in sorted(case_of_policy):
-            case = case_of_policy[contender]
+        for policy_id in sorted(case_of_policy):
+            case = case_of_policy[policy_id]
             try:
                 rehearse(case, self._robot, self._factory, self._operator, obs)
             except ContractMismatch as error:
@@ -466,7 +466,7 @@ class _RemainingTrials:
                     f"{error}"
                 ) from None
             except VLAgentsError as error:
-                raise from_code(error.code, f"policy {case.contender!r}: {error}") from error
+                raise from_code(error.code, f"policy {case.policy_id!r}: {error}") from error
 
         for trial in remaining:
             while self._is_due(trial):
@@ -586,7 +586,7 @@ class _RemainingTrials:
             difference = changed(
                 logged.hidden["metadata"], played.metadata, swept=case.step is not None
             )
-            if difference is None and earlier_case.contender == case.contender:
+            if difference is None and earlier_case.policy_id == case.policy_id:
                 difference = _changed_weights(logged.hidden["result"], played.result)
             if difference is not None:
                 raise ConfigError(

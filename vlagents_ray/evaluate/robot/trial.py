@@ -86,18 +86,18 @@ def schedule(cases: Iterable[EvalCase], key: bytes) -> list[Trial]:
     """
     tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
     for case in cases:
-        tasks.setdefault((case.suite.name, case.env), {})[case.contender] = case
+        tasks.setdefault((case.suite.name, case.env), {})[case.policy_id] = case
 
     trials: list[Trial] = []
     rows_used: Counter[int] = Counter()
-    for task, contenders in tasks.items():
-        suite = next(iter(contenders.values())).suite
+    for task, case_of_policy in tasks.items():
+        suite = next(iter(case_of_policy.values())).suite
         scenes = list(itertools.product(suite.seeds, range(suite.episodes)))
-        orders = _orders(key, task, contenders, len(scenes), rows_used)
+        orders = _orders(key, task, case_of_policy, len(scenes), rows_used)
         for i, (scene, order) in enumerate(zip(scenes, orders, strict=True)):
             seed, episode = scene
             for name in order:
-                case = contenders[name]
+                case = case_of_policy[name]
                 key_of_episode = EpisodeKey(case.env, episode, seed + episode, case.fingerprint)
                 job = Job(key_of_episode, case)
                 trials.append(Trial(number=len(trials) + 1, scene=i + 1, job=job))

@@ -63,7 +63,7 @@ def test_each_version_is_evaluated_as_it_was_pushed(
         versions.append(Publisher(url).push(gain(value)))
         summary = served.play(versions[-1])
         assert played(summary) == played(here.play(versions[-1]))
-    assert summary.results.contenders == [f"policy@{version}" for version in versions]
+    assert summary.results.policy_ids == [f"policy@{version}" for version in versions]
     assert len(played(summary)) == 12
     with pytest.raises(
         ConfigError, match=rf"got 99, but the newest that {url} acts with is {versions[-1]}"

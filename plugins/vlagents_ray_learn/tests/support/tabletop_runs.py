@@ -44,9 +44,9 @@ def ended(run: subprocess.Popen[str], folder: Path) -> str:
 
 
 def table(out: Path) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
-    """The weights, and seed and return of each episode, by contender."""
+    """The weights, and seed and return of each episode, by policy_id."""
     results, found = Results.load(out), {}
     for case in results.cases:
         episodes = sorted((one.result.key.seed, one.result.episode_return) for one in case.episodes)
-        found[case.contender] = pushed_of(case), episodes
-    return {name: found[name] for name in results.contenders}
+        found[case.policy_id] = pushed_of(case), episodes
+    return {name: found[name] for name in results.policy_ids}

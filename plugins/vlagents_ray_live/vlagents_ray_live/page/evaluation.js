@@ -58,8 +58,8 @@ function timeLeft(said, now) {
 // ---- cases
 
 function showCases(said) {
-  const shown = said.contenders.slice(-POLICIES);
-  const older = said.contenders.length - shown.length;
+  const shown = said.policy_ids.slice(-POLICIES);
+  const older = said.policy_ids.length - shown.length;
   byId("older").textContent = older ? `${older} earlier ones are in the learning curve alone.` : "";
   byId("interval").textContent = said.cases.some((result) => result.sequence)
     ? "Upper bar: success, with a confidence sequence where a case may stop early, else Wilson's interval of 95\u00a0%. Lower bar: episodes done."
