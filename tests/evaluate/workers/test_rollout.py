@@ -159,7 +159,7 @@ def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_s
     )
     assert few == [4, 4 + 11]
     assert every == [11, 11]
-    assert (first.artifacts.shown, first.artifacts.seen, first.artifacts.trajectory) == (
+    assert (first.artifacts.videos, first.artifacts.policy_videos, first.artifacts.trajectory) == (
         {},
         {},
         None,
@@ -175,7 +175,7 @@ def test_a_worker_whose_episodes_mostly_fail_renders_them_as_it_plays(config: Co
     worker = rollout_of(config, lambda: ToZero(3), video="failures")
     images, reports = rendered(worker, *seeds[False][:2], seeds[True][0], seeds[True][1])
     assert images == [4 + 11, 11, 11, 11]
-    assert [bool(report.artifacts.shown) for report in reports] == [True, True, False, False]
+    assert [bool(report.artifacts.videos) for report in reports] == [True, True, False, False]
 
 
 def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> None:
@@ -195,9 +195,9 @@ def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> 
         )
         for video in ("failures", "all")
     }
-    assert found["failures"][0].artifacts.shown == {}
+    assert found["failures"][0].artifacts.videos == {}
     assert found["failures"][1].artifacts == found["all"][1].artifacts
-    assert found["failures"][1].artifacts.shown
+    assert found["failures"][1].artifacts.videos
 
 
 def test_progress_tells_phase_age_and_place(

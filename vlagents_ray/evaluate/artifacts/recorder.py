@@ -1,10 +1,10 @@
-"""The artifacts of an episode: videos for people, a trajectory for programs.
+"""The artifacts of an episode: videos for people and a trajectory for programs.
 
-A trajectory is the numbers of the episode step by step in a .npz file, with the policy's images in
-MP4s beside it. Frames are encoded at once, in the worker, as H.264, which browsers play: at 224x224
-a frame takes about 0.3 ms, less than a JPEG, so there is no thread and no backlog. Files are made
-in memory and sent to the driver with the episode's result, which works on any node and leaves no
-partial files of a worker that dies.
+A trajectory has the numbers of every step in a .npz file, and the policy's images in MP4 files next
+to it. The worker encodes each frame immediately, as H.264, which browsers can decode. A frame of
+224x224 takes about 0.3 ms, less than a JPEG, so there is no thread and no backlog. Files are made
+in memory and sent to the driver with the episode's result. This works on any node, and a worker
+that dies leaves no partial files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import distinct, plain
 
-DEFAULT_FPS = 20.0  # for an env whose contract has no control rate
+DEFAULT_FPS = 20.0  # frame rate for an env whose contract has no control rate
 
 
 class VideoRecorder(EpisodeObserver):
@@ -68,14 +68,14 @@ class VideoRecorder(EpisodeObserver):
 def save_videos(
     out: Path, case: EvalCase, result: EpisodeResult, videos: dict[str, bytes]
 ) -> list[str]:
-    """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths
-    relative to `out`.
+    """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4` for each camera.
 
     A suite without a name has no folder. Two cameras never share a file
-    (`vlagents_ray.naming.distinct`).
+    (`vlagents_ray.naming.distinct`). A file gets its name when it is complete. Files of an earlier
+    attempt at the episode are removed.
 
-    Each file is complete once it has its name. Files of an earlier attempt at the episode are
-    removed.
+    Returns:
+        The paths relative to `out`.
     """
     folder = _folder_for(out, storage.VIDEOS, case, result)
     names = distinct(videos)
@@ -89,12 +89,12 @@ def save_videos(
     return written
 
 
-def _folder_for(out: Path, kind: str, case: EvalCase, result: EpisodeResult) -> Path:
-    """Return `out/KIND/POLICY/SUITE/ENV`, without the files of an earlier attempt at the
-    episode.
+def _folder_for(out: Path, category: str, case: EvalCase, result: EpisodeResult) -> Path:
+    """Return the folder `out/CATEGORY/POLICY/SUITE/ENV`, after removing the files of an earlier
+    attempt at the episode from it.
     """
     subfolders = [plain(name) for name in case.name if name]
-    folder = out.joinpath(kind, *subfolders)
+    folder = out.joinpath(category, *subfolders)
     for earlier_file in folder.glob(f"{_stem(result)}[_.]*"):
         earlier_file.unlink()
     return folder
@@ -105,7 +105,7 @@ def _stem(result: EpisodeResult) -> str:
     return f"ep{result.key.episode:04d}_seed{result.key.seed}"
 
 
-# The version of a policy that names none, and of steps before its first answer in real-time mode.
+# The version if a policy reports none, and for steps before its first answer in real-time mode.
 NO_VERSION = -1
 _STATE = "state/"  # prefix of the state's arrays in the .npz file
 
@@ -114,7 +114,7 @@ _STATE = "state/"  # prefix of the state's arrays in the .npz file
 class Trajectory:
     """T actions of D numbers each, and T + 1 observations: action i was chosen after observation i.
 
-    The images are in MP4 files beside the .npz file; frame i is that of observation i.
+    The images are in MP4 files next to the .npz file; frame i belongs to observation i.
     """
 
     actions: np.ndarray  # (T, D) float32, as executed
@@ -123,10 +123,11 @@ class Trajectory:
     state: dict[str, np.ndarray]  # (T + 1, D) float32, in the contract's units
     gripper: np.ndarray | None  # (T + 1,) float32 in [0, 1], 1 = open
     cameras: tuple[str, ...]
-    versions: np.ndarray  # (T,) int64, of the weights that chose each action, or NO_VERSION
+    # (T,) int64: the version of the weights that chose each action, or NO_VERSION
+    versions: np.ndarray
 
     def to_bytes(self) -> bytes:
-        """Encode the trajectory as an .npz file, in which nothing is pickled."""
+        """Encode the trajectory as an .npz file without pickled objects."""
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
         arrays |= {_STATE + name: values for name, values in self.state.items()}
@@ -143,7 +144,7 @@ class Trajectory:
         """Read an .npz file that `to_bytes` made.
 
         Raises:
-            ConfigError: The file is missing, or is no trajectory.
+            ConfigError: The file is missing, or does not contain a trajectory.
         """
         storage.require_there(path)
         try:
@@ -203,13 +204,15 @@ class TrajectoryRecorder(EpisodeObserver):
                 "both"
             )
 
-        # The cameras are those of the reset; a later observation may lack them.
+        # A later observation may lack the cameras of the reset.
         self._cameras = self._cameras or tuple(sorted(obs.cameras))
         self._states.append(state)
         self._grippers.append(obs.gripper)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Use the version of this answer after `ticks_waited` further actions."""
+        """Record the version of this answer, which applies after `ticks_waited` further
+        actions.
+        """
         version = version_of(act)
         self._next = ticks_waited, NO_VERSION if version is None else version
 
@@ -244,8 +247,11 @@ class TrajectoryRecorder(EpisodeObserver):
 
 
 def videos_of(trajectory: Path, cameras: Iterable[str]) -> dict[str, Path]:
-    """Return the MP4s of the policy's images by camera; `cameras` are the trajectory's. Frame i
-    is observation i.
+    """Return the paths of the MP4 files with the policy's images, by camera.
+
+    Args:
+        trajectory: The .npz file.
+        cameras: The cameras of the trajectory.
     """
     return {
         camera: trajectory.with_name(f"{trajectory.stem}_{name}.mp4")
@@ -264,15 +270,16 @@ class Artifacts:
     An MP4 file has a frame for every observation.
     """
 
-    shown: dict[str, bytes] = field(default_factory=dict)  # MP4s for people, by camera
-    seen: dict[str, bytes] = field(default_factory=dict)  # MP4s of the policy's images, by camera
+    videos: dict[str, bytes] = field(default_factory=dict)  # MP4 files for people, by camera
+    # MP4 files of the policy's images, by camera
+    policy_videos: dict[str, bytes] = field(default_factory=dict)
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
-    not_repeatable: str | None = None  # reason for images that the second pass did not render
+    not_repeatable: str | None = None  # reason why the second pass did not render images
 
 
 class EpisodeRecorder(EpisodeObserver):
-    """Records one episode. This class records nothing."""
+    """The interface of objects that record one episode. This class records nothing."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
@@ -280,8 +287,11 @@ class EpisodeRecorder(EpisodeObserver):
         return "none"
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return the artifacts of an episode with this result; `second_pass` renders missing
-        images.
+        """Return the artifacts of the episode.
+
+        Args:
+            result: The result of the episode.
+            second_pass: Renders images that were not rendered during the episode.
         """
         return Artifacts()
 
@@ -363,26 +373,28 @@ class Recording(EpisodeRecorder):
 def save(
     out: Path, case: EvalCase, result: EpisodeResult, artifacts: Artifacts
 ) -> tuple[list[str], str | None]:
-    """Write the files of an episode below `out`; returns the paths of its videos and its
-    trajectory, relative to it.
+    """Write the files of an episode below `out`.
 
-    A trajectory is `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz`, with `_CAMERA.mp4`. Its
-    videos that are also shown are links, and the .npz is written last: if it exists, the other
-    files do.
+    A trajectory consists of `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz` and its
+    `_CAMERA.mp4` files, which are links if they are also among the videos for people. The .npz file
+    is written last: if it exists, the other files do too.
+
+    Returns:
+        The paths of the videos and of the trajectory, relative to `out`.
     """
-    videos = save_videos(out, case, result, artifacts.shown)
+    videos = save_videos(out, case, result, artifacts.videos)
     folder = _folder_for(out, storage.TRAJECTORIES, case, result)
     if artifacts.trajectory is None:
         return videos, None
 
     path = folder / f"{_stem(result)}.npz"
-    video_of_camera = dict(zip(artifacts.shown, videos, strict=True))
-    for camera, file in videos_of(path, artifacts.seen).items():
+    video_of_camera = dict(zip(artifacts.videos, videos, strict=True))
+    for camera, file in videos_of(path, artifacts.policy_videos).items():
         if camera in video_of_camera:
             storage.link_or_copy(out / video_of_camera[camera], file)
         else:
             with storage.whole(file) as unfinished_path:
-                unfinished_path.write_bytes(artifacts.seen[camera])
+                unfinished_path.write_bytes(artifacts.policy_videos[camera])
 
     with storage.whole(path) as unfinished_path:
         unfinished_path.write_bytes(artifacts.trajectory)

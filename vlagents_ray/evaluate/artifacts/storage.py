@@ -22,7 +22,7 @@ from vlagents_ray.registry import target_of
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
 _RESUME = "finished episodes are kept: continue with --resume"
 _FULL = f"make room; {_RESUME}"
-_REFUSED = "make it writable, or choose another folder"
+_WRITABLE = "make it writable, or choose another folder"
 _CURES = {
     errno.ENOSPC: ("the disk is full", _FULL),
     errno.EDQUOT: ("your quota on this disk is used up", _FULL),
@@ -30,14 +30,14 @@ _CURES = {
         "a file would be larger than is allowed here (ulimit -f)",
         f"allow more; {_RESUME}",
     ),
-    errno.EROFS: ("is on a read-only file system", _REFUSED),
-    errno.EACCES: ("you may not write there", _REFUSED),
-    errno.EPERM: ("you may not write there", _REFUSED),
-    errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
-    errno.EEXIST: ("is there, and no folder", "choose another folder"),
+    errno.EROFS: ("is on a read-only file system", _WRITABLE),
+    errno.EACCES: ("you may not write there", _WRITABLE),
+    errno.EPERM: ("you may not write there", _WRITABLE),
+    errno.ENOTDIR: ("a part of the path is not a folder", "choose another folder"),
+    errno.EEXIST: ("exists and is not a folder", "choose another folder"),
     errno.EIO: (
         "the disk reports an error",
-        f"see the system's log (dmesg), and mend the disk; {_RESUME}",
+        f"see the system's log (dmesg), and repair the disk; {_RESUME}",
     ),
     errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
 }
@@ -51,13 +51,13 @@ _SQLITE = {
 
 
 def require_below(path: str) -> str:
-    """Return the `path` of an episode's file in results.db, or raise `ConfigError` if it leads out
-    of the folder.
+    """Return the `path` of an episode's file in results.db, which may come from another machine.
 
-    The folder may come from another machine.
+    Raises:
+        ConfigError: The path leads out of the folder of results.
     """
-    parts = PurePosixPath(path).parts
-    if not parts or path.startswith("/") or ".." in parts or "\0" in path:
+    components = PurePosixPath(path).parts
+    if not components or path.startswith("/") or ".." in components or "\0" in path:
         raise ConfigError(
             f"expected files of episodes in the folder of results, got the path {path!r}, which "
             "no evaluation writes; do not trust the author of this results.db"
@@ -69,8 +69,8 @@ def inside(home: Path, path: str) -> Path:
     """Return the absolute path of the file `path` in the folder of results `home`; it need not
     exist.
 
-    Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is
-    neither read, copied nor published.
+    Raises:
+        ConfigError: The path leads out of the folder, directly or through a symbolic link.
     """
     resolved_path = (home / require_below(path)).resolve()
     if not resolved_path.is_relative_to(home.resolve()):
@@ -89,8 +89,10 @@ def trajectory_videos(home: Path, trajectory: str) -> list[str]:
 
 
 def require_there(path: Path) -> Path:
-    """Return the `path` of an episode's file, or raise `ConfigError` if it is missing, as in a
-    partial copy.
+    """Return the `path` of an episode's file.
+
+    Raises:
+        ConfigError: The file is missing, for example in a partial copy.
     """
     if not path.is_file():
         raise ConfigError(
@@ -108,8 +110,8 @@ def outcome(result: EpisodeResult) -> str:
 
 
 def require_folder_of(file: Path) -> None:
-    """Raise `ConfigError` unless this file can be written: its folder exists, and it is not a
-    folder itself.
+    """Raise `ConfigError` if this file cannot be written, as it is a folder or its folder does not
+    exist.
     """
     if file.is_dir():
         raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
@@ -121,7 +123,7 @@ def require_folder_of(file: Path) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise `ConfigError` if this is a file or lies below one, so that no folder can be made."""
+    """Raise `ConfigError` if this is a file or below a file, so that no folder can be made."""
     blocking = next((path for path in (folder, *folder.parents) if path.exists()), None)
     if blocking is not None and not blocking.is_dir():
         raise ConfigError(f"{folder}: expected a folder, got the file {blocking}; choose another")
@@ -129,10 +131,10 @@ def require_folder(folder: Path) -> None:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Yield a path for writing, which is renamed to `path` when the file is complete; make missing
-    folders.
+    """Return a context manager that yields a path for writing and renames the file to `path` when
+    it is complete. Missing folders are made.
 
-    If writing fails, the unfinished file is removed, since other files need the room on a full
+    If writing fails, the unfinished file is removed, since other files need the space on a full
     disk.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,9 +159,10 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 @contextmanager
 def storing(folder: Path) -> Iterator[None]:
-    """Raise `StorageFailed` in place of an error of the disk of `folder`, with cause and cure.
+    """Return a context manager that replaces errors of the disk of `folder` with `StorageFailed`,
+    which names cause and cure. Other errors are not changed.
 
-    Use it around code in which only the disk raises `OSError`. Other errors pass.
+    Use it around code in which only the disk raises `OSError`.
     """
     try:
         yield
@@ -208,8 +211,8 @@ def versions() -> dict[str, Any]:
 
 
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
-    """Return the git state of a policy's code, diff included, if it is the same here as on its
-    server; else None.
+    """Return the git state of a policy's code, with its diff; None if this process has another
+    version of the code than the server.
     """
     policy = metadata.get("policy")
     if not isinstance(policy, str):
@@ -221,7 +224,9 @@ def policy_code(metadata: dict[str, Any]) -> GitState | None:
 
 
 def save_diffs(out: Path, git_states: Iterable[GitState | None]) -> None:
-    """Write the diff of each git state from its commit to `out/provenance/SHA256.diff`, once."""
+    """Write the diff between each git state and its commit to `out/provenance/SHA256.diff`, unless
+    the file exists.
+    """
     for code in git_states:
         if code is None or code.diff_sha256 is None:
             continue

@@ -1,6 +1,4 @@
-"""Changes of the program of an evaluation: the files and weights of its policies and
-environments.
-"""
+"""Changes of the files, settings and weights of an evaluation's policies and environments."""
 
 from __future__ import annotations
 
@@ -10,10 +8,10 @@ from typing import Any, NamedTuple
 
 from vlagents_ray.evaluate.plan.config import canonical, fingerprint
 
-IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
-_OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that the identity's "checkpoint" has
-_SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
-_DIGITS = 12  # of a digest that a person reads
+IDENTITY = ("policy", "checkpoint", "weights")  # fields of a policy's metadata
+_OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that "checkpoint" already compares
+_SWEPT = "checkpoint: "  # prefix of the names of the files that belong to a step of a sweep
+_DIGITS = 12  # digits of a digest that are printed
 MIX = (
     "restore the old files, give a new folder (--out), or mix both and have the report say so "
     "(--accept-changes)"
@@ -31,17 +29,17 @@ class EnvStatement(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A file, a digest or a setting that differs from that of earlier episodes."""
+    """A file, a digest or a setting that differs from earlier episodes."""
 
     subject: str  # "env my_envs:Reach", "policy pi0", or "plan"
-    name: str  # of the file or the setting
-    was: str | None  # its digest; None if there was none
-    now: str | None
+    name: str  # the name of the file or the setting
+    was: str | None  # the earlier digest or value; None if there was none
+    now: str | None  # the present digest or value
 
     def is_statement_of(self, env: str) -> bool:
         """Return whether the description or the contract of this env changed (`env_changes`)."""
-        kinds = tuple(f"its {kind} " for kind in EnvStatement._fields)
-        return self.subject == f"env {env}" and self.name.startswith(kinds)
+        prefixes = tuple(f"its {field} " for field in EnvStatement._fields)
+        return self.subject == f"env {env}" and self.name.startswith(prefixes)
 
     def is_setting_of(self, policy: str) -> bool:
         """Return whether the settings of this policy or of its wrappers changed
@@ -54,7 +52,7 @@ class Change:
 
 
 def listed(changes: Sequence[Change]) -> str:
-    """Return a line for each change, for an error."""
+    """Return the text of an error, with a line for each change."""
     return "\n".join(f"- {change}" for change in changes)
 
 
@@ -69,21 +67,19 @@ def program_changes(
 
 
 def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
-    """Compare what an environment states about itself; no changes are known if it has stated
-    nothing.
-    """
+    """Compare the descriptions and the contracts of an environment, except empty ones."""
     changes: list[Change] = []
-    for kind in EnvStatement._fields:
-        before, after = getattr(was, kind), getattr(now, kind)
+    for field in EnvStatement._fields:
+        before, after = getattr(was, field), getattr(now, field)
         if before and after:
-            changes += _changed_values(f"env {env}", f"its {kind}", before, after)
+            changes += _changed_values(f"env {env}", f"its {field}", before, after)
     return changes
 
 
 def _changed_values(
     subject: str, of: str, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[Change]:
-    """Compare two mappings by name; a change is called "`of` 'NAME'"."""
+    """Compare two mappings by name. The name of a change is "`of` 'NAME'"."""
     changes = []
     for name in sorted(before.keys() | after.keys()):
         was, now = before.get(name), after.get(name)
@@ -92,60 +88,59 @@ def _changed_values(
     return changes
 
 
-def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
-    """Return the field of a policy's identity that differs between two metadata of its server, or
-    None.
+def changed(was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
+    """Return the field of a policy's identity that differs between two metadata of its server;
+    None if none differs.
 
-    In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
+    In a sweep (`swept`), sessions choose their checkpoint, so the server's checkpoint is not
+    compared.
     """
     for field in IDENTITY[: 1 if swept else 2]:
-        if known.get(field) != now.get(field):
+        if was.get(field) != now.get(field):
             return field
 
-    changes = policy_changes("", known, now, swept=swept)
+    changes = policy_changes("", was, now, swept=swept)
     if not changes:
         return None
     return "weights" if changes[-1].name == "weights" else "program"
 
 
 def policy_changes(
-    subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool
+    subject: str, was: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool
 ) -> list[Change]:
-    """Compare files, settings and weights that two metadata of a policy's server state; the
-    weights come last.
+    """Compare the files, settings and weights in two metadata of a policy's server. A change of the
+    weights is the last one.
     """
     changes = program_changes(
-        subject, policy_program(known, swept=swept), policy_program(now, swept=swept)
+        subject, policy_program(was, swept=swept), policy_program(now, swept=swept)
     )
-    changes += _settings_changes(subject, known, now)
+    changes += _settings_changes(subject, was, now)
 
-    before = (known.get("weights") or {}).get("digest")
+    before = (was.get("weights") or {}).get("digest")
     after = (now.get("weights") or {}).get("digest")
     if not swept and before and after and before != after:
         changes.append(Change(subject, "weights", before, after))
     return changes
 
 
-def _settings_changes(
-    subject: str, known: Mapping[str, Any], now: Mapping[str, Any]
-) -> list[Change]:
+def _settings_changes(subject: str, was: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
     """Compare the settings of a policy and its wrappers, such as those in a deployment file."""
     changes: list[Change] = []
-    before, after = known.get("config"), now.get("config")
+    before, after = was.get("config"), now.get("config")
     if before is not None and after is not None:
         before = {name: value for name, value in before.items() if name not in _OF_CHECKPOINT}
         after = {name: value for name, value in after.items() if name not in _OF_CHECKPOINT}
         changes += _changed_values(subject, "its setting", before, after)
 
-    before, after = known.get("wrappers"), now.get("wrappers")
+    before, after = was.get("wrappers"), now.get("wrappers")
     if before is not None and after is not None and before != after:
         changes.append(Change(subject, "its wrappers", canonical(before), canonical(after)))
     return changes
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
-    """Return the digests of a policy's files by name, in a sweep without those of its checkpoint;
-    None if its server reports none.
+    """Return the digests of a policy's files by name; None if its server reports none. In a sweep,
+    the files of its checkpoint are left out.
     """
     program = metadata.get("program")
     if program is None:

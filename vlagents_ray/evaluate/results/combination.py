@@ -28,12 +28,13 @@ def require_distinct(folders: Iterable[Path]) -> None:
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    If two folders have a policy in the same env, or with other files, or with other weights under
-    the same checkpoint's name, the folder's name is appended: "pi0 (second)".
+    The folder's name is appended to a policy's name, as in "pi0 (second)", if two folders have the
+    policy in the same env, or with different files, or with different weights of the same
+    checkpoint.
 
     Raises:
-        ConfigError: There is no folder, or two of them are parts of one evaluation, which are
-            merged, not compared.
+        ConfigError: There is no folder, or two of them are parts of one evaluation, which must be
+            merged instead.
     """
     if not folders:
         raise ConfigError(
@@ -108,9 +109,7 @@ def _require_different_evaluations(folders: Sequence[Results]) -> None:
 
 
 def _clashing_policies(folders: Sequence[Results]) -> set[str]:
-    """Return the policies that are not the same in all folders, or are in one env more than
-    once.
-    """
+    """Return the policies that differ between folders, or occur more than once in an env."""
     all_cases: list[CaseResults] = []
     for results in folders:
         all_cases += results.cases
@@ -128,7 +127,7 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
             clashing.add(case.policy)
 
     swept = {case.policy for case in all_cases if case.step is not None}
-    first_metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
+    first_metadata: dict[str, dict[str, Any]] = {}  # by policy, from the first folder that has it
     for results in folders:
         for name, metadata in results.policies.items():
             first = first_metadata.setdefault(name, metadata)

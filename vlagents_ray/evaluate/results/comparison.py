@@ -22,7 +22,7 @@ from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 from vlagents_ray.naming import did_you_mean
 
-# The settings of the policy, in which compared cases may differ; all others are the env's.
+# The settings of a policy, in which compared cases may differ. All other settings are the env's.
 OF_POLICY = frozenset(
     {
         "policy",
@@ -74,7 +74,7 @@ class Comparison:
 
     a: str
     b: str
-    # One for each suite, in the order of the plan; empty if they share only one.
+    # One line for each suite, in the order of the plan; empty if A and B share only one suite.
     suites: tuple[Line, ...]
     total: Line
     cases: tuple[CaseResults, ...] = ()  # the cases in real time; only of `clock_gaps`
@@ -104,16 +104,16 @@ def compare(
         b: The other policy id.
         timing: "synchronous" or "in real time", for results that have episodes of both, which are
             never pooled.
-        accept_changes: Compare although files, description or contract of an env differ, or one of
-            the two was played with several versions of its files or weights.
+        accept_changes: Compare even if files, description or contract of an env differ, or if one
+            of the policies ran with several versions of its files or weights.
 
     Returns:
         The comparison by suite and in total, by success once.
 
     Raises:
-        ConfigError: One of the policy ids is unknown, they share no finished episode, an env of a
-            suite had different settings for the two, something changed and `accept_changes` is off,
-            or they share episodes of several clocks and `timing` names none.
+        ConfigError: One of the policy ids is unknown, or they share no finished episode, or an env
+            of a suite had different settings for the two, or something changed and
+            `accept_changes` is off, or they share episodes of several clocks and `timing` is None.
     """
     if timing is not None:
         timings = by_timing(results.cases)
@@ -131,17 +131,17 @@ def comparisons(
     chosen_of: int | None = None,
     accept_changes: bool = False,
 ) -> list[Comparison]:
-    """Return `compare` for each of these pairs of policy ids, with p-values adjusted for one
-    another.
+    """Return `compare` for each of these pairs of policy ids, with p-values adjusted for the number
+    of comparisons.
 
-    The comparisons on one suite are one family for Holm's method, and those on all suites together
-    another.
+    The comparisons on one suite are one family for Holm's method. The comparisons on all suites
+    together are another family.
 
     Args:
         results: Results that hold all of them.
         policy_pairs: The pairs of policy ids.
-        chosen_of: The number of all pairs, if these were chosen among them by their outcomes: the
-            p-values are then adjusted for all.
+        chosen_of: The number of all pairs, if these were chosen by their outcomes. The p-values are
+            then adjusted for all pairs.
         accept_changes: As for `compare`.
     """
     not_shown = max(0, (chosen_of or 0) - len(policy_pairs))
@@ -153,7 +153,7 @@ def comparisons(
         changes_of_pairs.append(changes)
 
     strata_of_pairs: list[list[Pairs]] = []
-    names: dict[str, None] = {}  # of all suites
+    names: dict[str, None] = {}  # the names of all suites, in order
     for suites in suites_of_pairs:
         names |= dict.fromkeys(suites)
         strata_of_pairs.append([])
@@ -161,7 +161,7 @@ def comparisons(
             strata_of_pairs[-1] += strata.values()
     totals = _lines(ALL, strata_of_pairs, not_shown)
 
-    # A pair that shares a single suite has no line for it: it would repeat the total.
+    # A pair that shares only one suite has no line for it, as the line would repeat the total.
     lines: list[list[Line]] = [[] for _ in policy_pairs]
     for name in names:
         members = []  # indices of the pairs that have a line for this suite
@@ -186,8 +186,8 @@ def comparable(
     *,
     accept_changes: bool = False,
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Return the pairs of policy ids that `compare` accepts, and for each other pair the reason
-    why it does not; by default of all pairs.
+    """Return the pairs of policy ids that `compare` accepts, and the reason for each pair that it
+    does not accept. By default, all pairs are tried.
     """
     if policy_pairs is None:
         policy_pairs = list(itertools.combinations(results.policy_ids, 2))
@@ -327,8 +327,8 @@ def _changes_between(
 
 
 def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]:
-    """Return what the episodes of the two cases, or of one of them, do not have in common, in
-    words.
+    """Return, in words, the properties that differ between episodes of the two cases, or within
+    one of them.
     """
     accepted = results.accepted_changes
     counted_by_case = []
@@ -360,7 +360,7 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
 
 
 def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
-    """Return the episodes of both cases, by success once."""
+    """Return the counts of the episodes that both cases have, by success once."""
     solved_by_b = {
         (result.key.episode, result.key.seed): bool(result.success_once) for result in b.counted
     }
@@ -378,12 +378,19 @@ def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
 
 
 def _lines(suite: str, family: Sequence[Sequence[Pairs]], not_shown: int = 0) -> list[Line]:
-    """Return the lines of one family, of which `not_shown` members were left out after a look at
-    their outcomes.
+    """Return the lines of one family.
 
-    The members left out count as undecided (p = 1). Holm's method rejects no more hypotheses if
-    some p-values are larger, so that the family-wise error holds for any choice.
+    The members that were left out count as undecided (p = 1). Larger p-values never make Holm's
+    method reject more hypotheses, so the family-wise error rate is valid for any choice.
+
+    Args:
+        suite: The name of the suite, or "all".
+        family: The strata of each shown member.
+        not_shown: The number of members that were left out because of their outcomes.
     """
     p_values = [sum(strata, Pairs()).p_value for strata in family]
     adjusted = holm(p_values + [1.0] * not_shown)[: len(p_values)]
-    return [Line(suite, tuple(strata), p) for strata, p in zip(family, adjusted, strict=True)]
+    return [
+        Line(suite, tuple(strata), p_value)
+        for strata, p_value in zip(family, adjusted, strict=True)
+    ]

@@ -1,8 +1,8 @@
-"""results.db: its tables, its lock, and its opening for the one writing evaluation and for readers.
+"""results.db: its tables, its lock, and how the writing evaluation and readers open it.
 
-Its journal is SQLite's rollback journal, with locks of the file system: hosts may share the folder,
-which a write-ahead log forbids (https://www.sqlite.org/wal.html). A commit takes a few
-milliseconds, and each episode has one.
+The database uses SQLite's rollback journal with locks of the file system, so hosts may share the
+folder. A write-ahead log would not allow that (https://www.sqlite.org/wal.html). Each episode is
+one commit, which takes a few milliseconds.
 """
 
 from __future__ import annotations
@@ -127,15 +127,15 @@ CREATE TABLE workers (
 
 
 def create(db: sqlite3.Connection) -> None:
-    """Make the tables of this version, all or none."""
+    """Make the tables of this version, in one transaction."""
     db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
 
 
 def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Insert `row`, its values by the names of their columns, which are those of `SCHEMA`."""
+    """Insert `row`, which maps the names of columns of `SCHEMA` to values."""
     columns = ", ".join(row)
     placeholders = ", ".join("?" * len(row))
-    query = f"INSERT INTO {table} ({columns}) VALUES ({placeholders})"  # noqa: S608 (our own names)
+    query = f"INSERT INTO {table} ({columns}) VALUES ({placeholders})"  # noqa: S608 (constants)
     db.execute(query, tuple(row.values()))
 
 
@@ -143,24 +143,25 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
     """Raise `ConfigError` for a results file of another version, or with other columns than this
     version's.
 
-    A file from elsewhere may have any text as names of columns, by which `merge` inserts rows, and
-    views or triggers, which would run arbitrary SQL when a table is read or written.
+    A file of a third party may contain any text as the name of a column, which `merge` would insert
+    into SQL. It may also contain views or triggers, which would run arbitrary SQL when a table is
+    read or written.
     """
     # A virtual table is also listed as a table, so the beginning of the statement is compared.
     statements = {"table": "CREATE TABLE", "index": "CREATE INDEX"}
-    for kind, name, sql in db.execute(
+    for object_type, name, sql in db.execute(
         "SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"
     ):
-        if kind not in statements or not str(sql).startswith(statements[kind]):
+        if object_type not in statements or not str(sql).startswith(statements[object_type]):
             raise ConfigError(
-                f"{out / FILE}: expected only the tables of an evaluation, got {name!r}, a {kind} "
-                "that no evaluation makes; do not trust its author"
+                f"{out / FILE}: expected only the tables of an evaluation, got {name!r}, a "
+                f"{object_type} that no evaluation makes; do not trust its author"
             )
 
     if not db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
         raise ConfigError(
-            f"{out / FILE}: expected a database of results, got an empty file, as of a copy that "
-            "was cut off; copy it again, or choose another folder"
+            f"{out / FILE}: expected a database of results, got an empty file, as after an "
+            "interrupted copy; copy it again, or choose another folder"
         )
 
     version = db.execute("PRAGMA user_version").fetchone()[0]
@@ -170,9 +171,9 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
             "another folder"
         )
 
-    for table, known in _known_columns().items():
+    for table, expected_columns in _known_columns().items():
         columns = _columns(db, table)
-        unknown, missing = columns - known, known - columns
+        unknown, missing = columns - expected_columns, expected_columns - columns
         if not unknown and not missing:
             continue
         difference = f"none of the columns {sorted(missing)}"
@@ -198,7 +199,7 @@ def _columns(db: sqlite3.Connection, table: str) -> set[str]:
     return {name for (name,) in db.execute("SELECT name FROM pragma_table_xinfo(?)", (table,))}
 
 
-WAIT_S = 60.0  # for another process's transaction to end
+WAIT_S = 60.0  # longest wait for the end of another process's transaction, s
 
 
 def read_only(out: Path) -> sqlite3.Connection:
@@ -208,7 +209,7 @@ def read_only(out: Path) -> sqlite3.Connection:
 
 LOCK = "results.lock"
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-_READER_S = 1.0  # longer than `is_locked` of another process holds the lock
+_READER_S = 1.0  # longer than `is_locked` of another process holds the lock, s
 _RETRY_EVERY_S = 0.01
 
 
@@ -216,7 +217,7 @@ def lock(out: Path) -> int:
     """Lock the folder `out`.
 
     Returns:
-        A descriptor: closing it releases the lock, as does the end of this process.
+        A file descriptor. Closing it releases the lock, and so does the end of this process.
     """
     file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     deadline = time.monotonic() + _READER_S

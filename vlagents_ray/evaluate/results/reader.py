@@ -27,9 +27,9 @@ from vlagents_ray.evaluate.results.database import (
 )
 from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_plan, pooled
 
-KILLED = "killed"  # the state of a run that ended without saying so
+KILLED = "killed"  # the state of a run that was killed, so that it recorded no end
 
-_SQLITE_FULL = 13  # sqlite3.SQLITE_FULL, from Python 3.11 on
+_SQLITE_FULL = 13  # sqlite3.SQLITE_FULL, which Python 3.10 lacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +43,15 @@ class Episode:
     run: int
     finished: float  # seconds since 1970
     env_program: str | None = None  # digest of the files of its environment, None if installed
-    policy_program: str | None = None  # the same for its policy
+    policy_program: str | None = None  # digest of the files of its policy, None if installed
     # Whether the episode comes after the end of its stopped case, or is no longer planned.
     beyond: bool = False
     unplanned: bool = False  # whether it is no longer planned
 
     @property
     def counts(self) -> bool:
-        """Whether the episode is in the rates: not if it failed by infrastructure, or is
-        `beyond`.
+        """Whether the rates include the episode: not if it failed because of infrastructure, or
+        is `beyond`.
         """
         return self.result.status != "infra_failed" and not self.beyond
 
@@ -60,7 +60,7 @@ class Episode:
 class Attempt:
     """An attempt at an episode that failed because of the infrastructure, not of the policy."""
 
-    key: str  # of the episode
+    key: str  # the key of the episode
     case_id: str
     attempt: int  # its number, from 1
     run: int
@@ -75,9 +75,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Worker(WorkerInfo):
-    """A worker's connection to a policy or creation of an env; a worker may have several
-    entries.
-    """
+    """A worker that connected to a policy or made an env. A worker may have several entries."""
 
     run: int
     at: float  # seconds since 1970
@@ -85,7 +83,7 @@ class Worker(WorkerInfo):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run over the plan: the first, or one that resumed it."""
+    """One run over the plan: the first run, or a run that resumed it."""
 
     run: int
     started: float  # seconds since 1970
@@ -110,7 +108,8 @@ class CaseResults:
     settings: dict[str, Any]
     described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made the env
     contract: dict[str, Any]
-    code: dict[str, Any]  # of the env: commit, dirty, diff_sha256; {} if it is in no git repository
+    # The env's commit, dirty and diff_sha256; {} if its code is in no git repository.
+    code: dict[str, Any]
     program: dict[str, str]  # digests of the env's files by their names; {} for an installed env
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
@@ -125,7 +124,9 @@ class CaseResults:
 
     @property
     def task(self) -> str:
-        """The env, with the name of its suite, if any, as an env may be in several suites."""
+        """The env, preceded by the name of its suite if it has one, as an env may be in several
+        suites.
+        """
         return f"{self.suite} {self.env}".strip()
 
     @property
@@ -204,7 +205,7 @@ class Results:
             runs = [_run(row) for row in table(db, "runs")]
             policies = {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")}
             workers = [Worker(**row) for row in table(db, "workers")]
-            # An evaluation may have begun after the first look at the lock.
+            # An evaluation may have begun after the lock was checked first.
             is_written = was_locked or is_locked(out)
 
         for index, run in enumerate(runs):
@@ -245,7 +246,7 @@ class Results:
         return inside(home, str(absolute.relative_to(home)))
 
     def among(self, cases: Sequence[CaseResults]) -> Results:
-        """Return the same results with these cases only."""
+        """Return the same results with only these cases."""
         return replace(self, cases=tuple(cases))
 
     def only(self, policy_id: str | None = None, env: str | None = None) -> Results:
@@ -256,7 +257,7 @@ class Results:
             env: The full name of an env; None for all.
 
         Returns:
-            The same results with these cases only.
+            The same results with only these cases.
 
         Raises:
             ConfigError: No case is left.
@@ -266,17 +267,19 @@ class Results:
             if policy_id in (None, case.policy_id) and env in (None, case.env):
                 selected.append(case)
         if not selected:
-            known = sorted({f"{case.policy_id} in {case.env}" for case in self.cases})
+            available = sorted({f"{case.policy_id} in {case.env}" for case in self.cases})
             raise ConfigError(
                 f"{self.out}: expected episodes of {policy_id or 'any policy'} in "
-                f"{env or 'any env'}, got none: {known}"
+                f"{env or 'any env'}, got none; it has {available}"
             )
         return self.among(selected)
 
 
 @contextmanager
 def reading(out: Path) -> Iterator[sqlite3.Connection]:
-    """Read one consistent state of all tables in `out`, even while an evaluation writes."""
+    """Return a context manager that yields a connection to one consistent state of all tables in
+    `out`, even while an evaluation writes.
+    """
     if not (out / FILE).is_file():
         raise ConfigError(
             f"{out}: expected a folder that an evaluation wrote, with {FILE} in it, got one "
@@ -285,12 +288,12 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(read_only(out)) as db:
             require_readable(out, db)
-            db.execute("PRAGMA trusted_schema = OFF")  # the file may be a stranger's
+            db.execute("PRAGMA trusted_schema = OFF")  # the file may come from a third party
             db.row_factory = sqlite3.Row
             db.execute("BEGIN")
             yield db
     except sqlite3.DatabaseError as error:
-        # The disk is full on which the caller writes a copy.
+        # The caller writes a copy, to a disk that is full.
         if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:
             raise
         raise ConfigError(
@@ -306,8 +309,10 @@ def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[d
 
 
 def episode_of(row: dict[str, Any]) -> Episode:
-    """Return the episode of a row of the table; raises `ConfigError` for a path that leads out
-    of the folder.
+    """Return the episode of a row of the table.
+
+    Raises:
+        ConfigError: One of its paths leads out of the folder.
     """
     names = {field.name for field in fields(EpisodeResult)} - {"key"}
     values = {name: value for name, value in row.items() if name in names}
@@ -359,8 +364,8 @@ def _case(
     marked = []
     for episode in episodes:
         key = episode.result.key
-        # After a resumption with fewer episodes, the others that were already played would be a
-        # biased selection.
+        # If the evaluation was resumed with fewer episodes, those beyond them that had already run
+        # would be a biased selection.
         unplanned = place_in_plan(key, seeds, episodes_per_seed) is None
         after_stop = stopping is not None and not stopping.counts(key)
         marked.append(replace(episode, beyond=unplanned or after_stop, unplanned=unplanned))
@@ -377,8 +382,8 @@ def _case(
 def rate_of(
     cases: Sequence[CaseResults], outcome: Literal["success_once", "success_at_end"]
 ) -> Rate:
-    """Return the success rate of one case, or of several together, with bounds that hold if cases
-    could stop early.
+    """Return the success rate of one case, or of several together, with bounds that are valid if
+    cases could stop early.
 
     Cases without a common rate (`have_common_rate`) are counted, and their rate is None.
     """
@@ -401,7 +406,7 @@ def have_common_rate(cases: Sequence[CaseResults]) -> bool:
     """Return whether the episodes of these cases may be counted in one rate.
 
     Cases that stopped after different numbers of episodes may not, as their outcomes would
-    determine their weights; nor may cases with different clocks, as success in real time differs
+    determine their weights. Cases with different clocks may not, as success in real time differs
     from success while the env waits.
     """
     return len({case.stopped_at for case in cases}) <= 1 and len(by_timing(cases)) <= 1
@@ -411,11 +416,11 @@ SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
 
 
 def by_timing(cases: Sequence[CaseResults]) -> dict[str, list[CaseResults]]:
-    """Group the cases by their clock: "synchronous" first, then "in real time", or one such
-    group for each clock.
+    """Group the cases by their clock: "synchronous" first, then "in real time", which has a group
+    for each clock if there are several.
     """
     synchronous = [case for case in cases if case.settings.get("clock") is None]
-    clocks: dict[str, list[CaseResults]] = {}  # of the others, by their settings
+    clocks: dict[str, list[CaseResults]] = {}  # cases in real time, by the settings of their clock
     for case in cases:
         clock = case.settings.get("clock")
         if clock is not None:
@@ -444,4 +449,4 @@ def synchronous_twin(results: Results, case: CaseResults) -> CaseResults | None:
     if case.settings["clock"] is None:
         return None
     settings = case.settings | {"clock": None}
-    return next((other for other in results.cases if other.settings == settings), None)
+    return next((twin for twin in results.cases if twin.settings == settings), None)

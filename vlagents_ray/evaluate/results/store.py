@@ -54,12 +54,12 @@ class Store(AbstractContextManager["Store"]):
     """The results of one `out` folder, open for one evaluation at a time."""
 
     def __init__(self, plan: ResolvedPlan) -> None:
-        """Open or begin the results in `plan.out`.
+        """Open the results in `plan.out`, or begin new ones.
 
         Raises:
-            ConfigError: There are results and `plan.resume` is off, they have other settings or
-                another program and `plan.accept_changes` is off, or another evaluation is writing
-                to them.
+            ConfigError: There are results and `plan.resume` is off, or they have other settings,
+                or another program and `plan.accept_changes` is off, or another evaluation is
+                writing to them.
             StorageFailed: The folder cannot be written to.
         """
         self.cases = plan.cases
@@ -70,9 +70,8 @@ class Store(AbstractContextManager["Store"]):
             self.out.mkdir(parents=True, exist_ok=True)
             self._lock = lock(self.out)
 
-        # The state of this run.
-        self._run = 0
-        self._changes: list[Change] = []  # those that were accepted
+        self._run = 0  # the number of this run
+        self._changes: list[Change] = []  # the accepted changes of this run
         self._accepted: set[Hashable] = set()  # policies, cases and places with accepted changes
         self._policy_programs: dict[str, str | None] = {}  # by policy
         self._compared_envs: set[str] = set()  # places whose env was compared with earlier runs
@@ -122,7 +121,7 @@ class Store(AbstractContextManager["Store"]):
             )
 
     def finished(self) -> set[str]:
-        """Return the keys of the episodes that will not be played again."""
+        """Return the keys of the episodes that will not run again."""
         query = "SELECT key FROM episodes WHERE status != 'infra_failed'"
         return {key for (key,) in self._db.execute(query)}
 
@@ -134,13 +133,15 @@ class Store(AbstractContextManager["Store"]):
         trajectory: str | None = None,
         finished: float | None = None,
     ) -> None:
-        """Record an episode, finished now or at `finished`, s since 1970.
+        """Record an episode that finished now or at `finished`, s since 1970.
 
-        It replaces one that failed by infrastructure; any other is not changed.
+        It replaces an episode with the same key that failed because of infrastructure. An episode
+        with a result is never changed.
 
-        Raises `ConfigError` if it was played by another checkpoint than earlier episodes of its
-        case, as after a swap, by other weights of the same name, or by other weights than the
-        pushed ones of its case: a rate has one checkpoint.
+        Raises:
+            ConfigError: The episode ran with another checkpoint than earlier episodes of its case,
+                or with other weights of the same name. All episodes of a rate need one checkpoint.
+            WeightsLost: It ran with other weights than the pushed ones that its case evaluates.
         """
         case = self._cases_by_id[result.key.settings]
         _require_pushed_weights(case, result)
@@ -149,7 +150,7 @@ class Store(AbstractContextManager["Store"]):
 
         row = asdict(result)
         key = row.pop("key")
-        del key["policy_seed"]  # in an evaluation, it is that of the environment
+        del key["policy_seed"]  # in an evaluation, it equals the environment's seed
         row |= {
             "key": str(result.key),
             "case_id": key.pop("settings"),
@@ -170,24 +171,24 @@ class Store(AbstractContextManager["Store"]):
             insert(self._db, "episodes", row)
 
     def _require_same_checkpoint(self, result: EpisodeResult) -> None:
-        """Raise `ConfigError` if other episodes of the case were played by another checkpoint."""
+        """Raise `ConfigError` if other episodes of the case ran with another checkpoint."""
         query = (
             "SELECT checkpoint FROM episodes WHERE case_id = ? AND checkpoint IS NOT NULL LIMIT 1"
         )
         row = self._db.execute(query, (result.key.settings,)).fetchone()
         if row is None or result.checkpoint is None:
             return
-        (known,) = row
-        if result.checkpoint != known:
+        (recorded_checkpoint,) = row
+        if result.checkpoint != recorded_checkpoint:
             raise ConfigError(
-                f"policy: expected the checkpoint {known!r} of the results in {self.out}, got "
-                f"{result.checkpoint!r} in {result.key}; serve the first again, or choose another "
-                "out folder"
+                f"policy: expected the checkpoint {recorded_checkpoint!r} of the results in "
+                f"{self.out}, got {result.checkpoint!r} in {result.key}; serve the first again, or "
+                "choose another out folder"
             )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
-        """Require the weights of earlier episodes of the case, and of other cases with the same
-        checkpoint, unless other ones are accepted.
+        """Require the same weights as in earlier episodes of the case, and in other cases with the
+        same checkpoint, unless changes are accepted.
         """
         if result.weights is None:
             return
@@ -206,11 +207,11 @@ class Store(AbstractContextManager["Store"]):
             (case.policy.name, case.step, result.checkpoint),
         )
         for owner in owners:
-            known = self._weights.setdefault(owner, result.weights)
-            if result.weights == known:
+            recorded_weights = self._weights.setdefault(owner, result.weights)
+            if result.weights == recorded_weights:
                 continue
             name = result.checkpoint or "weights"
-            change = Change(f"policy {case.policy_id}", name, known, result.weights)
+            change = Change(f"policy {case.policy_id}", name, recorded_weights, result.weights)
             self._accept_or_raise(
                 owner, [change], f"{result.key} was run with other weights than the results in"
             )
@@ -242,7 +243,13 @@ class Store(AbstractContextManager["Store"]):
         self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
-        """Record an attempt that infrastructure failed; `retried` is whether another follows."""
+        """Record an attempt that failed because of infrastructure.
+
+        Args:
+            job: The episode and the number of the attempt.
+            failure: The failure.
+            retried: Whether another attempt follows.
+        """
         row = {
             "key": str(job.key),
             "case_id": job.key.settings,
@@ -264,50 +271,54 @@ class Store(AbstractContextManager["Store"]):
         with self._db:
             insert(self._db, "workers", asdict(worker) | {"run": self._run, "at": time.time()})
 
-    def note_env(self, place: str, made: EnvInfo) -> None:
-        """Record the description, contract and code of the env of the cases at `place`.
+    def note_env(self, place: str, env_info: EnvInfo) -> None:
+        """Record the description, contract and code of an env that a worker has made.
 
-        Raises `ConfigError` if description or contract differ from an earlier run, as after an
-        update of the simulator, or if the worker has other files than the process that made the
-        plan.
+        Args:
+            place: Suite and env of the cases (`EvalCase.place`).
+            env_info: The facts that the worker reports.
+
+        Raises:
+            ConfigError: The description or the contract differs from an earlier run, for example
+                after an update of the simulator, or the worker has other files than the process
+                that made the plan.
         """
         cases = [case for case in self.cases if case.place == place]
         env = cases[0].env
-        changes = program_changes(f"env {env}", cases[0].program, made.program)
-        # A file that was not there before is allowed: the environment itself may write a file that
-        # its settings name.
+        changes = program_changes(f"env {env}", cases[0].program, env_info.program)
+        # A new file is allowed: the environment itself may write a file that its settings name.
         if any(change.was is not None for change in changes):
             raise ConfigError(
-                f"expected the files of this process on the worker at {made.host}, got others, or "
-                f"they were edited since the start:\n{listed(changes)}\ngive both the same files, "
+                f"expected the files of this process on the worker at {env_info.host}, got others, "
+                f"or they were edited since the start:\n{listed(changes)}\ngive both the same files, "
                 "and continue with --resume"
             )
 
-        # Another worker of this run may have made the env; descriptions may differ between nodes.
+        # The env is compared once in a run, as descriptions may differ between nodes.
         if place not in self._compared_envs:
             self._compared_envs.add(place)
-            self._require_same_env(cases, made)
+            self._require_same_env(cases, env_info)
 
-        described = json.dumps(made.described, default=str)
-        code = {} if made.code is None else made.code.to_json()
-        values = (described, canonical(made.contract), canonical(code))
+        described = json.dumps(env_info.described, default=str)
+        code = {} if env_info.code is None else env_info.code.to_json()
+        values = (described, canonical(env_info.contract), canonical(code))
         with self._db:
             self._db.executemany(
                 "UPDATE cases SET described = ?, contract = ?, code = ? WHERE case_id = ?",
                 [(*values, case.fingerprint) for case in cases],
             )
 
-    def _require_same_env(self, cases: Sequence[EvalCase], made: EnvInfo) -> None:
+    def _require_same_env(self, cases: Sequence[EvalCase], env_info: EnvInfo) -> None:
         """Require the description and the contract that earlier runs recorded for any of the
-        cases, unless other ones are accepted.
+        cases, unless changes are accepted.
 
-        The cases share one env; those of other policies are included, as they are compared with
+        The cases share one env. They include those of all policies, as policies are compared with
         each other.
         """
         env, place = cases[0].env, cases[0].place
         now = EnvStatement(
-            json.loads(json.dumps(made.described, default=str)),
-            json.loads(canonical(made.contract)),
+            json.loads(json.dumps(env_info.described, default=str)),
+            json.loads(canonical(env_info.contract)),
         )
         query = "SELECT described, contract FROM cases WHERE case_id = ? AND described IS NOT NULL"
         changes: dict[Change, None] = {}
@@ -320,21 +331,23 @@ class Store(AbstractContextManager["Store"]):
         self._accept_or_raise(place, list(changes), "the environment is not that of the results in")
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
-        """Record the metadata of a policy's server; raises `ConfigError` if it is another policy
-        than before.
+        """Record the metadata of a policy's server.
+
+        Raises:
+            ConfigError: It is another policy than in earlier runs.
         """
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
-        known = None if row is None else json.loads(row[0])
+        earlier = None if row is None else json.loads(row[0])
         swept = any(case.step is not None for case in self.cases if case.policy.name == name)
-        if known is not None:
-            field = changed(known, metadata, swept=swept)
+        if earlier is not None:
+            field = changed(earlier, metadata, swept=swept)
             if field in ("policy", "checkpoint"):
                 raise ConfigError(
-                    f"policy {name!r}: expected {field} {known.get(field)!r}, as in the results "
+                    f"policy {name!r}: expected {field} {earlier.get(field)!r}, as in the results "
                     f"in {self.out}, got {metadata.get(field)!r} from the server; serve the "
                     "first again, or choose another out folder"
                 )
-            changes = policy_changes(f"policy {name}", known, metadata, swept=swept)
+            changes = policy_changes(f"policy {name}", earlier, metadata, swept=swept)
             self._accept_or_raise(
                 ("policy", name), changes, "the policy is not that of the results in"
             )
@@ -383,7 +396,7 @@ class Store(AbstractContextManager["Store"]):
     def _require_resumable(self, db: sqlite3.Connection) -> None:
         """Require that the results in the folder, if any, may be continued by this plan.
 
-        The remains of a plan that could not begin are deleted.
+        The rows of an earlier plan that could not begin are deleted.
         """
         (runs,) = db.execute("SELECT COUNT(*) FROM runs").fetchone()
         (episodes,) = db.execute("SELECT COUNT(*) FROM episodes").fetchone()
@@ -449,9 +462,9 @@ class Store(AbstractContextManager["Store"]):
         """Return the cases and episodes of the results that this plan lacks, and other rules of
         early stopping.
 
-        A plan may grow, also by steps of a policy, which `--watch` adds one after the other. A
-        trainer evaluates versions of policies one after the other into one folder, each with its
-        plan, so cases of other policies are not missing.
+        A plan may grow; for example, `--watch` adds the steps of a policy in turn. A trainer
+        evaluates the versions of its policies in turn into one folder, each with a plan that has
+        only its own cases, so the cases of other policies do not count as missing.
         """
         is_training = all(case.policy.pushed_weights for case in self.cases)
         policies = {case.policy.name for case in self.cases}
@@ -494,10 +507,10 @@ def _require_pushed_weights(case: EvalCase, result: EpisodeResult) -> None:
 def _plan_changes(
     case: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None
 ) -> list[Change]:
-    """Return what the plan of a case leaves out of the results, or another rule of early stopping
-    than `stop`.
+    """Return the seeds and episodes in the results that the plan of a case lacks, and a change of
+    its rule of early stopping.
 
-    Otherwise an evaluation could end where its rate looks good.
+    Without this check, an evaluation could end when its rate happens to be high.
     """
     seeds = json.loads(seeds_json)
     episodes = planned // len(seeds)
@@ -513,10 +526,11 @@ def _plan_changes(
 
 
 def _differences(db: sqlite3.Connection, case: EvalCase) -> list[str]:
-    """Return the settings of `case` that differ from those in the results, a sentence each; none
-    for a new case.
+    """Return a sentence for each setting of `case` that differs from the results; none for a new
+    case.
 
-    The first seeds must be the same: else episode 3 would be two episodes.
+    The first seeds must be the same, as the number of an episode would otherwise mean two different
+    episodes.
     """
     row = db.execute(
         "SELECT settings, seeds FROM cases WHERE policy = ? AND step IS ? AND suite = ? AND env = "
