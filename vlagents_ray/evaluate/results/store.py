@@ -290,8 +290,8 @@ class Store(AbstractContextManager["Store"]):
         if any(change.was is not None for change in changes):
             raise ConfigError(
                 f"expected the files of this process on the worker at {env_info.host}, got others, "
-                f"or they were edited since the start:\n{listed(changes)}\ngive both the same files, "
-                "and continue with --resume"
+                f"or they were edited since the start:\n{listed(changes)}\ngive both the same "
+                "files, and continue with --resume"
             )
 
         # The env is compared once in a run, as descriptions may differ between nodes.

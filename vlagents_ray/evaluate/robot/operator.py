@@ -1,4 +1,4 @@
-"""The operator at the robot: questions and displays at a terminal or at a page in the browser."""
+"""The operator at the robot, who answers questions at a terminal or at a page in the browser."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from vlagents_ray.page_protocol import BACKLOG, PageListener, PageProtocol
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
-_START_QUALITY = 92  # JPEG, of the start pictures
+_START_QUALITY = 92  # JPEG quality of the start pictures
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 _Phase = Literal["scene", "playing", "verdict", "next", "end"]
 _CHOICES: dict[str, set[str]] = {
@@ -42,10 +42,10 @@ _CHOICES: dict[str, set[str]] = {
     "playing": {"stop"},
     "verdict": {*_OUTCOMES.values()},
 }
-_AWAY_S = 3.0  # time without a request of the page after which the operator counts as away
-_LOOK_S = 0.1  # period of live pictures while the scene is set
-_BODY = 10_000  # bytes of an answer
-_PAGE_QUALITY = 80
+_AWAY_S = 3.0  # time without a request of the page after which the page counts as closed, s
+_LOOK_S = 0.1  # period of live pictures while the scene is set, s
+_BODY = 10_000  # most bytes of an answer
+_PAGE_QUALITY = 80  # JPEG quality of live pictures
 _FILES = {
     "operator.html": "text/html",
     "operator.css": "text/css",
@@ -72,14 +72,16 @@ class VisibleTrial:
     attempt: int  # from 1; higher after a repetition
     instruction: str
     setup: str  # instructions for setting the scene
-    seconds: float  # after which the trial ends
+    seconds: float  # time limit of the trial
     rubric: Mapping[str, float]  # points by part of the task
     # The JPEG of each camera at the scene's first start.
     start: Mapping[str, Path] = field(default_factory=dict)
-    message: str = ""  # end of the last attempt, if it has no verdict
+    message: str = ""  # how the last attempt ended, if it has no verdict
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields for JSON; for the start pictures, the names of the cameras."""
+        """Return the fields for JSON, with the names of the cameras in place of the start
+        pictures.
+        """
         return asdict(self) | {"rubric": dict(self.rubric), "start": sorted(self.start)}
 
 
@@ -89,7 +91,7 @@ class Verdict:
 
     outcome: Outcome
     earned: tuple[str, ...] = ()  # the parts of the rubric that were reached, in a partial success
-    note: str = ""  # for "repeat" the reason, which is required
+    note: str = ""  # any text; required for "repeat", where it is the reason
 
     def score(self, rubric: Mapping[str, float]) -> float:
         """Return the share of the rubric's points that were earned: 1 for a success, 0 for a
@@ -100,7 +102,7 @@ class Verdict:
 
         Raises:
             ConfigError: A partial success has a part that is not in the rubric, or there is no
-                rubric; or a repetition has no reason.
+                rubric, or a repetition has no reason.
         """
         if self.outcome == "repeat" and not self.note.strip():
             raise ConfigError(
@@ -121,7 +123,7 @@ class Verdict:
 
 
 class Operator(Protocol):
-    """The interface of the operator; the methods are called from one thread, in this order."""
+    """The interface of the operator. The methods are called on one thread, in this order."""
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
         """Wait until the scene is set. The robot stays still.
@@ -135,46 +137,48 @@ class Operator(Protocol):
         """
 
     def watch(self, obs: Obs) -> None:
-        """Show an observation of the running trial; called at each control tick, so it must
-        return at once.
+        """Show an observation of the running trial. It is called at each control tick, so it must
+        return immediately.
         """
 
     def stops(self) -> bool:
-        """Return whether to stop the running trial, also because the operator's page was closed."""
+        """Return whether to stop the running trial, for example because the operator's page was
+        closed.
+        """
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
         """Ask for the verdict. The robot stays still.
 
         Args:
-            trial: The trial that was played.
+            trial: The trial that has ended.
             ending: The end of the trial, in words.
 
         Returns:
-            The verdict; to repeat the trial, its note has the reason.
+            The verdict. If the trial is to be repeated, its note is the reason.
 
         Raises:
-            KeyboardInterrupt: The operator has left. The trial will be played again.
+            KeyboardInterrupt: The operator has left. The trial will be repeated.
         """
 
 
 def start_pictures(out: Path, scene: str) -> dict[str, Path]:
-    """Return the JPEG of each camera at the first start of a scene; {} before that."""
+    """Return the JPEG of each camera from the first start of a scene; {} if it has not started."""
     return {path.stem: path for path in sorted((out / SCENES / scene).glob("*.jpg"))}
 
 
 def save_start(out: Path, scene: str, obs: Obs) -> None:
-    """Save the pictures of a scene at its start, in place of earlier ones."""
+    """Save the pictures of a scene at its start, and replace earlier ones."""
     for camera, name in distinct(obs.cameras).items():
         with whole(out / SCENES / scene / f"{name}.jpg") as unfinished_path:
             unfinished_path.write_bytes(encode_jpeg(obs.cameras[camera], _START_QUALITY))
 
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
-    """Save the mean of a start picture and the camera's present picture, beside the folder of the
+    """Save the mean of a start picture and the camera's present picture, next to the folder of the
     start picture.
 
     Returns:
-        The new JPEG; it has the size of `now`, and only `now` if the sizes differ.
+        The new JPEG, of the size of `now`. If the sizes differ, it shows only `now`.
     """
     start_picture = decode(start.read_bytes())
     if start_picture.shape == now.shape:
@@ -209,8 +213,8 @@ class TerminalOperator(Operator):
         self._stopping = _enter_pressed if stopping is None else stopping
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Print the trial and the setup of its scene, and wait for Enter; "q" or the end of the
-        input ends the evaluation.
+        """Print the trial and the setup of its scene, and wait for Enter. The input "q", or the end
+        of the input, ends the evaluation.
         """
         self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
         pictures = (f"set it as in {picture}" for picture in trial.start.values())
@@ -231,7 +235,7 @@ class TerminalOperator(Operator):
                 self._look(trial, observe())
 
     def watch(self, obs: Obs) -> None:
-        """Show nothing: the operator sees the robot."""
+        """Show nothing, as the operator sees the robot."""
 
     def stops(self) -> bool:
         return self._stopping()
@@ -281,8 +285,8 @@ class TerminalOperator(Operator):
 
 
 def _enter_pressed() -> bool:
-    """Return whether a line was typed at the terminal; False if the input is no terminal, which
-    is not read ahead.
+    """Return whether a line was typed at the terminal; False if the input is not a terminal, as
+    its lines are answers to later questions.
     """
     if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
@@ -291,14 +295,14 @@ def _enter_pressed() -> bool:
 
 
 class PageOperator(Operator):
-    """An operator at a page in the browser. Use as a context manager: the page is served within it.
+    """An operator at a page in the browser, which is served within the context of this object.
 
-    The page is on the loopback interface, and requires the random part of its address. A running
-    trial is stopped if the page has sent no request for 3 s, as when it was closed. At the end of
-    the context an open page shows whether the evaluation is complete.
+    The page listens on the loopback interface, and its address has a random part. A running trial
+    is stopped if the page has sent no request for 3 s, for example because it was closed. At the
+    end of the context, an open page shows whether the evaluation is complete.
 
     Args:
-        say: Prints a line: the page's address.
+        say: Prints a line with the page's address.
         port: The port; 0 chooses a free one.
     """
 
@@ -350,12 +354,12 @@ class PageOperator(Operator):
         self._say(f"the operator's page: {self.url}")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
         with self._changed:
             self._phase, self._answer = "end", None
-            if kind is None:
+            if error_type is None:
                 self._ending = "The evaluation is complete: close this page"
-            elif issubclass(kind, KeyboardInterrupt):
+            elif issubclass(error_type, KeyboardInterrupt):
                 self._ending = (
                     "The evaluation was interrupted: --resume continues it, at a new address"
                 )
@@ -454,7 +458,7 @@ class PageOperator(Operator):
         return FileResponse(path, headers=_HEADERS)
 
     async def _take(self, http: Request) -> Response:
-        """Accept an answer, unless it is for another trial or question than the present one."""
+        """Accept an answer if it belongs to the present trial and question."""
         if not http.headers.get("content-type", "").startswith("application/json"):
             return PlainTextResponse("expected application/json", 415)
 
@@ -480,7 +484,7 @@ class PageOperator(Operator):
                 or question != (self._phase, trial.number, trial.attempt)
                 or self._answer is not None
             ):
-                return PlainTextResponse("the trial has gone on meanwhile", 409)
+                return PlainTextResponse("this question is no longer open", 409)
 
             choices = _CHOICES.get(self._phase, set())
             if answer["do"] not in choices:

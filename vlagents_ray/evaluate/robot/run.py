@@ -1,10 +1,10 @@
-"""Runs the trials of an evaluation on a robot, and writes the results when all of them have their
-verdicts.
+"""Runs the trials of an evaluation on a robot, and writes the results when all trials have a
+verdict.
 
-Until then there are two files in place of results.db. The log, `trials.jsonl`, has a line for each
-attempt at a trial, with its verdict. The policy, its checkpoint and its timing are in
-`trials.hidden.jsonl`, which the operator does not open. A line of the log has the hash of its
-hidden line, so neither can be changed later without the other.
+Until then, two files replace results.db. The log, `trials.jsonl`, has a line for each attempt at a
+trial, with its verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`,
+which the operator must not open. Each line of the log contains the hash of its hidden line, so
+neither can be changed later without the other.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ from vlagents_ray.robot.loop import Robot, opened, robot_factory
 LOG = "trials.jsonl"
 HIDDEN = "trials.hidden.jsonl"
 KEY = "trials.key"
-# Hidden lines have a multiple of this length in bytes, so that the size of the file reveals no
-# policy.
+# The length of a hidden line is a multiple of this number of bytes, so that the size of the file
+# does not reveal the policy.
 _BLOCK = 16384
 _KILLED = "the evaluation ended before the verdict"
 
@@ -71,27 +71,28 @@ class LoggedTrial:
 
     trial: int
     attempt: int
-    at: float  # s since 1970, of its end
-    # The fields in plain text: outcome, earned, score, note; or `again`, the reason of a
-    # repetition.
-    seen: dict[str, Any]
+    at: float  # the time of its end, s since 1970
+    # The fields that the operator may read: outcome, earned, score, note; or `again`, the reason
+    # of a repetition.
+    visible: dict[str, Any]
     hidden: dict[str, Any]  # the fields that reveal the policy
 
     @property
     def finished(self) -> bool:
-        """Whether the trial has a result, so that it is not played again."""
-        return "again" not in self.seen
+        """Whether the trial has a result, so that it is not repeated."""
+        return "again" not in self.visible
 
 
 class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     """The log in one folder, open for one evaluation at a time."""
 
     def __init__(self, plan: ResolvedPlan) -> None:
-        """Open or begin the log in `plan.out`.
+        """Open the log in `plan.out`, or begin a new one.
 
         Raises:
-            ConfigError: There is a log and `plan.resume` is off, or it has another plan or key;
-                there are results of a simulation; or another evaluation writes to the folder.
+            ConfigError: There is a log and `plan.resume` is off, or the log has another plan or
+                key, or there are results of a simulation, or another evaluation writes to the
+                folder.
             StorageFailed: The folder cannot be written to.
         """
         self._path = plan.out / LOG
@@ -141,13 +142,13 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     def end(
         self, trial: int, attempt: int, visible: dict[str, Any], hidden: dict[str, Any]
     ) -> None:
-        """Record the end of an attempt, with the fields `seen` and `hidden` of `LoggedTrial`."""
+        """Record the end of an attempt, with the fields `visible` and `hidden` of `LoggedTrial`."""
         at = time.time()
         self._write({"trial": trial, "attempt": attempt, "at": at, **visible}, hidden)
         self.attempts.append(LoggedTrial(trial, attempt, at, visible, hidden))
 
     def note_unblinded(self) -> None:
-        """Record that the results were written before all trials were played."""
+        """Record that the results were written before all trials had run."""
         self._write({"unblinded": time.time()})
 
     def _read(self, plan: ResolvedPlan, identity: str) -> None:
@@ -184,7 +185,7 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
                     "or was changed; restore both files from one copy, or choose another out folder"
                 )
             self.attempts.append(
-                LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden))
+                LoggedTrial(*attempt, line.pop("at"), visible=line, hidden=json.loads(hidden))
             )
 
         for attempt in unfinished_attempts:
@@ -195,8 +196,8 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if hidden is not None:
                 text = json.dumps(hidden, default=str).encode()
                 text += b" " * (-len(text) % _BLOCK)
-                # The hidden line is written before the line that has its hash, since the process
-                # may be killed between the two.
+                # The hidden line is written before the line with its hash, since the process may be
+                # killed in between.
                 self._hidden.append(text)
                 line = {**line, "hidden": _hash(self.key, text)}
             self._log.append(canonical(line).encode())
@@ -211,7 +212,7 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
         self._file = os.fdopen(descriptor, "a+b")
 
     def lock(self) -> None:
-        """Raise `ConfigError` if another process holds the file."""
+        """Lock the file; raise `ConfigError` if another process has locked it."""
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -221,7 +222,7 @@ class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
             ) from error
 
     def read(self) -> list[bytes]:
-        """Return all complete lines, and drop one that a killed process left incomplete."""
+        """Return all complete lines, and delete an incomplete one that a killed process left."""
         self._file.seek(0)
         data = self._file.read()
         complete = data.rfind(b"\n") + 1
@@ -243,10 +244,10 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
 
     Args:
         out: The folder of an evaluation on a robot.
-        key: The plan's key; None: the folder's own.
+        key: The plan's key; None if it is in the folder.
 
     Raises:
-        ConfigError: The folder has no log, or it is of another key.
+        ConfigError: The folder has no log, or its log has another key.
     """
     try:
         with (out / LOG).open("rb") as file:
@@ -272,12 +273,12 @@ def _hash(key: bytes, line: bytes) -> str:
 
 
 def _by_hash(key: bytes, lines: Iterable[bytes]) -> dict[str, bytes]:
-    """Return hidden lines by the hashes that the log has of them."""
+    """Return hidden lines by their hashes, which the log contains."""
     return {_hash(key, line): line for line in lines}
 
 
 def _key(plan: ResolvedPlan) -> bytes:
-    """Return the plan's key, or the one drawn for this folder."""
+    """Return the plan's key, or the random key of this folder, which is drawn if there is none."""
     robot, _ = plan.cases[0].on_robot
     if robot.key is not None:
         return robot.key.encode()
@@ -296,10 +297,10 @@ _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")
 
 
 class TrialsInterrupted(KeyboardInterrupt):
-    """The operator or a signal ended an evaluation on a robot; `resume` continues with the next
+    """The operator or a signal ended an evaluation on a robot. `resume` continues with the next
     trial.
 
-    It has no results, as further trials would not be blind.
+    There are no results yet, as they would unblind the remaining trials.
     """
 
 
@@ -310,19 +311,20 @@ def evaluate_on_robot(
     robot: Robot | None = None,
     agent_factory: AgentFactory | None = None,
 ) -> Summary:
-    """Play every trial of `config` that has no result yet, and write the results to `config.out`.
+    """Run every trial of `config` that has no result yet, and write the results to `config.out`.
 
-    A trial's policy is drawn (`schedule`). Until the last verdict only the hidden file in the
-    folder names it (`TrialLog`), and no output or log does; results.db, summary.json and
-    report.html are written at the end, as for a simulation. With `config.stop`, a task ends once
-    all its cases have stopped, since trials of the remaining ones would reveal their policy.
+    The order of the policies is random (`schedule`). Until the last verdict, only the hidden file
+    in the folder names the policy of a trial (`TrialLog`); no output and no log does. results.db,
+    summary.json and report.html are written at the end, as for a simulation. With `config.stop`, a
+    task ends once all its cases have stopped, since trials of only the remaining cases would reveal
+    their policies.
 
     Args:
         config: The policies, with their URLs, and the plan, with `robot`.
         operator: The operator at the robot.
-        robot: The robot; by default one of the class `config.robot.arm`.
-        agent_factory: Called with a policy to make its agent for a trial, in place of a connection
-            to its `url`.
+        robot: The robot; by default an object of the class `config.robot.arm`.
+        agent_factory: Called with a policy to make its agent for a trial; by default, the agent is
+            a connection to the policy's `url`.
 
     Returns:
         The summary of all results in `config.out`.
@@ -390,13 +392,13 @@ def unblind(out: Path, key: str | None = None) -> Summary:
 
     Args:
         out: The folder of an evaluation on a robot.
-        key: The plan's key; None: the folder's own.
+        key: The plan's key; None if it is in the folder.
 
     Returns:
         The summary of these results.
 
     Raises:
-        ConfigError: The folder has no trials, or they are of another key.
+        ConfigError: The folder has no trials, or its log has another key.
     """
     config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
     require_trials(config)
@@ -407,7 +409,7 @@ def unblind(out: Path, key: str | None = None) -> Summary:
 
 
 def require_trials(config: EvalConfig) -> None:
-    """Raise `ConfigError` if a configuration has no robot, or settings without meaning on one."""
+    """Raise `ConfigError` if a plan has no robot, or has settings that do not apply to a robot."""
     if config.real_robot is None:
         raise ConfigError(
             "robot: expected `robot: {tasks: …}` in the plan and the robot's class (--robot), "
@@ -424,7 +426,7 @@ def require_trials(config: EvalConfig) -> None:
 
 @dataclasses.dataclass(slots=True)
 class _RemainingTrials:
-    """The remaining trials, one after the other."""
+    """Runs the remaining trials in turn."""
 
     _plan: ResolvedPlan
     _operator: Operator
@@ -446,7 +448,7 @@ class _RemainingTrials:
             self._stopping.add(result_of(self._trials[number - 1], logged))
 
     def play(self) -> None:
-        """Rehearse the policies, then play each trial until it has a result."""
+        """Rehearse the policies, then run each trial until it has a result."""
         remaining = [trial for trial in self._trials if self._is_due(trial)]
         if not remaining:
             return
@@ -473,20 +475,20 @@ class _RemainingTrials:
                 self._play(trial)
 
     def _is_due(self, trial: Trial) -> bool:
-        """Return whether the trial has no result and its task goes on."""
+        """Return whether the trial has no result and its task is not over."""
         return trial.number not in self._log.finished and not self._is_over(trial)
 
     def _play(self, trial: Trial) -> None:
-        """Play one attempt at the trial, and record its verdict or the reason of its repetition."""
+        """Run one attempt at the trial, and record its verdict or the reason of its repetition."""
         view = self._visible(trial)
         attempt = view.attempt
         if not self._operator.prepare(view, self._robot.observe):
             raise KeyboardInterrupt
 
-        finished_scenes = {self._trials[number - 1].place for number in self._log.finished}
-        if trial.place not in finished_scenes:
+        finished_scenes = {self._trials[number - 1].scene_name for number in self._log.finished}
+        if trial.scene_name not in finished_scenes:
             with storing(self._plan.out):
-                save_start(self._plan.out, trial.place, self._robot.observe())
+                save_start(self._plan.out, trial.scene_name, self._robot.observe())
 
         self._log.begin(trial.number, attempt)
         try:
@@ -557,7 +559,7 @@ class _RemainingTrials:
         earlier_attempts = self._log.of(trial.number)
         message = self._message
         if earlier_attempts:
-            message = f"repeated: {earlier_attempts[-1].seen['again']}"
+            message = f"repeated: {earlier_attempts[-1].visible['again']}"
 
         return VisibleTrial(
             number=trial.number,
@@ -569,13 +571,13 @@ class _RemainingTrials:
             setup=task.setup,
             seconds=task.max_steps / robot.hz,
             rubric=task.rubric,
-            start=start_pictures(self._plan.out, trial.place),
+            start=start_pictures(self._plan.out, trial.scene_name),
             message=message,
         )
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
-        """Raise `ConfigError` if the policy has changed, without naming the policy or its
-        trials.
+        """Raise `ConfigError` if the policy has changed. The message does not name the policy or
+        its trials.
         """
         case = trial.job.case
         for number, logged in self._log.finished.items():
@@ -596,8 +598,8 @@ class _RemainingTrials:
 
 
 def _changed_weights(earlier: dict[str, Any], result: EpisodeResult) -> str | None:
-    """Return the first of "checkpoint" and "weights" that two results state differently; None if
-    there is none.
+    """Return "checkpoint" or "weights", the first of them that differs between two results; None
+    if neither does.
 
     Args:
         earlier: The fields of the earlier result.
@@ -614,20 +616,23 @@ def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
     """Return the result of a finished trial from the log.
 
     Raises:
-        ConfigError: The logged result is of another plan.
+        ConfigError: The logged result belongs to another plan.
     """
     fields = dict(logged.hidden["result"])
     fields["key"] = EpisodeKey(**fields["key"])
     if fields["key"] != trial.job.key:
         raise ConfigError(
-            f"trial {trial.number}: its result is of another plan; choose another out folder"
+            f"trial {trial.number}: expected a result of this plan, got another plan's; choose "
+            "another out folder"
         )
     return EpisodeResult(**fields)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the logs of this package and of Ray off the terminal: they may name the policy."""
+    """Return a context manager that silences the loggers of this package and of Ray, as their
+    messages may name the policy.
+    """
     loggers = {name: logging.getLogger(name) for name in _LOGGERS}
     levels = {name: logger.level for name, logger in loggers.items()}
     for logger in loggers.values():
@@ -640,7 +645,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _write_results(plan: ResolvedPlan, log: TrialLog, state: str) -> Summary:
-    """Write results.db from the whole log, as an evaluation in simulation does, in place of an
+    """Write results.db from the whole log, as an evaluation in simulation would, and replace an
     earlier one.
     """
     trials = schedule(plan.cases, log.key)
@@ -660,8 +665,8 @@ def _write_results(plan: ResolvedPlan, log: TrialLog, state: str) -> Summary:
             trial = trials[logged.trial - 1]
             job = dataclasses.replace(trial.job, attempt=logged.attempt)
             if not logged.finished:
-                if logged.seen["cause"] == "operator":
-                    failure = Failure("operator", "trial_repeated", logged.seen["again"])
+                if logged.visible["cause"] == "operator":
+                    failure = Failure("operator", "trial_repeated", logged.visible["again"])
                 else:
                     failure = Failure(**logged.hidden)
                 store.record_attempt(job, failure, retried=True)

@@ -1,4 +1,4 @@
-"""The trials of an evaluation on a robot: their order, and the run of one."""
+"""The trials of an evaluation on a robot: their order, and how one trial runs."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
 class Trial:
     """A trial, with its policy, `job.case.policy`, which the operator must not see."""
 
-    number: int  # from 1, in the order in which they are played
-    scene: int  # from 1; each policy plays each scene of a task once
+    number: int  # from 1, in the order in which the trials run
+    scene: int  # from 1; each policy has one trial in each scene of a task
     job: Job
 
     @property
@@ -60,8 +60,8 @@ class Trial:
         return self.job.case.suite.name, self.job.case.env
 
     @property
-    def place(self) -> str:
-        """The name of the scene in files."""
+    def scene_name(self) -> str:
+        """The name of the scene in the names of files."""
         return plain("-".join((*filter(None, self.task), f"scene{self.scene}")))
 
 
@@ -69,20 +69,20 @@ def schedule(cases: Iterable[EvalCase], key: bytes) -> list[Trial]:
     """Draw the order of all trials: task by task, scene by scene, and in each scene every policy
     once.
 
-    With k policies, each k scenes of a task in a row have the rows of a k x k Latin square in a
-    drawn order, whose columns are the policies in a drawn order. The fewer than k scenes that
-    remain of each task share one such square: they have those of its rows that the remaining scenes
-    of the tasks before had least often, drawn among equals. So each policy is first, second, and so
-    on equally often, and the counts differ by at most one in each task, and in the whole plan.
-    Seeds begin no new square. The draw depends on the key and the names of policies, suites and
-    environments, by HMAC-SHA256.
+    With k policies, each group of k consecutive scenes of a task has the rows of a k x k Latin
+    square. The order of its rows and that of the policies in its columns are random. The fewer than
+    k scenes that remain of each task share one more square: they take the rows that the remaining
+    scenes of earlier tasks used least often, and a random one of equals. So each policy is first,
+    second, and so on equally often. The counts differ by at most one in each task, and in the whole
+    plan. A group may span several seeds. The order depends on the key and on the names of policies,
+    suites and environments, through HMAC-SHA256.
 
     Args:
         cases: The cases of the plan, all on a robot.
         key: The plan's key, which reveals the policy of each trial.
 
     Returns:
-        The trials in the order in which they are played.
+        The trials in the order in which they run.
     """
     tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
     for case in cases:
@@ -110,8 +110,8 @@ def _orders(
     """Yield the order of the policies in each scene of a task.
 
     Args:
-        rows_used: How often the last scenes of the tasks before had each row of their common
-            square; it is updated.
+        rows_used: How often the remaining scenes of earlier tasks used each row of their common
+            square. It is updated.
     """
     size = len(names)
     for first in range(0, scenes, size):
@@ -129,8 +129,8 @@ def _orders(
 
 
 def _drawn(key: bytes, purpose: list[str | int], names: Iterable[str]) -> list[str]:
-    """Return the names in the order of their authentication codes, independent of the plan's
-    order; `purpose` makes each draw another.
+    """Return the names in the order of their authentication codes, which does not depend on the
+    order in the plan. `purpose` makes the draws differ.
     """
 
     def code(name: str) -> bytes:
@@ -141,17 +141,17 @@ def _drawn(key: bytes, purpose: list[str | int], names: Iterable[str]) -> list[s
 
 @dataclass(frozen=True, slots=True)
 class PlayedTrial:
-    """A trial that was played, before its verdict."""
+    """A trial that has ended, before its verdict."""
 
-    result: EpisodeResult  # without success
-    metadata: dict[str, Any]  # of the policy's server
-    ending: str  # in words that do not depend on the policy
+    result: EpisodeResult  # its success is not set yet
+    metadata: dict[str, Any]  # the metadata of the policy's server
+    ending: str  # how it ended, in words that do not depend on the policy
 
 
 class WatchedRobot(RobotWrapper):
     """A robot whose errors become `EnvFailed`, and whose steps are counted."""
 
-    stats: EpisodeStats | None = None  # of the running trial
+    stats: EpisodeStats | None = None  # the statistics of the running trial
     # Whether the player has returned the next action; the way to the rest pose has no steps.
     step_due: bool = False
 
@@ -174,8 +174,8 @@ class WatchedRobot(RobotWrapper):
 
 
 class _OperatorStop(CommandInbox):
-    """The operator's stop button, which the control loop reads before each motion, also on the
-    way to the rest pose.
+    """The operator's stop button. The control loop reads it before each motion, including the
+    motions to the rest pose.
     """
 
     def __init__(self, operator: Operator) -> None:
@@ -236,10 +236,22 @@ def play(
     operator: Operator,
     recording: Path | None,
 ) -> PlayedTrial:
-    """Play one attempt at a trial, and always stop the robot at its end.
+    """Run one attempt at a trial, and always stop the robot at its end.
+
+    Args:
+        trial: The trial.
+        robot: The robot.
+        factory: Makes the agent of the trial's policy.
+        operator: The operator, who may stop the trial.
+        recording: The folder for a recording; None for no recording.
 
     Returns:
-        The trial; with the status "policy_error" if the policy failed.
+        The trial, with the status "policy_error" if the policy failed.
+
+    Raises:
+        CheckpointFailed: The policy cannot load its checkpoint.
+        EnvFailed: The robot failed.
+        PolicyUnavailable: The policy's server was silent or could not be reached.
     """
     case = trial.job.case
     settings, task = case.on_robot
@@ -290,12 +302,13 @@ def play(
         except PolicyFailed as error:
             failed = error
 
-        for bark in report.barks:  # failures of infrastructure are not the policy's
+        # Failures of infrastructure do not count as failures of the policy.
+        for bark in report.barks:
             if bark == _STOPPED:
                 continue
             if bark.startswith("server"):
                 raise PolicyUnavailable(f"the policy's server was silent: {bark}")
-            raise EnvFailed(f"robot: the control loop was held up: {bark}")
+            raise EnvFailed(f"robot: the control loop was blocked: {bark}")
         if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
             raise PolicyUnavailable(
                 f"the policy's server could not be reached: {report.reasons['lost']}"
@@ -322,8 +335,8 @@ def rehearse(
 ) -> None:
     """Run a policy once, without moving the robot.
 
-    A mistake in the settings, or a policy that does not fit the robot, shows before the first
-    trial. Work done on the first call, such as compilation, does not slow the first trial, which
+    Mistakes in the settings, and policies that do not fit the robot, are thus found before the
+    first trial. Work of a first call, such as compilation, does not slow the first trial, where it
     would reveal which policy is running.
     """
     settings, task = case.on_robot
@@ -339,7 +352,7 @@ def rehearse(
                 agent.reset(obs, task.instruction, **case.policy_options)
                 fit.require(None, agent.act(obs).rows())
 
-        with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
+        with contextlib.suppress(InvalidAction):  # in a trial, it counts as the policy's failure
             player.reset(obs, task.instruction, **case.policy_options)
             player.act(obs)
 
@@ -352,8 +365,8 @@ def _player(
     robot: WatchedRobot,
     operator: Operator,
 ) -> Iterator[tuple[Agent, ChunkPlayer]]:
-    """Yield a policy's agent and its player with the plan's settings; both are closed at the
-    end.
+    """Return a context manager that yields a policy's agent and its player with the plan's
+    settings, and closes both.
     """
     settings, _ = case.on_robot
     agent = factory(case.policy)
@@ -374,7 +387,7 @@ def _player(
             measure=measured_state(settings.measure),
             limits=settings.limits,
             hz=settings.hz,
-            soft_start_s=0.0,  # the same limits in each trial of each policy
+            soft_start_s=0.0,  # so that all trials of all policies have the same limits
         )
         player = _CountingPlayer(agent, stats, robot, operator, player_settings, check=guard)
         unplayed.pop_all()  # the player closes the agent
