@@ -69,7 +69,7 @@ def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(
 ) -> None:
     results = play(config(episodes=2, record="all"), Noisy)
     first, *others = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
-    assert first.startswith("actions: they differ from step 3 on: [")
+    assert first.startswith("actions: they differ from step 3: expected [")
     assert any(line.startswith("episode_return: ") for line in others)
 
 
@@ -179,7 +179,7 @@ class Tired(Noisy):
 def test_fewer_actions_are_told_as_such(config: Config, tmp_path: Path) -> None:
     longer = find(play(config(episodes=1, record="all")), f"{LINE}#0")
     found = compare(longer, play(longer.config(tmp_path / "again"), Tired))
-    assert found[0] == "actions: 10 were recorded, now they are 6; the first 6 are the same"
+    assert found[0] == "actions: expected 10, as recorded, got 6; the first 6 are the same"
 
 
 def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(

@@ -14,18 +14,18 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import unfinished
 
-FINISHED = "training_finished"  # a file of this name in the folder means that no checkpoint follows
+FINISHED = "training_finished"  # name of the file that announces the end of the training
 
-# The path, the size in bytes and the time of change in ns of each file.
+# The path, the size in bytes and the modification time in ns of each file.
 Snapshot = frozenset[tuple[str, int, int]]
 
 
 @dataclass(slots=True)
 class _IncompleteCheckpoint:
-    """The state of a checkpoint since its last change, until it is complete."""
+    """The state of an incomplete checkpoint since its last change."""
 
     snapshot: Snapshot
-    since: float  # s, when this state was first seen
+    since: float  # when this snapshot was first taken, s
     why: str = ""  # the reason why it is not complete
     examined: bool = False  # whether its files were examined since they changed
 
@@ -45,13 +45,13 @@ class CheckpointWatcher:
 
         A checkpoint is complete when `vlagents_ray.policies.base.checkpoint_files` finds no fault
         in it, and either its names, sizes and times have not changed for `settle_s` seconds, or it
-        holds a file called `marker`.
+        contains a file called `marker`.
 
         Args:
             pattern: A checkpoint's path with `{step}` in it.
             folder: The folder of the steps; by default the part of `pattern` before `{step}`.
             settle_s: Seconds without a change.
-            marker: The name of a file that the trainer writes last, if it does.
+            marker: The name of the file that the trainer writes last, if there is one.
         """
         names = PurePath(pattern).parts
         step_index = next((i for i, name in enumerate(names) if STEP in name), None)
@@ -71,8 +71,10 @@ class CheckpointWatcher:
         self._complete: set[int] = set()
 
     def scan(self, now: float) -> list[int]:
-        """Return the steps completed since the last call, ascending; `now` is in s, of any
-        clock.
+        """Return the steps that were completed since the last call, ascending.
+
+        Args:
+            now: The time, s, of any clock.
         """
         paths_by_step = self._paths_by_step()
         for step in self._incomplete.keys() - paths_by_step.keys():
@@ -104,8 +106,8 @@ class CheckpointWatcher:
         return {step: checkpoint.why for step, checkpoint in sorted(self._incomplete.items())}
 
     def _paths_by_step(self) -> dict[int, tuple[Path, Path]]:
-        """Return by step the entry of the folder, and the path that the policy loads: the entry,
-        or one in it.
+        """Return, by step, the entry of the folder and the path that the policy loads, which is the
+        entry or a path in it.
         """
         paths: dict[int, tuple[Path, Path]] = {}
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
@@ -136,7 +138,7 @@ class CheckpointWatcher:
 
         state.why = unfinished(checkpoint) or ""
         state.examined = True
-        # The files passed; they may have changed while they were examined.
+        # The files have no fault, but they may have changed while they were examined.
         return not state.why and _snapshot(entry) == snapshot
 
 
@@ -146,9 +148,14 @@ def rounds(
     pause: Callable[[], object],
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[list[int]]:
-    """Yield the completed steps up to `until`; `pause` is called between two scans of the folder.
+    """Yield the completed steps up to `until`, until a step at or after `until` is complete or the
+    training has announced its end.
 
-    It ends when a step at or after `until` is complete, or when the training has announced its end.
+    Args:
+        watcher: Finds the checkpoints.
+        until: The last step to evaluate; None for all steps.
+        pause: Called between two scans of the folder.
+        clock: Returns the time, s.
     """
     while True:
         # The announcement is read before the scan, which then finds all checkpoints.

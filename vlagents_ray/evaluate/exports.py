@@ -1,6 +1,6 @@
 """A table with one row for each episode, as JSON or CSV.
 
-The names and types of the columns stay as they are; new columns come last.
+The names and types of the columns never change, and new columns are added at the end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column. Any may be empty, as for an episode that failed by infrastructure."""
+    """A column. Any value may be empty, for example if infrastructure made the episode fail."""
 
     name: str
     type: Type
@@ -30,44 +30,46 @@ class Column:
     value: Callable[[CaseResults, Episode], Any]
 
 
-def _of_result(name: str, kind: Type, meaning: str, field: str | None = None) -> Column:
+def _of_result(name: str, value_type: Type, meaning: str, field: str | None = None) -> Column:
     return Column(
-        name, kind, meaning, lambda _case, episode: getattr(episode.result, field or name)
+        name, value_type, meaning, lambda _case, episode: getattr(episode.result, field or name)
     )
 
 
-def _of_case(name: str, kind: Type, meaning: str) -> Column:
-    return Column(name, kind, meaning, lambda case, _episode: getattr(case, name))
+def _of_case(name: str, value_type: Type, meaning: str) -> Column:
+    return Column(name, value_type, meaning, lambda case, _episode: getattr(case, name))
 
 
-def _of_episode(name: str, kind: Type, meaning: str) -> Column:
-    return Column(name, kind, meaning, lambda _case, episode: getattr(episode, name))
+def _of_episode(name: str, value_type: Type, meaning: str) -> Column:
+    return Column(name, value_type, meaning, lambda _case, episode: getattr(episode, name))
 
 
 COLUMNS = (
     _of_result(
         "key",
         "string",
-        "identifies the episode by all that determines it, its weights included",
+        "identifies the episode by everything that determines it, including the weights",
         "full_key",
     ),
     _of_case("policy", "string", "its name in the evaluation"),
-    _of_case("step", "integer", "of training, in a sweep over checkpoints"),
-    _of_result("checkpoint", "string", "that the policy's reset named"),
+    _of_case("step", "integer", "training step, in a sweep over checkpoints"),
+    _of_result("checkpoint", "string", "checkpoint that the policy reported at the reset"),
     _of_result(
-        "weights", "string", "digest of the weights loaded from it; null if the policy states none"
+        "weights", "string", "digest of the weights loaded from it; null if the policy reports none"
     ),
     _of_result(
         "policy_version",
         "integer",
-        "of the weights that computed the last act; 0 is the loaded checkpoint",
+        "version of the weights used for the last action; 0 is the loaded checkpoint",
     ),
     _of_result(
         "policy_fingerprint",
         "string",
-        "of that version, computed by its replica from the weights in memory",
+        "fingerprint of that version, computed by the replica from the weights in memory",
     ),
-    _of_result("first_policy_version", "integer", "of the weights that computed the first act"),
+    _of_result(
+        "first_policy_version", "integer", "version of the weights used for the first action"
+    ),
     _of_case("suite", "string", "its name in the evaluation"),
     _of_case("env", "string", "full name, with the task"),
     Column(
@@ -79,27 +81,25 @@ COLUMNS = (
     Column(
         "seed",
         "integer",
-        "of the env's and the policy's reset",
+        "seed of the env's and the policy's reset",
         lambda _case, episode: episode.result.key.seed,
     ),
     _of_case(
         "settings",
         "json",
-        "all else that decides the episode: options of env and policy, checkpoint, codec",
+        "all other settings of the episode: options of env and policy, checkpoint, codec",
     ),
     _of_case("described", "json", "the env's description of itself: versions, protocol"),
-    _of_case(
-        "code", "json", "of the env: its git commit, and the SHA-256 of the difference from it"
-    ),
+    _of_case("code", "json", "git commit of the env, and the SHA-256 of uncommitted changes"),
     _of_result(
         "status",
         "string",
-        "done; policy_error: the policy failed; infra_failed: it counts in no rate",
+        "done; policy_error: the policy failed; infra_failed: lost, excluded from all rates",
     ),
     Column(
         "counted",
         "boolean",
-        "whether it counts in the rates",
+        "whether the rates include it",
         lambda _case, episode: episode.counts,
     ),
     _of_result("success_once", "boolean", "the task was solved after some step"),
@@ -109,33 +109,41 @@ COLUMNS = (
     _of_result("return", "number", "sum of the rewards", "episode_return"),
     _of_result("ending", "string", "terminated, truncated, policy_done or error"),
     _of_result("instruction", "string", "the task in words"),
-    _of_result("error", "string", "of a status other than done"),
+    _of_result("error", "string", "error, if the status is not done"),
     _of_result(
-        "actions_sha256", "string", "of the actions as executed: (steps, D) little-endian float32"
+        "actions_sha256",
+        "string",
+        "SHA-256 of the executed actions: (steps, D) little-endian float32",
     ),
-    _of_result("seconds", "number", "from reset to the last step"),
-    _of_result("reset_ms", "number", "of the env"),
+    _of_result("seconds", "number", "duration from the reset to the last step"),
+    _of_result("reset_ms", "number", "duration of the env's reset"),
     _of_result("env_step_ms", "number", "median of the env's steps"),
-    _of_result("env_seconds", "number", "of the env's reset and all its steps; null on a robot"),
+    _of_result(
+        "env_seconds", "number", "duration of the env's reset and all its steps; null on a robot"
+    ),
     _of_result("acts", "integer", "answers of the policy; fewer than steps with chunks"),
-    _of_result("policy_ms", "number", "median of the policy's answers, transport included"),
+    _of_result(
+        "policy_ms", "number", "median latency of the policy's answers, including transport"
+    ),
     _of_result("policy_p95_ms", "number", "their 95th percentile"),
     _of_result(
-        "policy_seconds", "number", "time that the policy computed for it: its share of each batch"
+        "policy_seconds",
+        "number",
+        "time that the policy computed for the episode: its share of each batch",
     ),
     _of_result(
-        "latency_ms", "number", "in real-time mode: the env's time that one answer took, median"
+        "latency_ms", "number", "in real-time mode: median latency of an answer, in the env's time"
     ),
     _of_result("ticks_waited", "integer", "steps executed while the policy computed"),
-    _of_result("ticks_held", "integer", "of these, steps with no row of a chunk left"),
-    _of_result("timing_ms", "json", "median times of one answer on the server, by stage"),
+    _of_result("ticks_held", "integer", "of these, steps without a remaining row of a chunk"),
+    _of_result("timing_ms", "json", "median duration of each stage of an answer on the server"),
     _of_result("transport", "string", "transport of the observations"),
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
     _of_episode("run", "integer", "number of the run over the plan, from 1"),
     Column(
         "finished",
         "time",
-        "when it was recorded",
+        "time at which it was recorded",
         lambda _, episode: datetime.fromtimestamp(episode.finished, timezone.utc),
     ),
     _of_episode("videos", "json", "paths in the folder of results"),
@@ -148,15 +156,19 @@ COLUMNS = (
     _of_episode(
         "env_program",
         "string",
-        "digest of the files of the env, its code included; null if installed",
+        "digest of the env's files, including its code; null if installed",
     ),
-    _of_episode("policy_program", "string", "the same of the policy"),
+    _of_episode(
+        "policy_program",
+        "string",
+        "digest of the policy's files, including its code; null if installed",
+    ),
 )
 
 
 def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield every recorded episode as Python values by column; those of type "json" are nested
-    or, if `flat`, text.
+    """Yield a dict for each recorded episode, with a Python value for each column. Values of the
+    type "json" are nested or, if `flat`, text.
     """
     for case in results.cases:
         for episode in case.episodes:
@@ -168,8 +180,10 @@ def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def to_json(results: Results, path: Path) -> int:
-    """Write a list with one object for each episode; times are ISO 8601, in UTC. Returns the
-    number of episodes.
+    """Write a list with one object for each episode; times are ISO 8601, in UTC.
+
+    Returns:
+        The number of episodes.
     """
     require_folder_of(path)
     episodes = list(rows(results))
@@ -180,10 +194,11 @@ def to_json(results: Results, path: Path) -> int:
 
 
 def to_csv(results: Results, path: Path) -> int:
-    """Write a header, and a line for each episode; None is an empty field, a boolean `true` or
-    `false`.
+    """Write a header, and a line for each episode. None is an empty field, and a boolean is `true`
+    or `false`.
 
-    Returns the number of episodes.
+    Returns:
+        The number of episodes.
     """
     require_folder_of(path)
     number = 0

@@ -1,4 +1,4 @@
-"""Plays a recorded episode again, and compares the two."""
+"""Runs a recorded episode again, and compares the replay with the recording."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results
 
-_FEW = 5  # names in a message
-# Largest differences of actions of 1 or less, else relative. At the first step that differs, a
-# batch of another size changes 1e-7 to 1e-5. Later steps amplify that, since each observation
-# depends on the actions before it.
+_FEW = 5  # most names in a message
+# The largest differences that count as rounding: absolute for numbers up to 1, relative for larger
+# ones. At the first step that differs, a batch of another size changes 1e-7 to 1e-5. Later steps
+# amplify that, since each observation depends on the actions before it.
 ROUNDING = 1e-4
 DRIFT = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
 class ActionsDifference:
-    """By how much the actions of two episodes of one length differ: absolutely, or relatively to
-    numbers above 1.
+    """The differences between the actions of two episodes of the same length. They are absolute for
+    numbers up to 1, and relative for larger ones.
     """
 
-    step: int  # the first that differs; the observations until then were the same
-    at_first: float  # the largest of a number of that step's action
-    largest: float  # of all steps
+    step: int  # the first step that differs; the observations until then were the same
+    at_first: float  # the largest difference at that step
+    largest: float  # the largest difference at any step
 
     @property
     def is_rounding(self) -> bool:
-        """Whether another rounding explains the difference, at the first step and as it grew
-        later.
+        """Whether different rounding explains the difference, at the first step and at later
+        ones.
         """
         return self.at_first <= ROUNDING and self.largest <= DRIFT
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """An episode that can be played again."""
+    """An episode that can be replayed."""
 
     results: Results
     case: CaseResults
@@ -55,8 +55,8 @@ class Recorded:
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Return the settings of an evaluation of this episode's case alone, with video and
-        trajectory. The other settings are those of the episode's run.
+        """Return the settings of an evaluation of only this episode's case, with video and
+        trajectory. All other settings are the settings of the episode's run.
 
         Args:
             out: The folder of results.
@@ -67,7 +67,7 @@ class Recorded:
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
-        # Find the case by its settings: `merge` may have taken the suite's name from another
+        # The case is found by its settings, as `merge` may have taken the suite's name from another
         # folder.
         cases = plan_cases(config)
         case = next((case for case in cases if case.fingerprint == self.case.case_id), None)
@@ -83,13 +83,13 @@ class Recorded:
         if case.policy.source is None:
             policy_settings["config"] = {}  # the server has its own configuration
         else:
-            policy_settings["url"] = None  # it was served for that run, and is served again
+            policy_settings["url"] = None  # it was served for that run, and will be served again
         if policy is not None:
             policy_settings.pop("name", None)
             policy_settings |= policy
 
         suite = case.suite.model_dump() | {"envs": [case.env], "worker": case.worker.model_dump()}
-        this_case_alone = {
+        only_this_case = {
             "policies": [policy_settings],
             "suites": [suite],
             "out": out,
@@ -97,15 +97,17 @@ class Recorded:
             "resume": False,
         }
         return EvalConfig.model_validate(
-            config.model_dump() | this_case_alone | {"video": "all", "record": "all", "track": []}
+            config.model_dump() | only_this_case | {"video": "all", "record": "all", "track": []}
         )
 
 
 def find(results: Results, name: str | None) -> Recorded:
-    """Find the episode with the key `name`, or the only one with number N in an env, as "ENV#N".
+    """Find the episode with the key `name`, or "ENV#N" for the only one with the number N in an
+    env.
 
-    Raises `ConfigError` if no name is given, if there is none, if there are several, or if it
-    failed by infrastructure.
+    Raises:
+        ConfigError: `name` is None, or no episode or several episodes have this name, or the
+            episode failed because of infrastructure.
     """
     matching = []
     for case in results.cases:
@@ -142,17 +144,20 @@ def find(results: Results, name: str | None) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """Return the differences of the replay, a sentence each; empty if it is the same episode up to
+    """Return a sentence for each difference of the replay; empty if it is the same episode up to
     rounding.
 
     Actions that differ in their bytes count as the same if the difference `is_rounding` (see
-    `actions_difference`). In that case, returns that differ by no more than `DRIFT` also count as
-    the same. Durations are not compared. Raises `ConfigError` if infrastructure failed the replay.
+    `actions_difference`). In that case, returns that differ by at most `DRIFT` also count as the
+    same. Durations are not compared.
+
+    Raises:
+        ConfigError: The replay failed because of infrastructure.
     """
     [[replay]] = [case.episodes for case in replayed.cases]
     if replay.result.status == "infra_failed":
         raise ConfigError(
-            f"the replay did not end, so that there is nothing to compare: {replay.result.error}"
+            f"expected a finished replay to compare, got one that failed: {replay.result.error}"
         )
 
     recorded_outcome = recorded.episode.result.outcome
@@ -171,7 +176,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
         replayed_value = replayed_outcome[name]
         if recorded_value != replayed_value and name not in ("key", "actions_sha256"):
             differences.append(
-                f"{name}: {recorded_value!r} was recorded, now it is {replayed_value!r}"
+                f"{name}: expected {recorded_value!r}, as recorded, got {replayed_value!r}"
             )
 
     recorded_weights = recorded.episode.result.weights
@@ -186,7 +191,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
 
 
 def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifference | None:
-    """Return by how much the replayed actions differ.
+    """Return the difference between the recorded and the replayed actions.
 
     Returns:
         None if they are equal byte for byte, if their numbers differ, or if a trajectory is
@@ -213,7 +218,7 @@ def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifferen
 
 
 def _trajectory_file(results: Results, episode: Episode) -> Path | None:
-    """Return the file of an episode's trajectory, or None if it was not recorded or is missing."""
+    """Return the file of an episode's trajectory; None if it was not recorded or is missing."""
     if episode.trajectory is None:
         return None
     file = results.file(episode.trajectory)
@@ -244,14 +249,14 @@ def _describe_actions(recorded: Recorded, replayed: Path) -> str:
     for step, (recorded_action, replayed_action) in enumerate(pairs):
         if recorded_action.tobytes() != replayed_action.tobytes():
             return (
-                f"actions: they differ from step {step} on: {_row(recorded_action)} was recorded, "
-                f"now it is {_row(replayed_action)}"
+                f"actions: they differ from step {step}: expected {_row(recorded_action)}, as "
+                f"recorded, got {_row(replayed_action)}"
             )
 
     same = min(len(recorded_actions), len(replayed_actions))
     return (
-        f"actions: {len(recorded_actions)} were recorded, now they are {len(replayed_actions)}; "
-        f"the first {same} are the same"
+        f"actions: expected {len(recorded_actions)}, as recorded, got {len(replayed_actions)}; the "
+        f"first {same} are the same"
     )
 
 

@@ -1,4 +1,4 @@
-"""Runs an evaluation: dispatch, retries, recording, and a clean stop."""
+"""Runs an evaluation: it dispatches episodes, retries them, records results, and stops cleanly."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ from vlagents_ray.policies.base.program import Program
 from vlagents_ray.ray_tools.signals import stop_signals
 
 log = logging.getLogger(__name__)
-POLL_S = 0.25  # time after which a signal is handled
-MARGIN = 1.25  # assumed factor of the next episode over the longest so far
-CLOSING_S = 10.0  # for workers to close their simulators, and for the report to be written
+POLL_S = 0.25  # longest time until a signal is handled, s
+MARGIN = 1.25  # the next episode may take this many times as long as the longest so far
+CLOSING_S = 10.0  # time for workers to close their simulators and to write the report, s
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
@@ -66,8 +66,8 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 class OutOfTime(EvaluationInterrupted):
-    """No further episode would have ended by `end_at`; `resume` continues, as after an
-    interruption.
+    """No further episode would have ended by `end_at`. As after an interruption, `resume` continues
+    the evaluation.
     """
 
     why = "out of time"
@@ -81,36 +81,36 @@ def evaluate(
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
 ) -> Summary:
-    """Play every episode of `config` that has no result yet, and write the results to `config.out`.
+    """Run every episode of `config` that has no result yet, and write the results to `config.out`.
 
-    Episodes run in Ray actors: in the cluster of this process, else in that of `RAY_ADDRESS`, else
-    in a local one for the length of the run. With `config.workers` 0 they run in this process, on
-    this thread, and time limits do not apply; a short evaluation does that by default (see
-    `chosen_workers`). Results are the same. Each worker uses the policy at its `url`, or its own
-    agent from `agent_factory`. Even if an exception is raised, recorded episodes are kept, and
-    summary.json and report.html are written if the disk has room.
+    Episodes run in Ray actors: in the cluster of this process, otherwise in the cluster of
+    `RAY_ADDRESS`, otherwise in a local cluster that ends with the run. If `config.workers` is 0,
+    they run in this process, on this thread, without time limits; a short evaluation does that by
+    default (see `chosen_workers`). The results are the same. Each worker uses the policy at its
+    `url`, or an agent that it makes with `agent_factory`. Even if an exception is raised, recorded
+    episodes are kept, and summary.json and report.html are written if the disk has space.
 
     Args:
         config: The policies, the envs, and the folder of results.
-        agent_factory: Called in each worker to make its agent, in place of a connection to the
-            policy's `url`; or such functions by the names of policies.
+        agent_factory: Called in each worker to make its agent, or a mapping of such functions by
+            the names of policies; by default, an agent is a connection to the policy's `url`.
         progress: Shows the progress (`progress_for`); by default nothing is shown.
-        only: (number, seed) of the one episode of each env that is played; by default all are.
-        end_at: A time in seconds since 1970. No episode begins that would not end by then, by the
-            durations of earlier ones.
+        only: (number, seed) of the single episode of each env that runs; by default all run.
+        end_at: A time in seconds since 1970. No episode begins that would probably end later,
+            judging from the durations of earlier episodes.
 
     Returns:
-        The summary of all results in `config.out`, those of earlier runs included.
+        The summary of all results in `config.out`, including those of earlier runs.
 
     Raises:
         ConfigError: The settings are invalid, or contradict the results in `config.out`.
         ContractMismatch: A policy and an env do not fit together.
         StorageFailed: The disk is full, or cannot be written to.
-        EvaluationInterrupted: Ctrl-C or SIGTERM; its subclass `OutOfTime` if `end_at` left
-            episodes.
-        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a
-            row; `PolicyFailed` with the last error, after as many in a row that an error of a
-            policy ended.
+        EvaluationInterrupted: Ctrl-C or SIGTERM ended the evaluation; its subclass `OutOfTime` if
+            `end_at` did.
+        VLAgentsError: `config.abort_after` episodes in a row were lost to infrastructure; it is the
+            last of these errors. `PolicyFailed` if as many episodes in a row ended with an error of
+            a policy.
     """
     return evaluate_plan(
         resolve(config), agent_factory=agent_factory, progress=progress, only=only, end_at=end_at
@@ -157,7 +157,7 @@ def evaluate_plan(
 
 def conclude(store: Store, state: str) -> Summary:
     """Record the end of the run, and write its summary and its report."""
-    # late: an evaluation begins sooner.
+    # Imported late, so that an evaluation begins sooner.
     from vlagents_ray.evaluate.report.page import FILE, write_report
 
     with storing(store.out):
@@ -169,7 +169,7 @@ def conclude(store: Store, state: str) -> Summary:
 
 
 def check(config: EvalConfig) -> None:
-    """Check the settings as `evaluate` does, before a policy is served for it.
+    """Check the settings as `evaluate` does. It is called before a policy is served for it.
 
     Raises:
         ConfigError: An env or a tracker is not registered or not installed, or the settings
@@ -235,11 +235,13 @@ class _Run(Consumer):
         self._deadline = Deadline(end_at, (episode.result.seconds for episode in results.episodes))
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
-        """Play all queued episodes, until a signal or the deadline ends the run; returns its state
-        and summary.
+        """Run all queued episodes, until a signal or the deadline ends the run.
 
-        The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at
-        once and the job is killed seconds later.
+        The summary is written before the process disconnects from Ray: when Slurm cancels a job,
+        Ray stops responding immediately and the job is killed seconds later.
+
+        Returns:
+            The state of the run, and its summary.
         """
         queue = self._driver.queue
         if not len(queue):
@@ -265,7 +267,7 @@ class _Run(Consumer):
                         if isinstance(error, StorageFailed) or not stop.wait(SIGNAL_S):
                             raise
                         log.info(
-                            "a part of the evaluation that the signal ended, too, reported: %s",
+                            "an error that the signal probably caused: %s",
                             error,
                         )
 
@@ -283,11 +285,11 @@ class _Run(Consumer):
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
             if report.failure is not None:
-                # A terminal or a service manager also signals workers and policies: that costs no
-                # attempt.
+                # A terminal or a service manager also signals workers and policies. Their failures
+                # do not count as attempts.
                 if stop.wait(late_s):
                     continue
-                # One wait is for all failures of a poll: a lost policy fails many episodes at once.
+                # One wait suffices for all failures of a poll, of which a lost policy has many.
                 late_s = 0.0
             with storing(self._plan.out):
                 self._driver.take(job, report)
@@ -331,14 +333,14 @@ class _Run(Consumer):
         """Write the files and the result of an episode, and stop its case if that suffices."""
         if artifacts.not_repeatable is not None:
             log.warning(
-                "%s: nothing of it is recorded, as its actions do not repeat it in the simulator: "
-                "%s; its worker renders further episodes as they are played",
+                "%s: its video is not recorded, as its actions do not repeat it in the "
+                "simulator: %s; its worker renders further episodes while they run",
                 job.key,
                 artifacts.not_repeatable,
             )
 
-        # The files are written first: a crash in between repeats the episode, and they are
-        # overwritten.
+        # The files are written before the result. After a crash in between, the episode is repeated
+        # and overwrites them.
         videos, trajectory = save(self._plan.out, job.case, result, artifacts)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.case, result)
@@ -355,8 +357,10 @@ class _Run(Consumer):
 
 
 class Deadline:
-    """Measures the duration of episodes in the driver, with the start of a simulator and waiting
-    for a policy.
+    """Decides whether there is time for another episode.
+
+    The durations of episodes are measured in the driver, so they include the start of a simulator
+    and the wait for a policy.
     """
 
     def __init__(
@@ -365,13 +369,17 @@ class Deadline:
         known_s: Iterable[float] = (),
         now: Callable[[], float] = time.time,
     ) -> None:
-        """`end_at` is in seconds since 1970, None for no deadline; `known_s` are durations of
-        earlier episodes, s.
+        """Start without running episodes.
+
+        Args:
+            end_at: The deadline in seconds since 1970; None for no deadline.
+            known_s: The durations of earlier episodes, s.
+            now: The clock.
         """
         self._end_at = end_at
         self._longest_s = max(known_s, default=0.0)
         self._now = now
-        self._starts: dict[EpisodeKey, float] = {}  # of the episodes that are being played
+        self._starts: dict[EpisodeKey, float] = {}  # start times of the running episodes
 
     def begin(self, jobs: Iterable[Job]) -> None:
         """Note that a worker begins these episodes."""
@@ -385,12 +393,12 @@ class Deadline:
 
     @property
     def leaves_room(self) -> bool:
-        """Return whether one more episode would end in time."""
+        """Whether one more episode would end in time."""
         return self._left_s() > self._longest_s * MARGIN
 
     @property
     def is_over(self) -> bool:
-        """Return whether running episodes must be abandoned."""
+        """Whether running episodes must be abandoned."""
         return self._left_s() <= 0
 
     def _left_s(self) -> float:

@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.results.summary import Group, summarize
 
 log = logging.getLogger(__name__)
 
-CLOSE_S = 120.0  # for trackers to send what is buffered
+CLOSE_S = 120.0  # time for trackers to send their buffered values, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,11 @@ class TrackedPolicy:
     out: Path
     project: str
     group: str
-    name: str  # of the policy
-    id: str  # is kept when an evaluation resumes this folder
-    # The keys are `evaluation`, its settings; `served`, the policy's identity; and `code`, the git
-    # states.
+    name: str  # the name of the policy
+    id: str  # reused when an evaluation resumes in this folder
+    # The settings (`evaluation`), the policy's identity (`served`) and the git states (`code`).
     config: dict[str, Any]
-    diffs: Sequence[Path]  # of the working trees from their commits
+    diffs: Sequence[Path]  # files with the uncommitted changes of working trees
 
 
 class TrackerRun(Protocol):
@@ -48,30 +47,33 @@ class TrackerRun(Protocol):
     """
 
     def __init__(self, subject: TrackedPolicy) -> None:
-        """Begin the run, or continue the one with this id."""
+        """Begin the run, or continue the run with this id."""
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Log values at a training step; without a step they are the only values of the run."""
+        """Log values at a training step. If `step` is None, they are the only values of the run."""
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Show videos of episodes of the suite and env `label`, the prefix of its values' names."""
+        """Show videos of episodes. `label` consists of suite and env, as the prefix of the names of
+        values.
+        """
 
     def finish(self) -> None:
         """Send the buffered values, and end the run."""
 
 
 class TrackerFeed:
-    """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context
-    manager around a run.
+    """Logs to the trackers on a separate thread, as a tracker may wait for a network. It is a
+    context manager around a run.
 
-    A tracker that fails is not used again in this run: a warning is logged, and the results are
-    unaffected. The results record what was logged, so that a resumed run logs only new values.
+    If a tracker fails, a warning is logged and it is not used again in this run; the results are
+    unaffected. The database records which values were logged, so that a resumed run logs only new
+    ones.
     """
 
     def __init__(self, plan: ResolvedPlan) -> None:
         """Prepare the trackers of a plan."""
         self._plan = plan
-        self._working = list(plan.trackers)  # those that have not failed
+        self._working = list(plan.trackers)  # the trackers that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
         self._updated = threading.Event()
         self._closing = False
@@ -105,7 +107,7 @@ class TrackerFeed:
         while not over:
             self._updated.wait()
             self._updated.clear()
-            # The flag is read before the results, so that all cases complete by then are logged.
+            # The flag is read before the results, so that all complete cases are logged.
             over = self._closing
             for tracker in list(self._working):
                 try:
@@ -125,8 +127,8 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
-        """Log the complete cases, and then the complete policies, unless the tracker already has
-        their numbers.
+        """Log the complete cases, and then the complete policies, except those whose values the
+        tracker already has.
         """
         summary = summarize(results)
         groups = []
@@ -166,7 +168,7 @@ class TrackerFeed:
         return run
 
     def _videos(self, case: CaseResults) -> list[Path]:
-        """Return the first videos of a case that are shown, failures first."""
+        """Return the videos of a case that are logged, failures first."""
         ordered = sorted(case.episodes, key=lambda episode: bool(episode.result.success_once))
         videos = []
         for episode in ordered:
