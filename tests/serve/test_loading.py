@@ -185,7 +185,7 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(
     monkeypatch.setitem(PEER_METHODS, method, asked._replace(call=call))
     one = object.__new__(Bare)
     vars(one).update(
-        _migrator=SimpleNamespace(held=parts[HeldSessions]),
+        _migrator=SimpleNamespace(sessions=parts[HeldSessions]),
         _rebalancer=parts[Rebalancer],
     )
     args = () if asked.part is Rebalancer else (1, "two")

@@ -31,10 +31,10 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import (
     IMPORT_PATH,
     Deployment,
+    declared_contract,
     only_application,
     own_settings,
     read_deployment,
-    stated_contract,
     together,
     with_settings,
 )
@@ -165,7 +165,7 @@ def _require_fit(plan: ResolvedPlan, deployments: Mapping[str, Deployment]) -> N
         plan: The plan.
         deployments: The deployments of its policies, by their names in the plan.
     """
-    policy_contract = cache(lambda policy: stated_contract(deployments[policy]))
+    policy_contract = cache(lambda policy: declared_contract(deployments[policy]))
     for case in plan.cases:
         if case.robot is not None or case.policy.name not in deployments:
             continue

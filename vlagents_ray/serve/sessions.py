@@ -315,8 +315,8 @@ class SessionTable(Generic[M]):
         with self._lock:
             self._left.pop(session_id, None)
 
-    def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
-        """Return the versions of the given sessions that are here and have an episode."""
+    def versions_of(self, session_ids: Iterable[str]) -> dict[str, Version]:
+        """Return the versions of those of the sessions that this table has with an episode."""
         with self._lock:
             sessions = [self._sessions.get(session_id) for session_id in session_ids]
             return {

@@ -142,7 +142,7 @@ class Moves(RuleBasedStateMachine):
         at = self._place(name)
         if at is None:
             return
-        held, other = self.served.migrators[at].held, _Peer(self.served, 1 - at)
+        held, other = self.served.migrators[at].sessions, _Peer(self.served, 1 - at)
         given = held.send_to_peer(self.names[name], [other])
         asyncio.run_coroutine_threadsafe(given, self.served._loop).result(30)
         assert self._place(name) == 1 - at
@@ -272,7 +272,7 @@ def test_sessions_move_with_weights_that_no_other_session_uses(
     alive = served.engines[1].models.own_weights._alive
     assert first not in alive
     if stops:
-        held, other = served.migrators[0].held, _Peer(served, 1)
+        held, other = served.migrators[0].sessions, _Peer(served, 1)
         for name in names:
             asyncio.run_coroutine_threadsafe(held.send_to_peer(name, [other]), served._loop).result(
                 30

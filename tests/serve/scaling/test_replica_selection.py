@@ -139,7 +139,7 @@ def test_clients_that_come_at_once_are_spread_evenly() -> None:
     mine, neighbours = balance(engine, load("b", 3), load("c", 0))
 
     async def place() -> list[str | None]:
-        return await asyncio.gather(*(mine.place(ClientLocation()) for _ in range(15)))
+        return await asyncio.gather(*(mine.redirect(ClientLocation()) for _ in range(15)))
 
     places = asyncio.run(place())
     assert {name: places.count(name) for name in (None, "b", "c")} == {None: 6, "b": 3, "c": 6}
@@ -155,9 +155,9 @@ def test_a_client_that_no_replica_is_near_to_gets_the_least_loaded_of_the_next_p
         ClientLocation(boot_id=machine, must_be_near=True)
         for machine in ("another machine", "none", load("b", 0).boot_id)
     ]
-    assert asyncio.run(mine.place(near[0], near[2])) == "c"
-    assert asyncio.run(mine.place(near[1], near[2])) in ("b", None)
-    assert asyncio.run(mine.place(near[1])) is None
+    assert asyncio.run(mine.redirect(near[0], near[2])) == "c"
+    assert asyncio.run(mine.redirect(near[1], near[2])) in ("b", None)
+    assert asyncio.run(mine.redirect(near[1])) is None
 
 
 def test_a_client_is_expected_until_its_session_is_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,7 +94,7 @@ def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
 
 def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
     """As another replica asks."""
-    work = getattr(HeldSessions, method)(replicas.migrators[number].held, *args)
+    work = getattr(HeldSessions, method)(replicas.migrators[number].sessions, *args)
     return asyncio.run_coroutine_threadsafe(work, replicas._loop).result(20)
 
 
@@ -312,7 +312,7 @@ def test_a_session_whose_export_takes_too_long_stays(
     busy = begin(a, "act", "other", wait=True)
     Counting.entered.get(timeout=20)
     assert isinstance(ask(b, "act").error, UnknownSession)
-    version = a.sessions.held(["robot-1"])["robot-1"]
+    version = a.sessions.versions_of(["robot-1"])["robot-1"]
     assert serve(served, 0, "release", "robot-1", version, "claim") is False
     Counting.gate.set()
     assert busy.get(timeout=20).error is None
@@ -355,7 +355,7 @@ def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(
     served = replicas(2)
     a, b = served.engines
     first = ask(a, "reset", instruction="episode 1").step
-    held, copied, go_on = served.migrators[0].held, threading.Event(), threading.Event()
+    held, copied, go_on = served.migrators[0].sessions, threading.Event(), threading.Event()
     copy = held.copy
 
     async def slow_copy(*args: Any) -> Any:
@@ -437,8 +437,8 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     ask(a, "reset", instruction="episode 1")
     monkeypatch.setattr(session_migration, "_ANSWER_S", 1.0)
     hangs, ends = threading.Event(), threading.Event()
-    old = served.migrators[0].held
-    release, held = old.release, old.held
+    old = served.migrators[0].sessions
+    release, held = old.release, old.versions_of
 
     async def hang() -> None:
         while hangs.is_set() and not ends.is_set():
@@ -454,7 +454,7 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
         return await held(*args)
 
     monkeypatch.setattr(old, "release", released)
-    monkeypatch.setattr(old, "held", answered)
+    monkeypatch.setattr(old, "versions_of", answered)
     try:
         # Upon which a client begins its episode again.
         assert isinstance(ask(b, "act").error, UnknownSession)
@@ -560,13 +560,13 @@ def test_made_up_sessions_keep_no_other_from_moving(
     a, b = served.engines
     ask(a, "reset", instruction="episode 1")
     questions: list[int] = []
-    held = a.sessions.held
+    held = a.sessions.versions_of
 
     def counted(names: Any) -> Any:
         questions.append(len(names))
         return held(names)
 
-    monkeypatch.setattr(a.sessions, "held", counted)
+    monkeypatch.setattr(a.sessions, "versions_of", counted)
     made_up = [Request("act", Obs(), session=f"none-{i}") for i in range(400)]
     answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
     sender = Sender(b, "websocket", "x", connected=True, caller=NoKey.OPEN)

@@ -1,3 +1,1 @@
-"""The start of a server: its Ray, HAProxy, ports and deployment file, and the check that it is
-ready.
-"""
+"""Starts a server: its Ray, HAProxy, ports and deployment file, and the check that it is ready."""

@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
-# The keys of an application that Serve need not apply.
+# The keys of an application that Serve does not have to apply.
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 
 class HttpSettings(BaseModel, extra="allow"):
-    """Where the server listens; Serve's own default is all interfaces."""
+    """The address at which the server listens; Serve's own default is all interfaces."""
 
     host: str = LOOPBACK
     port: int = 8000
 
 
 class Application(BaseModel, extra="allow"):
-    """An application, of this package or another one."""
+    """An application of this package or of another one."""
 
     name: str = "default"
     route_prefix: Annotated[str, Field(pattern="^/")] | None = "/"
@@ -75,8 +75,10 @@ class Deployment(BaseModel, extra="allow"):
         )
 
     def for_serve(self) -> ServeDeploySchema:
-        """Return Serve's schema of the file; raises `ValidationError` if a setting of Serve is
-        wrong.
+        """Return the file as Serve's schema.
+
+        Raises:
+            ValidationError: A setting of Serve is wrong.
         """
         from ray.serve.schema import ServeDeploySchema  # takes a second
 
@@ -84,8 +86,8 @@ class Deployment(BaseModel, extra="allow"):
 
 
 def deployment(policy: str, *, step_follows: bool = False, **args: Any) -> Deployment:
-    """Return the deployment of one policy, as if read from a file by `read_deployment`; `args`
-    are of `ServerArgs`.
+    """Return the deployment of one policy, in the form in which `read_deployment` reads it from a
+    file. `args` are fields of `ServerArgs`.
     """
     app = {
         "name": policy.rpartition(":")[2],
@@ -134,7 +136,7 @@ def read_deployment(
 
 
 def _refuse_unknown(source: str, path: Path) -> None:
-    """Raise `UnknownPolicy` for a source that is no registered name, with the likely mistake."""
+    """Raise an error that names the likely mistake, for a source that is not a registered name."""
     if path.name and path.with_suffix(".py").is_file():
         module = ".".join(path.parts).removesuffix(".py")
         raise UnknownPolicy(
@@ -154,8 +156,8 @@ def _refuse_unknown(source: str, path: Path) -> None:
 
 
 def _settings_of_checkout(policy: str) -> dict[str, Any]:
-    """Return the settings in the deployment file of a checkout that has this policy's weights;
-    empty without one.
+    """Return the settings in the deployment file of the checkout that has this policy's weights;
+    empty if there is no such checkout.
     """
     for folder in (Path(), Path(vlagents_ray.__file__).parents[1]):
         file = folder / "deployments" / f"{policy}.yaml"
@@ -166,9 +168,7 @@ def _settings_of_checkout(policy: str) -> dict[str, Any]:
 
 
 def policy_application(source: str, app: str | None = None) -> Application:
-    """Return one application of a deployment that serves a policy: the one named `app`, or the
-    only one.
-    """
+    """Return the application with the name `app` of a deployment, or its only application."""
     applications = {
         application.name: application for application in our_apps(read_deployment(source))
     }
@@ -193,8 +193,8 @@ def with_gateways_at(config: Deployment, host: str) -> Deployment:
 
 
 def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> Deployment:
-    """Return the deployment of one application, with these settings of a dialect in place of the
-    file's.
+    """Return the deployment of one application with these settings of a dialect, which replace
+    those of the file.
     """
     changed = config.model_copy(deep=True)
     apps = our_apps(changed)
@@ -211,8 +211,10 @@ def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> 
 
 
 def only_application(name: str, config: Deployment) -> Application:
-    """Return the application of a deployment for the policy `name`; raises `ConfigError` if it
-    has several.
+    """Return the only application of a deployment for the policy `name`.
+
+    Raises:
+        ConfigError: The deployment has several applications.
     """
     if len(config.applications) != 1:
         names = [app.name for app in config.applications]
@@ -245,7 +247,7 @@ def with_settings(
     steps: bool = False,
     step_follows: bool = False,
 ) -> Deployment:
-    """Return the deployment, with these settings of its policies in place of the file's.
+    """Return the deployment with these settings of its policies, which replace those of the file.
 
     With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
     """
@@ -263,10 +265,10 @@ def with_settings(
 
 
 def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
-    """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file
-    states another number.
+    """Return the deployment with as many replicas as fit on `gpus`. Each replica uses one GPU,
+    unless the file sets another number.
 
-    A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
+    A policy is not changed if its file sets the number of replicas, autoscaling, or zero GPUs.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -289,7 +291,7 @@ def own_settings(app: Application) -> dict[str, Any]:
     return settings
 
 
-def stated_contract(config: Deployment) -> Contract | None:
+def declared_contract(config: Deployment) -> Contract | None:
     """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
@@ -352,8 +354,8 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
 def _require_policy(
     args: ServerArgs, config: dict[str, Any], *, installed: bool, step_follows: bool
 ) -> None:
-    """Build the policy in its environment, with each kind of settings, and check that the dialects
-    fit its contract.
+    """Build the policy in its environment with the settings of each choice, and check that the
+    dialects fit its contract.
 
     A replica repeats the check.
 
@@ -384,8 +386,8 @@ def _require_policy(
 def _contract(
     args: ServerArgs, checkpoints: Checkpoints, settings: dict[str, Any]
 ) -> Contract | None:
-    """Build the policy in its environment with these settings, and return its contract, if it
-    has one already.
+    """Build the policy in its environment with these settings, and return its contract; None if it
+    has no contract before it is loaded.
     """
     if args.environment.python is not None:
         return check_policy(args.environment, args.policy, settings, args.wrappers)

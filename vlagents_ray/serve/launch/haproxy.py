@@ -1,5 +1,5 @@
-"""HAProxy in front of a server's replicas, with files and ports that no other server on the machine
-uses, and its TLS.
+"""HAProxy in front of a server's replicas, with its TLS and with files and ports that no other
+server on the machine uses.
 
 `python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes
 the script that starts HAProxy on a cluster.
@@ -117,7 +117,7 @@ class Tls:
 
 
 def _refuse_passwords() -> bytes:
-    """Refuse a key with a password, which OpenSSL would otherwise request on the terminal."""
+    """Reject a key with a password, which OpenSSL would otherwise request on the terminal."""
     raise ValueError("the key has a password")
 
 
@@ -169,8 +169,8 @@ class PublicListener:
 
 
 def haproxy_binary() -> str | None:
-    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the
-    PATH; None without any.
+    """Return the path of HAProxy: the one that the user names, otherwise the one of `ray[serve]`'s
+    package, otherwise the one on the PATH; None if there is none.
     """
     binary = Path(os.environ.get(_BINARY) or "/")
     # This process may have inherited the variable, with another server's script as its value.
@@ -243,23 +243,23 @@ def _write_launcher(
     path.
 
     If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of
-    applications (`/-/routes`) is hidden, in each of its encodings. `limit_addresses` is whether
-    Serve's own port bounds the connections of one address; a `PublicListener` in front of that port
-    does it itself.
+    applications (`/-/routes`) is hidden, in each of its encodings. If `limit_addresses` is true,
+    Serve's own port limits the connections of one address; a `PublicListener` in front of that port
+    does so itself.
 
-    No WebSocket is compressed, since a replica would inflate a message before any limit applies. A
-    handshake has no body, as a replica would never answer it.
+    WebSockets are never compressed, since a replica would decompress a message before any limit
+    applies. A handshake with a body is rejected, as a replica would never answer it.
 
     If the server is `alone`, its port is closed until the first replica runs: clients of other
-    systems retry a refused connection, but end at a refused handshake. `open_port` opens it at
-    once.
+    systems retry a refused connection, but give up after a rejected handshake. `open_port` opens it
+    immediately.
 
     If an application has no replica, Serve would hold its requests until there is one. Here they
-    are held briefly, so that an application scaled to zero starts a replica, and then get 503;
+    are held briefly, so that an application scaled to zero starts a replica, and then get 503.
     WebSockets wait.
 
-    A session that has left an unresponsive replica does not return to it by its hash: it stays
-    where it acts until HAProxy is started again with other replicas.
+    The hash does not return a session to an unresponsive replica that it has left. The session
+    stays at its new replica until HAProxy is started again with other replicas.
     """
     refusal = _write_refusal(folder)
 
@@ -320,7 +320,7 @@ def _write_launcher(
 
 
 def _write_refusal(folder: Path) -> Path:
-    """Write the response of HAProxy without a replica, and return its path."""
+    """Write the response that HAProxy sends if there is no replica, and return its path."""
     error = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
     head = (
         f"HTTP/1.1 {error.status} Service Unavailable",
@@ -335,17 +335,15 @@ def _write_refusal(folder: Path) -> Path:
 
 
 def open_port(folder: Path) -> None:
-    """Open the port of a server without replicas from the start, such as one whose applications
-    begin with none.
-    """
+    """Open the port of a server before it has replicas, for applications that begin with none."""
     (folder / _OPEN).touch()
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
     """Wait until HAProxy forwards requests directly to every replica.
 
-    Before that, requests pass through Serve's Python proxy, as would a WebSocket that is opened
-    then, until it ends.
+    Before that, requests pass through Serve's Python proxy, and a WebSocket that is opened then
+    would use that proxy until it ends.
     """
     stats_url = f"http://127.0.0.1:{stats_port}/stats;csv"
     while True:

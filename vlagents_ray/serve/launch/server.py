@@ -1,5 +1,4 @@
-"""Start Ray and Serve here, or use a running cluster, and serve a deployment for the length of a
-context.
+"""Serves a deployment within a context, on a new Ray of this process or on a running cluster.
 
 A server on its own Ray has HAProxy in front of its replicas if the binary is installed, with files
 and ports that no other server on the machine uses. Only HAProxy may listen on the network.
@@ -45,7 +44,7 @@ log = logging.getLogger(__name__)
 _SHUTDOWN_S = 30.0
 # Time for Serve's proxies to listen; on a busy node, several are replaced before one does.
 _PROXIES_S = 180.0
-_LOOK_S = 0.2  # interval at which Serve's proxies, and its end, are checked
+_LOOK_S = 0.2  # interval of the checks of Serve's proxies and of its end, s
 _START_S = 600.0  # time for a policy to become ready on this machine
 _GROW_S = 3600.0  # time for a policy to become ready on a cluster that may add a machine first
 _REMIND_S = 30.0
@@ -54,8 +53,12 @@ _REMIND_S = 30.0
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
     """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
 
-    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts
-    another one: `look_again` returns the refs of the current ones.
+    Serve kills a proxy that does not start within some seconds, for example on a busy node, and
+    starts another one.
+
+    Args:
+        proxies: The refs of the proxies.
+        look_again: Returns the refs of the current proxies.
     """
     deadline = time.monotonic() + _PROXIES_S
     while True:
@@ -73,12 +76,12 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
 
 
 def shut_down(client: Any) -> None:
-    """Shut Serve down like `serve.shutdown`, so that replicas drain and HAProxy stops, but without
-    its error message.
+    """Shut Serve down as `serve.shutdown` does, so that replicas drain and HAProxy stops, but
+    without its error message.
 
     The controller ends itself during this call, which Ray would report as a failed task that will
     be retried. A signal to the whole process group or service, such as systemd's SIGTERM, also ends
-    Ray's head: then Serve can neither answer nor continue, and the reaper ends its processes.
+    Ray's head. Serve can then neither answer nor continue, and the reaper ends its processes.
     """
     # Ray would report a call in progress at the end as a failed task.
     for poll in private.long_polls(client):
@@ -118,8 +121,7 @@ def running_server(
     tls: haproxy.Tls | None = None,
     ingress: bool = True,
 ) -> Iterator[Server]:
-    """Serve `config` for the length of the context, and stop on exit everything that was started
-    here.
+    """Return a context manager that serves `config` and, on exit, stops everything that it started.
 
     Args:
         config: The deployment.
@@ -178,7 +180,7 @@ def running_server(
         stack.push(session.unless_lost(lambda: shut_down(client)))
 
         _require_gpus(config)
-        deploy(client, config, own=is_own_ray, ingress=ingress)
+        deploy(client, config, is_own_ray=is_own_ray, ingress=ingress)
 
         if timeout_s is None:
             timeout_s = _START_S if address is None else _GROW_S
@@ -235,18 +237,24 @@ def _with_access(
     return changed
 
 
-def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None:
+def deploy(client: Any, config: Deployment, *, is_own_ray: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
-    For a deployment file, Serve starts a process that imports the server again. On our `own` Ray,
-    applications of this package are built here instead, unless their file has settings that Serve
-    must apply: such a file may also be deployed again, and Serve would replace all replicas of an
-    application that it did not build. Without `ingress`, replicas end without waiting for requests,
-    since their clients have already ended.
+    For a deployment file, Serve starts a process that imports the server again. On a Ray of this
+    process, applications of this package are built in this process instead, unless their file has
+    settings that Serve must apply. Such a file may also be deployed again, and Serve would replace
+    all replicas of an application that it did not build.
+
+    Args:
+        client: Serve's client.
+        config: The deployment.
+        is_own_ray: Whether this process started the Ray.
+        ingress: Whether the server has an HTTP port. Otherwise replicas end without waiting for
+            requests, since their clients have already ended.
     """
     from vlagents_ray.serve.app import application
 
-    if not config.plain or not own:
+    if not config.plain or not is_own_ray:
         client.deploy_apps(config.for_serve())
         return
 
@@ -260,11 +268,11 @@ def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None
 
 
 def _require_gpus(config: Deployment, local_gpus: float | None = None) -> None:
-    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they
-    would wait forever.
+    """Raise `ConfigError` if the replicas need more GPUs than the Ray of this process has, since
+    they would wait forever.
 
     `local_gpus` is the number of GPUs that a new local Ray would have. An existing cluster may
-    grow: there, missing GPUs cause a warning, which is repeated while the replicas wait.
+    grow. There, missing GPUs only cause a warning, which is repeated while the replicas wait.
     """
     if local_gpus is None and not session.started_here():
         return
@@ -292,8 +300,8 @@ def _missing_gpus(config: Deployment, local_gpus: float | None = None) -> str | 
 
 
 def _begins_with_replicas(app: Application) -> bool:
-    """Return whether an application gets a replica without a request; that of another package
-    may not.
+    """Return whether an application gets a replica before its first request; False if it is of
+    another package and might not.
     """
     return app.import_path == IMPORT_PATH and ServerArgs(**app.args).initial_replicas > 0
 
@@ -396,12 +404,12 @@ def own_ray(
     ingress: bool = True,
     begins_empty: bool = False,
 ) -> Iterator[haproxy.PublicListener | None]:
-    """Run a private Ray for the length of the context, which no other machine and no other user can
-    reach.
+    """Return a context manager that runs a private Ray, which no other machine and no other user
+    can reach.
 
-    The arguments are those of `running_server`; the server will listen at `host` and `port`, once
-    it has a replica, or from the start if an application `begins_empty`, as the first request then
-    starts its replica.
+    The arguments are described at `running_server`. The server will listen at `host` and `port` as
+    soon as it has a replica. If an application `begins_empty`, it listens immediately, as the first
+    request then starts the replica.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
@@ -492,8 +500,8 @@ def wait_until_ready(
         apps: The URL of each application; one without a URL is called through a Serve handle.
         ours: The applications of this package, which report why their policy is not ready yet.
         deadline: End of the waiting, s, of `time.monotonic()`.
-        missing: Describes the resources that the cluster lacks; logged at once, and again every 30
-            s.
+        missing: Describes the resources that the cluster lacks, which is logged immediately, and
+            again every 30 s.
 
     Raises:
         ConfigError: An application failed to deploy, or a policy to load.

@@ -1,11 +1,11 @@
-"""Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix
-`ray_`.
+"""Prometheus metrics of a replica. Ray exports them at the metrics port of the node, with the
+prefix `ray_`.
 
 `Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and
-`policy`. Transport is `shm`, `plasma`, `websocket`, `http` or `handle`, priority is `robot` or
-`simulation`, code is "ok", an error's code or "disconnected". Latencies are those of successful
-requests, stages those of successful acts. Counters are exact; a histogram takes a random sample of
-up to 100 values per second for each kind of request and for the batches.
+`policy`. The tag `transport` is `shm`, `plasma`, `websocket`, `http` or `handle`, `priority` is
+`robot` or `simulation`, and `code` is "ok", an error's code or "disconnected". Latencies are
+measured for successful requests, and stages for successful acts. Counters are exact. Histograms use
+a random sample of up to 100 values per second for each kind of request and for the batches.
 """
 
 from __future__ import annotations
@@ -95,10 +95,10 @@ class Exporter:
             Counter, "padding_rows", "Rows that filled batches up to a fixed size."
         )
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "priority")
-        self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
+        self._sessions = make(Gauge, "sessions", "Sessions of the replica.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
-        # This series and the next are of a GPU in the replica's process; the kinds are allocated,
-        # reserved and free.
+        # This series and the next describe a GPU of the replica's process. The values of the tag
+        # `kind` are allocated, reserved and free.
         self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
         self._gpu_ms = make(
             Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=MS_BOUNDARIES
@@ -117,7 +117,7 @@ class Exporter:
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
         )
         self._keys = keys
-        self._replayed = 0  # exported part of the replays
+        self._replayed = 0  # number of replays that were exported
         self._meter = LoadMeter(engine.queue)
         self._periodic = Periodic(PERIOD_S)
 
@@ -178,24 +178,26 @@ class Exporter:
 
 
 def series(
-    tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any
+    tags: Mapping[str, str], series_class: Any, name: str, text: str, *tag_keys: str, **options: Any
 ) -> Any:
     """Create a series of a replica, with the prefix `vlagents_`.
 
     Args:
         tags: The tags of the replica, such as `PartContext.metric_tags`.
-        kind: The class in `ray.util.metrics`.
-        name: Its name without the prefix.
-        text: Its description.
-        own: The names of its own tags, which each value sets.
-        options: Further arguments of `kind`, such as the `boundaries` of a histogram.
+        series_class: The class in `ray.util.metrics`.
+        name: The name of the series without the prefix.
+        text: The description of the series.
+        tag_keys: The names of further tags, which each value sets.
+        options: Further arguments of `series_class`, such as the `boundaries` of a histogram.
     """
-    created = kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options)
+    created = series_class(
+        f"vlagents_{name}", description=text, tag_keys=(*tags, *tag_keys), **options
+    )
     return created.set_default_tags(dict(tags))
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:
-    """Yield each value, pausing at times, so that the policy thread never waits long for the
+    """Yield each value, with short pauses so that the policy thread never waits long for the
     interpreter's lock.
     """
     until = time.perf_counter() + _SLICE_S

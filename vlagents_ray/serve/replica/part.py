@@ -8,14 +8,14 @@ turns it on:
       policy: pi0
       parts: {latency_log: {folder: runs/latency}}
 
-A part whose registry entry says `by_default` is on where its plug-in is installed; `parts: {NAME:
+A part whose registry entry has `by_default` is on if its plug-in is installed; `parts: {NAME:
 null}` turns it off.
 
-Routes are behind the server's access control: with API keys on, a caller without a key reaches none
-of them but `pages`, which hold no data.
+The server's access control applies to routes: with API keys, a caller without a key can only reach
+`pages`, which contain no data.
 
-A deployment may have several replicas, each with a part of its own. A part calls the same part of
-the others by the methods that it lists in `sibling_methods`:
+A deployment may have several replicas, each with its own instance of the part. A part calls the
+instances in other replicas through the methods that it lists in `sibling_methods`:
 
     class Counter(ReplicaPart):
         sibling_methods = {"count": 3.0}
@@ -26,7 +26,8 @@ the others by the methods that it lists in `sibling_methods`:
             counts = [sibling.call(Counter.count) for sibling in await self.siblings()]
             return self.count() + sum(await asyncio.gather(*counts))
 
-A part that needs the loaded policy overrides `before_ready`, and one with periodic work `run`.
+A part that needs the loaded policy overrides `before_ready`; a part with periodic work overrides
+`run`.
 
 `examples/plugin` has a complete part.
 """
@@ -53,7 +54,7 @@ logger = logging.getLogger(__name__)
 
 
 class OtherReplica(Protocol):
-    """Another replica of the application, `SiblingReplica`, as parts use it."""
+    """The interface of another replica of the application (`SiblingReplica`) for parts."""
 
     name: str  # unique over time
 
@@ -70,7 +71,7 @@ async def no_siblings() -> Sequence[OtherReplica]:
 
 @dataclass(frozen=True, slots=True)
 class PartContext:
-    """What a part may use of its replica."""
+    """The facts and abilities of a replica that its parts may use."""
 
     engine: Engine
     replica: str  # name of the replica, unique over time
@@ -87,7 +88,7 @@ class PartContext:
 
     @property
     def short_name(self) -> str:
-        """The name of the replica without those of its application and deployment, for viewers."""
+        """The name of the replica without its application and deployment, for viewers."""
         return self.replica.rpartition("#")[2]
 
 
@@ -132,14 +133,15 @@ class ReplicaPart:
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     sibling_methods: ClassVar[Mapping[str, float | None]] = {}
-    """The methods that the same part of other replicas, or a process of the cluster, may call, and
-    the time limit of each for an answer, s; None is no limit. A coroutine function runs on the
-    replica's event loop, any other one in a thread."""
+    """The methods that the same part of other replicas, or a process of the cluster, may call, each
+    with the time limit for its answer, s (None: no limit). Coroutine functions run on the replica's
+    event loop, other functions in a thread."""
 
     pages: ClassVar[Mapping[str, str]] = {}
     """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve`
-    prints their addresses. They need no key, which a browser cannot send with them: a page itself
-    must hold no data. Each is a route of the part; the replica does not start otherwise."""
+    prints their addresses. They need no key, as a browser cannot send one with them. Therefore a
+    page itself must contain no data. Each page must be a route of the part; otherwise the replica
+    does not start."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -150,7 +152,7 @@ class ReplicaPart:
         """Open files and start threads."""
 
     async def before_ready(self) -> None:
-        """Prepare what needs the loaded policy, on the replica's event loop.
+        """Do the preparations that need the loaded policy, on the replica's event loop.
 
         Serve sends the replica no requests before this returns.
         """
@@ -158,7 +160,7 @@ class ReplicaPart:
     async def run(self) -> None:
         """Do periodic work on the replica's event loop; the replica cancels it before it closes.
 
-        An error is logged, and ends this work alone.
+        An error is logged, and ends only this work.
         """
 
     def close(self) -> None:
@@ -173,7 +175,7 @@ class ReplicaPart:
         return None
 
     def describe(self) -> Mapping[str, Any]:
-        """Return facts for clients, which the replica's metadata has under `parts` and the name
+        """Return facts for clients. The replica's metadata contains them under `parts` and the name
         of this part.
 
         `GET /docs` lists a part with a `summary` and the path of its `page` or its `paths`, such as
@@ -211,8 +213,8 @@ class ReplicaParts:
             server: All routes of the server, in the order in which they are tried.
 
         Raises:
-            ConfigError: A request for a page would be answered by a route that is not the part's
-                own, which would need no key either.
+            ConfigError: A request for a page would be answered by a route of another part or of
+                the server, which would then need no key either.
         """
         paths = set()
         for name, part in self._parts.items():
@@ -259,7 +261,7 @@ class ReplicaParts:
         return await asyncio.to_thread(call, *args)
 
     async def before_ready(self) -> None:
-        """Let each part prepare what needs the loaded policy, in the order of the parts."""
+        """Await `before_ready` of each part, in the order of the parts."""
         for part in self._parts.values():
             await part.before_ready()
 
@@ -289,8 +291,8 @@ def _route_of(path: str, routes: Sequence[BaseRoute]) -> BaseRoute | None:
 
 
 def open_parts(args: PartArgs, context: PartContext) -> ReplicaParts:
-    """Create and open the parts that are on in a deployment file; if one fails, close those
-    before it.
+    """Create and open the parts that a deployment file turns on. If one fails, the earlier ones are
+    closed.
     """
     parts: dict[str, ReplicaPart] = {}
     with ExitStack() as opened:

@@ -74,8 +74,8 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self, args: dict[str, Any], gateway: Any = None
     ) -> None:
-        """Create the replica with the settings `args`; passing the gateway's handle adds it to
-        the application.
+        """Create the replica with the settings `args`. Serve adds the deployment of the gateway to
+        the application because its handle is an argument.
         """
         self._args = settings = ServerArgs(**args)
         self._gateway = gateway
@@ -84,13 +84,13 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._code, self._program = settings.code()
         self._keys = settings.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, settings.access.insecure)
-        write_audit()  # also without keys, to log the buttons pressed on the live page
+        write_audit()  # even without keys, to log the buttons pressed on the live page
         if self._keys is not None and not settings.access.plain_http:
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
         self._shutdown = Shutdown()
 
-        # The engine, and its parts that are shared with other replicas.
+        # The engine, and its components that communicate with other replicas.
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(
             self._peers.own_name, self._peers.others, asyncio.get_running_loop()
@@ -145,13 +145,14 @@ class PolicyReplica(ClientApi, SiblingApi):
         settings change.
 
         The first call loads the policy, so that Serve reports RUNNING only when it can act, and
-        `serve status` has the reason why it cannot. Later calls return at once and raise nothing,
-        as an error would end the replica: the metadata and the log show the result of the swap.
+        `serve status` has the reason why it cannot. Later calls return immediately and raise no
+        error, as an error would end the replica. The metadata and the log show the result of the
+        swap.
 
         Args:
             settings: The policy's settings that replace those in `args`.
-            rank: Not used, but without this parameter Serve calls no `reconfigure` if there is no
-                `user_config`.
+            rank: Not used, but without this parameter Serve does not call `reconfigure` if there is
+                no `user_config`.
         """
         config = {**self._args.config, **(settings or {})}
         if self._configured:
@@ -206,8 +207,8 @@ class PolicyReplica(ClientApi, SiblingApi):
             await self.close()
 
     async def check_health(self) -> None:
-        """Raise an error if the policy died or hangs; Serve calls this after loading, and then
-        replaces the replica.
+        """Raise an error if the policy died or hangs. Serve calls this periodically once the policy
+        is loaded, and replaces the replica after an error.
         """
         await asyncio.to_thread(self._engine.health.check)
 
@@ -285,11 +286,11 @@ class PolicyReplica(ClientApi, SiblingApi):
             must_be_near: Whether the client's transport reaches no other machine.
         """
         location = ClientLocation(node, boot_id, must_be_near)
-        return await self._rebalancer.place(location) or self._connection_info()
+        return await self._rebalancer.redirect(location) or self._connection_info()
 
     async def call(self, session_id: str, frame: Any) -> bytes:
-        """Execute a frame of requests from inside the cluster, a buffer that is read in place
-        from plasma.
+        """Execute a frame of requests from inside the cluster. The frame is a buffer in plasma,
+        which is read without a copy.
         """
         return await answer_frame(self._engine, self._limits, session_id, frame)
 
@@ -320,7 +321,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         """
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
         locations = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
-        metadata, _ = await self._rebalancer.place(*locations) or (self.metadata(), None)
+        metadata, _ = await self._rebalancer.redirect(*locations) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
 
     # Other replicas: `SiblingApi`.
@@ -341,7 +342,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Call one of `PEER_METHODS` for another replica."""
         part, call, _ = PEER_METHODS[method]
         if part is HeldSessions:
-            return await call(self._migrator.held, *args)
+            return await call(self._migrator.sessions, *args)
         return call(self._rebalancer)
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
@@ -356,10 +357,10 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Drain the engine as soon as Serve stops this replica, if other replicas can take its
         clients.
 
-        The WebSockets end, since Serve waits for them before it calls `close`, and kills the
-        replica after a while. Before that, detect a policy that hangs. A policy that holds the
-        interpreter's lock also blocks this task; in that case a thread that needs no lock writes
-        the stack traces into the log.
+        The WebSockets are closed, since Serve waits for them before it calls `close`, and kills the
+        replica after a while. Until then, this task detects a policy that hangs. A policy that
+        holds the interpreter's lock also blocks this task; in that case a thread that needs no lock
+        writes the stack traces into the log.
         """
         while not replica_is_ending():
             faulthandler.dump_traceback_later(

@@ -12,8 +12,7 @@ Serve averages these values over `look_back_s`. Its controller calls the policy 
 limits the result to the minimum and maximum number of replicas, and applies it after
 `upscale_delay_s` or `downscale_delay_s`.
 
-The controller gets this module pickled by value, so the module imports no other module of this
-package.
+The module is pickled by value for the controller, so it imports no other module of this package.
 """
 
 from __future__ import annotations
@@ -26,15 +25,16 @@ UTILISATION = "utilisation"
 WAITING = "waiting"
 SESSIONS = "sessions"
 
-# Share of each target below which fewer replicas must stay, so that their number does not
-# oscillate.
+# A replica is removed only if the load of the remaining ones stays below this share of each target,
+# so that their number does not oscillate.
 _MARGIN = 0.8
-# Load below which a replica is idle, as a share of a replica: idle ones measure some millionths.
+# Utilisation below which a replica counts as idle; an idle replica measures some millionths.
 _NOTHING = 1e-3
 
 
 class MeasuredLoad:
-    """Requests as many replicas as keep each of them below all targets. Stateless.
+    """Requests the smallest number of replicas that keeps each of them below all targets. It has no
+    state.
 
     Args:
         target_utilisation: Utilisation per replica, in [0, 1].

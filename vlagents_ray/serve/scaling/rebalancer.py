@@ -1,12 +1,12 @@
 """Balances sessions over the replicas: new sessions go to the least loaded one, and surplus
 sessions are moved.
 
-A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica for as
-long as it lasts, so that a new replica would not relieve the others. Therefore each replica
-compares its number of sessions with the others' every few seconds. If it holds clearly more than
-its share, it requests some connections to reconnect. Their sessions then move as they do when a
-replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash decides on
-the replica of HTTP sessions.
+A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica until it
+ends, so a new replica would not relieve the others. Therefore each replica compares its number of
+sessions with the others' every few seconds. If it has clearly more than its share, it asks some
+clients to reconnect. Their sessions then move in the same way as when a replica stops
+(`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash selects the replica of
+HTTP sessions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vlagents_ray.serve.engine.engine import Engine
 _SLACK = 0.25
 logger = logging.getLogger(__name__)
 PERIOD_S = 3.0  # interval of the comparisons
-# Transports whose connections can be requested to reconnect.
+# Transports whose clients can be asked to reconnect.
 MOVABLE = ("shm", "plasma", "websocket", "handle")
 _EXPECTED_S = 3.0  # time after which a client that was sent here is no longer expected
 _SETTLE_S = 6.0  # time for which a connection counts as leaving after a request to reconnect
@@ -43,7 +43,7 @@ class ReplicaLoad:
     """The load of one replica, as that replica reports it."""
 
     replica: str  # name of its actor
-    sessions: int  # sessions held, and those expected from clients that were just sent to it
+    sessions: int  # its sessions, and those expected of clients that were just sent to it
     accepts: bool  # whether its policy is loaded, and it is not stopping
     node: str  # Ray's id of its node
     boot_id: str  # boot id of its machine
@@ -53,7 +53,7 @@ class ReplicaLoad:
 
 @dataclass(frozen=True, slots=True)
 class ClientLocation:
-    """The location of a client, as far as the client states it; replicas nearby are preferred."""
+    """The location of a client, as far as the client reports it. Replicas nearby are preferred."""
 
     node: str = ""  # Ray's id of its node; empty outside the cluster
     boot_id: str = ""  # boot id of its machine; empty if unknown
@@ -67,11 +67,11 @@ class ClientLocation:
 
 
 def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> ReplicaLoad | None:
-    """Return the least loaded replica near to the client, or the least loaded one if that has
+    """Return the least loaded replica near the client, or the least loaded one of all if it has
     clearly fewer sessions.
 
     Among equally loaded replicas, the first is chosen. The result is None if no replica accepts
-    sessions, or if the client needs a near one and there is none.
+    sessions, or if the client needs a near replica and there is none.
     """
     accepting = [load for load in loads if load.accepts]
     near = min(
@@ -129,24 +129,28 @@ class Siblings(Protocol):
     """
 
     async def loads(self) -> list[ReplicaLoad]:
-        """Return the loads of the replicas that answer at once."""
+        """Return the loads of the replicas that answer quickly."""
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to that replica; return its answer for the client, None if it does
-        not answer at once.
+        """Announce a client to that replica. Return its answer for the client; None if it does not
+        answer quickly.
         """
 
 
 class Rebalancer:
-    """Compares the sessions of one replica with those of the others, and places new clients; on
-    one event loop.
+    """Compares the number of sessions of one replica with the other replicas, and chooses replicas
+    for new clients. It runs on one event loop.
     """
 
     def __init__(
         self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]
     ) -> None:
-        """Balance the sessions of `engine` and `siblings`; `own_load` returns the load of this
-        replica for a count.
+        """Balance the sessions of `engine` and `siblings`.
+
+        Args:
+            engine: The engine of this replica.
+            siblings: The other replicas.
+            own_load: Returns the load of this replica with the given number of sessions.
         """
         self._engine, self._siblings, self._own_load = engine, siblings, own_load
         # Times at which clients were sent here that have no session yet.
@@ -155,7 +159,7 @@ class Rebalancer:
         self._sibling_loads: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time of the last request for the others' loads
         self._uneven = False  # whether the last comparison found too many sessions here
-        self._placing = asyncio.Lock()  # clients are placed in turn
+        self._placing = asyncio.Lock()  # held while a replica for a client is chosen
 
     async def run(self) -> None:
         """Compare the numbers of sessions periodically, until cancelled."""
@@ -181,7 +185,7 @@ class Rebalancer:
         self.load()
         self._expected.append(time.monotonic())
 
-    async def place(self, *locations: ClientLocation) -> Any:
+    async def redirect(self, *locations: ClientLocation) -> Any:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
@@ -199,14 +203,16 @@ class Rebalancer:
                     self._sibling_loads = await self._siblings.loads()
                 except Exception:
                     # Errors of the other replicas must not keep a client from connecting.
-                    logger.exception("the other replicas could not be asked")
+                    logger.exception("the loads of the other replicas could not be read")
                     self._sibling_loads = []
                 self._asked_at = time.monotonic()
             chosen = self._choose(locations)
         return None if chosen is None else await self._siblings.announce_client(chosen)
 
     def _choose(self, locations: Sequence[ClientLocation]) -> str | None:
-        """Return the name of the replica for a client, and count it there; None for this one."""
+        """Return the name of the replica for a client, and count the client there; None for this
+        replica.
+        """
         mine = self.load()
         loads = [mine, *self._sibling_loads]
         random.shuffle(loads)  # so that the choice among equally loaded replicas is random
@@ -222,7 +228,7 @@ class Rebalancer:
         return chosen.replica
 
     async def compare(self) -> None:
-        """Compare the loads, and mark connections to drain if there were too many sessions here
+        """Compare the loads, and ask clients to reconnect if this replica had too many sessions
         twice in a row.
         """
         drain_list, sessions = self._engine.drain_list, self._engine.sessions

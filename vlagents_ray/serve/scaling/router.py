@@ -32,8 +32,8 @@ class _NoReplica(BackPressureError):  # type: ignore[misc]
 
 
 class SessionRouter(ConsistentHashRouter):  # type: ignore[misc]
-    """Routes a session's requests to one replica, by the session header; without replicas, the
-    proxy answers 503.
+    """Routes a session's requests to one replica, according to the session header. If there is no
+    replica, the proxy answers 503.
     """
 
     async def _choose_replica_for_request(

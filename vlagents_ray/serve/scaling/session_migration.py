@@ -1,4 +1,4 @@
-"""Migration of sessions, when a replica stops or the load balancer sends a session's request to
+"""Moves sessions when a replica stops, or when the load balancer sends a session's request to
 another replica.
 
 A replica that gets a request for an unknown session searches the other replicas for it, and
@@ -9,7 +9,7 @@ A move never duplicates or loses a session. It has three steps, of which only th
 a session:
 
 1. The new replica creates a copy that cannot act yet.
-2. The old replica releases the session, if that is still in the state of the copy.
+2. The old replica releases the session if its state still equals the copy.
 3. The copy becomes the session.
 
 A late or repeated message finds the session in another state (`Version`), and has no effect. The
@@ -64,7 +64,7 @@ FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the 
 UserOf = Callable[[dict[str, Any], float], Origin | None]
 # Called when a search is over, and its request's `user` of `fetch`.
 _Callback = tuple[Callable[[], None], UserOf]
-# Largest number of concurrent searches of a caller; further requests get `UnknownSession` at once.
+# Largest number of concurrent searches of a caller. Further requests get `UnknownSession`.
 _PENDING = 4096
 # Time limit for another replica's answer; a replica that still loads does not answer.
 _ANSWER_S = 3.0
@@ -74,7 +74,7 @@ _SILENT_S = 3.0  # time without further requests to a silent replica
 _ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
 _LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
 _BATCH_S = 0.002  # time for which searches are collected into one query
-_GATHER_S = 0.02  # time for which begun episodes are collected into one announcement
+_GATHER_S = 0.02  # time for which new episodes are collected into one announcement
 _AT_ONCE = 16  # largest number of sessions that are handed over, or unpickled, at a time
 
 
@@ -99,49 +99,60 @@ class HeldSessions:
         fetch_from: FetchFrom,
         spawn: Spawn,
     ) -> None:
-        """Move the sessions of an engine, of the replica called `name`; `fetch_from` fetches one
-        from a replica.
+        """Hold the sessions of `engine`.
+
+        Args:
+            engine: The engine of the replica.
+            loop: The event loop of the replica.
+            name: The name of the replica.
+            fetch_from: Fetches a session from another replica.
+            spawn: Starts a task on the event loop.
         """
         self._engine, self._loop, self._name = engine, loop, name
         self._fetch_from, self._spawn = fetch_from, spawn
         # Releases that other replicas requested.
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
-        # Sessions being given away, until another replica has them.
+        # Sessions that are being transferred, until another replica has them.
         self._leaving: dict[str, asyncio.Future[None]] = {}
 
     # Operations for other replicas.
 
-    async def held(self, session_ids: Collection[str]) -> dict[str, Version]:
-        """Return the versions of those sessions that are here, or are moving from here to another
-        replica.
+    async def versions_of(self, session_ids: Collection[str]) -> dict[str, Version]:
+        """Return the versions of those of the sessions that this replica has or is transferring to
+        another replica.
 
-        Returns at once. The version of a session that is moving is (0, 0).
+        It never waits. The version of a session that is being transferred is (0, 0).
         """
         leaving = dict.fromkeys(filter(self.is_leaving, session_ids), (0, 0))
-        return leaving | self._engine.sessions.held(session_ids)
+        return leaving | self._engine.sessions.versions_of(session_ids)
 
-    async def copy(self, session_id: str, offered: bool = False) -> dict[str, Any] | None:
-        """Return the session's state after its queued acts; None if it is not here, or cannot be
-        pickled.
+    async def copy(self, session_id: str, is_leaving: bool = False) -> dict[str, Any] | None:
+        """Return the session's state after its queued acts; None if this replica does not have the
+        session, or if it cannot be pickled.
 
-        Its `age_s` is the time from its episode's reset to this call, s. `offered` is for the
-        replica that `send_to_peer` called: there is no time limit, since the session ends with this
-        replica otherwise.
+        The `age_s` of the state is the time from its episode's reset to this call, s.
+
+        Args:
+            session_id: The session.
+            is_leaving: Whether `send_to_peer` has offered the session to the caller. There is then
+                no time limit, since the session would end with this replica.
         """
         asked = self._engine.clock()
-        if session_id in self._leaving and not offered:
+        if session_id in self._leaving and not is_leaving:
             await asyncio.wait([self._leaving[session_id]], timeout=EXPORT_S)
             return None
-        if self.is_leaving(session_id) and not offered:
+        if self.is_leaving(session_id) and not is_leaving:
             await asyncio.sleep(ON_ITS_WAY_S)
-        state = await self._ask(session_id, "export", None if offered else EXPORT_S)
+        state = await self._ask(session_id, "export", None if is_leaving else EXPORT_S)
         if state is not None:
             state["age_s"] = asked - state.pop("began")
         return state
 
     async def weights(self, session_id: str) -> dict[str, Any] | None:
-        """Return the values of the weights with which the session acts; None if it is not here."""
+        """Return the values of the weights with which the session acts; None if this replica does
+        not have the session.
+        """
         sessions = self._engine.sessions.all()
         session = next((session for session in sessions if session.id == session_id), None)
         if session is None or session.model is None or session.weights is None:
@@ -171,8 +182,8 @@ class HeldSessions:
         return True
 
     def is_leaving(self, session_id: str) -> bool:
-        """Return whether the session has just been released here, so that no replica may hold it
-        at the moment.
+        """Return whether this replica has just released the session, so that possibly no replica
+        has it at the moment.
         """
         left = self._loop.time() - self._released.get(session_id, float("-inf"))
         return session_id in self._leaving or (
@@ -183,8 +194,7 @@ class HeldSessions:
         """Fetch a session from the replica called `holder`, which stops.
 
         Returns:
-            Whether the session is here; also True if a newer state of the session has replaced that
-            one.
+            Whether this replica has the session, or a newer state of it.
         """
         if self._engine.draining:
             return False
@@ -203,8 +213,8 @@ class HeldSessions:
     # Operations for this replica.
 
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> None:
-        """Let the first of `peers` that can do so fetch the session, which stays here until that
-        replica has a copy.
+        """Offer the session to `peers` in turn, until one has fetched it. It stays at this replica
+        until the other one has a copy.
         """
         self._leaving[session_id] = self._loop.create_future()
         try:
@@ -226,7 +236,7 @@ class HeldSessions:
             self._leaving.pop(session_id).set_result(None)
 
     async def wait_until_left(self, session_id: str) -> None:
-        """Wait until another replica has the session, if this replica is giving it away."""
+        """Wait until another replica has the session, if this replica is transferring it."""
         if session_id in self._leaving:
             await asyncio.wait([self._leaving[session_id]])
 
@@ -278,9 +288,9 @@ _Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]
 
 
 class SessionMigrator:
-    """Finds sessions at other replicas, takes them over, and gives away those of this replica.
+    """Finds sessions at other replicas and takes them over, and hands over those of this replica.
 
-    `held` answers the calls of the other replicas. All work runs on the replica's event loop;
+    `sessions` answers the calls of the other replicas. All work runs on the replica's event loop;
     `fetch` and `announce` may be called on any thread.
     """
 
@@ -291,10 +301,14 @@ class SessionMigrator:
         loop: asyncio.AbstractEventLoop,
         in_thread: InThread | None = None,
     ) -> None:
-        """Create the migrator of the replica that its peers call `name`.
+        """Create the migrator of a replica.
 
-        `in_thread` runs a slow call (unpickling, loading a checkpoint) on another thread, by
-        default a dedicated one.
+        Args:
+            name: The name of the replica for the other ones.
+            peers: Returns the other replicas.
+            loop: The event loop of the replica.
+            in_thread: Runs a slow call (unpickling, loading a checkpoint) on another thread; by
+                default on a dedicated one.
         """
         self._name, self._peers = name, peers
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
@@ -305,7 +319,7 @@ class SessionMigrator:
         self._callbacks: dict[str, list[_Callback]] = {}  # by session, until its search is over
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
-        # Steps of begun episodes that are not announced yet, by session.
+        # Steps at which episodes began that are not announced yet, by session.
         self._unannounced: dict[str, int] = {}
         self._announced: list[Answer] = []  # delivered once those are announced
         # Number of sessions that are being fetched since other replicas offered them.
@@ -319,7 +333,7 @@ class SessionMigrator:
     def start(self, engine: Engine) -> None:
         """Set the engine whose sessions move; this migrator is its `finder`."""
         self._engine = engine
-        self.held = HeldSessions(engine, self._loop, self._name, self._fetch_from, self._spawn)
+        self.sessions = HeldSessions(engine, self._loop, self._name, self._fetch_from, self._spawn)
 
     def fetch(
         self,
@@ -331,11 +345,13 @@ class SessionMigrator:
         """Fetch a session from another replica.
 
         Args:
-            then: Called once the session is here or was not found.
-            caller: Owner of the search; the number of concurrent searches per caller is limited.
-            user: Returns the origin of a request that can act on a session with that exported
-                state, whose episode began at that time. A session for which all return None is not
-                moved.
+            session_id: The session.
+            then: Called once this replica has the session, or the session was not found.
+            caller: The owner of the search. The number of concurrent searches per caller is
+                limited.
+            user: Returns the origin of a request that can act on a session with the given exported
+                state, whose episode began at the given time; None if the request cannot. A session
+                is not moved if all waiting requests return None.
 
         Returns:
             False if `then` will not be called, since `caller` has too many searches or the migrator
@@ -362,11 +378,14 @@ class SessionMigrator:
         return True
 
     def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their
-        states are older.
+        """Announce to the other replicas that the session has begun an episode at this replica, so
+        that they drop older states.
 
-        The `answer` to the reset is delivered once they have dropped those states, or `_OTHERS_S`
-        have passed.
+        Args:
+            session_id: The session.
+            step: The step at which the episode began.
+            answer: The answer to the reset. It is delivered once the others have dropped those
+                states, or after `_OTHERS_S`.
         """
         with self._lock:
             is_first = not self._unannounced
@@ -383,7 +402,7 @@ class SessionMigrator:
 
         async def transfer(session_id: str, peers: Sequence[Peer]) -> None:
             async with slots:
-                await self.held.send_to_peer(session_id, peers)
+                await self.sessions.send_to_peer(session_id, peers)
 
         tried = set[tuple[str, Version]]()
         while True:
@@ -405,11 +424,11 @@ class SessionMigrator:
                 await asyncio.sleep(ON_ITS_WAY_S)
 
         self._closed = True
-        # Later requests are refused, so that clients send them to the new replica.
+        # Later requests are rejected, so that clients send them to the new replica.
         self._engine.stop(0.0)
 
     async def _responsive_first(self) -> list[Peer]:
-        """Return the other replicas; those that do not answer at once are last."""
+        """Return the other replicas. Those that do not answer quickly are last."""
         answers = {peer: self._spawn(self._query_peer(peer, [])) for peer in await self._peers()}
         if answers:
             await asyncio.wait(answers.values(), timeout=_OTHERS_S)
@@ -452,11 +471,11 @@ class SessionMigrator:
         for attempt in itertools.count():
             if attempt:
                 await asyncio.sleep(ON_ITS_WAY_S)
-                # Another replica has given it to this one.
-                if self._engine.sessions.held([session_id]):
+                # Another replica has handed it over to this one.
+                if self._engine.sessions.versions_of([session_id]):
                     return
 
-            await self.held.wait_until_left(session_id)
+            await self.sessions.wait_until_left(session_id)
             holders = await self._holders(session_id, await self._answers(session_id))
             for version, peer in holders[1:]:
                 newest = holders[0][0]
@@ -467,40 +486,40 @@ class SessionMigrator:
 
             if holders and await self._move(session_id, holders[0][1]):
                 return
-            misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
+            misses = 0 if holders or self.sessions.is_leaving(session_id) else misses + 1
             if misses == 2 or (attempt >= _ATTEMPTS and self._loop.time() > begun + ARRIVAL_S):
                 return
 
     async def _fetch_from(self, session_id: str, holder: str) -> bool:
-        """Fetch a session from the replica called `holder`, which offers it; return whether it
-        is here.
+        """Fetch a session from the replica called `holder`, which offers it; return whether that
+        succeeded.
         """
         self._offered += 1
         try:
             for peer in await self._peers():
                 if peer.name == holder:
-                    return await self._move(session_id, peer, offered=True)
+                    return await self._move(session_id, peer, is_leaving=True)
             return False
         finally:
             self._offered -= 1
 
-    async def _move(self, session_id: str, peer: Peer, *, offered: bool = False) -> bool:
+    async def _move(self, session_id: str, peer: Peer, *, is_leaving: bool = False) -> bool:
         """Move the session from that replica to this one; return False if its state there has
         changed.
 
-        A session that the replica has not `offered` is moved only if one of the waiting requests
-        can act on it.
+        Unless the session `is_leaving` that replica, which stops, it is moved only if one of the
+        waiting requests can act on it.
         """
         asked = self._engine.clock()
-        copying = peer.ask(HeldSessions.copy, session_id, offered)
-        state = await self._answer(copying, None if offered else EXPORT_S)
+        copying = peer.ask(HeldSessions.copy, session_id, is_leaving)
+        state = await self._answer(copying, None if is_leaving else EXPORT_S)
         if state is None:
             return False
-        # The other replica received the call later than `asked`, so that this is no later than the
-        # episode's true begin: an act that arrived after the reset is never taken for one of an
-        # older episode.
+        # The other replica received the call after `asked`, so `began` is not later than the true
+        # begin of the episode. An act that arrived after the reset is therefore never mistaken for
+        # an act of an older episode.
         began = asked - state["age_s"]
-        origin = NOWHERE if offered else self._user_of(session_id, state, began)
+        origin = NOWHERE if is_leaving else self._user_of(session_id, state, began)
         if origin is None:
             return True
 
@@ -510,7 +529,7 @@ class SessionMigrator:
             self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex))
         )
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
-            # The replica hangs: only the copy waits for it.
+            # The replica hangs. Only the copy waits for it.
             if await self._query_peer(peer, []) is None:
                 self._finish(session_id)
         if not release.result():
@@ -528,8 +547,8 @@ class SessionMigrator:
     async def _prepare(
         self, peer: Peer, session_id: str, state: dict[str, Any], began: float, origin: Origin
     ) -> Session[LoadedModel]:
-        """Create the copy of a session; if its version of the weights is not held here, get that
-        from the `peer`.
+        """Create the copy of a session. If this replica does not have its version of the weights,
+        fetch that from the `peer`.
         """
 
         async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
@@ -544,7 +563,7 @@ class SessionMigrator:
             return await prepare()
         async with self._fetching_weights:
             try:
-                return await prepare()  # another session may have brought them meanwhile
+                return await prepare()  # another session may have fetched them meanwhile
             except VersionNotHeld:
                 weights = await self._answer(peer.ask(HeldSessions.weights, session_id), _LOAD_S)
                 if weights is None:
@@ -561,8 +580,8 @@ class SessionMigrator:
         return next((origin for origin in origins if origin is not None), None)
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
-        """Return a future of the other replicas' answers to one query about all sessions that
-        are being searched.
+        """Return a future for the other replicas' answers to the next query, which is about all
+        sessions that are being searched.
         """
         answers: asyncio.Future[_Answers] = self._loop.create_future()
         if not self._next_query:
@@ -587,7 +606,9 @@ class SessionMigrator:
     ) -> dict[str, Version] | None:
         """Return that replica's answer; None if it does not answer in time."""
         try:
-            return await asyncio.wait_for(peer.ask(HeldSessions.held, session_ids), _ANSWER_S)
+            return await asyncio.wait_for(
+                peer.ask(HeldSessions.versions_of, session_ids), _ANSWER_S
+            )
         except Exception as error:  # noqa: BLE001 - an error of one replica must not stop the search at the others
             logger.info("another replica does not answer: %r", error)
             self._silent[peer.name] = self._loop.time() + _SILENT_S
@@ -642,7 +663,7 @@ class SessionMigrator:
             deliver(self._take_unannounced()[1] if announced is None else announced)
 
     def _take_unannounced(self) -> tuple[dict[str, int], list[Answer]]:
-        """Return the steps of the begun episodes, by session, and the answers that are due once
+        """Return the steps at which episodes began, by session, and the answers that are due once
         those are announced.
         """
         with self._lock:
@@ -659,7 +680,7 @@ class SessionMigrator:
             answers may be older.
         """
         later: list[_Callback] = []
-        is_here = bool(self._engine.sessions.held([session_id]))
+        is_here = bool(self._engine.sessions.versions_of([session_id]))
         with self._lock:
             callbacks = self._callbacks.pop(session_id, [])
             if waiting is not None and not (is_here or self._closed):
@@ -672,7 +693,7 @@ class SessionMigrator:
                 then()
             except Exception:
                 logger.exception("session %s: its request could not go on", session_id)
-        # Without any of `waiting`, the later ones have a search of their own already.
+        # If none of `waiting` is left, the later requests already have another search.
         return bool(callbacks and later)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:

@@ -39,17 +39,15 @@ class SiblingApi(Protocol):
     """The actor methods that the replicas of an application call on each other."""
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
-        """Expect a client that another replica sends here; return the metadata for the client,
-        and the actor.
+        """Expect a client that another replica redirects to this one; return the metadata for the
+        client, and the actor.
         """
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, and return its result."""
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
-        """Call a method of a part that its `ReplicaPart.sibling_methods` name, and return its
-        result.
-        """
+        """Call a method in the `ReplicaPart.sibling_methods` of a part, and return its result."""
 
 
 class PeerMethod(NamedTuple):
@@ -63,7 +61,7 @@ class PeerMethod(NamedTuple):
 PEER_METHODS = {
     method.call.__qualname__: method
     for method in (
-        PeerMethod(HeldSessions, HeldSessions.held, None),
+        PeerMethod(HeldSessions, HeldSessions.versions_of, None),
         PeerMethod(HeldSessions, HeldSessions.copy, None),
         PeerMethod(HeldSessions, HeldSessions.weights, _TRANSFER_S),
         PeerMethod(HeldSessions, HeldSessions.release, None),
@@ -78,7 +76,7 @@ for moves of sessions, and for loads.
 
 
 class SiblingReplica(Peer):
-    """Another replica: for moving sessions, and for parts of replicas."""
+    """A proxy of another replica, for moves of sessions and for parts of replicas."""
 
     def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
         """Create the proxy of an actor.
@@ -110,7 +108,7 @@ class SiblingReplica(Peer):
         return await self._ask_actor(PEER_METHODS[name].limit_s, SiblingApi.peer, name, *args)
 
     async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
-        """Call a method of a part there, within a time limit; raises what `call` raises."""
+        """Call a method of a part there, within a time limit; raises the same errors as `call`."""
         return await self._ask_actor(limit_s, SiblingApi.call_part, part, method, *args)
 
     async def _ask_actor(
@@ -144,7 +142,7 @@ class ReplicasInCluster:
     """The replicas of applications; each call looks them up again, since they may change."""
 
     def __init__(self, apps: Collection[str], but: str = "") -> None:
-        """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
+        """Call the replicas of `apps`, except the replica whose full name is `but`."""
         self._apps, self._but = apps, but
         self._initialized: set[str] = set()
 
@@ -191,8 +189,8 @@ class SiblingReplicas(ReplicasInCluster):
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return its answer for the client, or None after
-        0.3 s without one.
+        """Announce a client to another replica; return its answer for the client, or None if there
+        is none within 0.3 s.
         """
         try:
             actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
