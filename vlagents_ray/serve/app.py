@@ -1,4 +1,4 @@
-"""The Serve application of one policy: its deployments, and Serve's options for them.
+"""Builds the Serve application of one policy: its deployments, and Serve's options for them.
 
 Deployment files name it, as `import_path: vlagents_ray.serve.app:build`.
 """
@@ -26,10 +26,10 @@ from vlagents_ray.settings import wrong_settings
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
 _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
-# A replica gets neither these settings nor the dialects of the gateway, and is not restarted when
-# they change.
+# Settings that a replica does not get, so that it is not restarted when they change. It does not
+# get the dialects of the gateway either.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
-# Period at which remaining requests are counted; Serve's: 2 s.
+# Period at which Serve counts the remaining requests of a stopping replica; the default is 2 s.
 _AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}
 
 
@@ -75,9 +75,9 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         "name": POLICY,
         # A replica is replaced after three failed checks.
         "health_check_period_s": 1 if args.environment.process == "child" else 5,
-        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then
-        # only these checks limit the time of a call. Together they take the limit of a call;
-        # Serve's default is 95 s for any policy.
+        # A replica that does not reply is frozen, or its policy holds the interpreter's lock. Then
+        # only these checks limit the time of a call. Together they take as long as the limit of a
+        # call; Serve's default is 95 s for any policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
         # A policy that failed to load once will fail again. While other replicas run, Serve retries
         # forever.
@@ -85,8 +85,8 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         # Settings of the policy that a file has next to `args`; they change without a restart.
         "user_config": {},
         "ray_actor_options": actor_options,
-        # A WebSocket session counts as a request as long as it lasts, so the limit must allow all
-        # sessions and two batches. It is no protection against overload, since requests wait in the
+        # A WebSocket session counts as one request until it ends, so the limit must allow all
+        # sessions and two batches. It does not protect against overload, since requests wait in the
         # batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
@@ -98,7 +98,7 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     else:
         options["num_replicas"] = args.replicas or 1
     if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1":
-        # HAProxy itself hashes the session header (see haproxy.py) and refuses a custom router.
+        # HAProxy itself hashes the session header (see haproxy.py) and rejects a custom router.
         options["request_router_config"] = RequestRouterConfig(
             request_router_class="vlagents_ray.serve.scaling.router.SessionRouter"
         )
@@ -115,14 +115,14 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
 
 
 def _gateway(args: ServerArgs) -> Application:
-    """Build the process of the dialects that have their own port; it runs on the head node,
-    where clients connect.
+    """Build the deployment of the gateway, the process of the dialects that have their own port. It
+    runs on the head node, where clients connect.
     """
     options: dict[str, Any] = {
         "name": GATEWAY,
         "num_replicas": 1,
         "graceful_shutdown_timeout_s": 10,
-        **_AT_ONCE,  # no request of Serve delays its end: clients use its own ports
+        **_AT_ONCE,  # Serve has no requests of its clients, which use its own ports
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }

@@ -22,7 +22,7 @@ from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
 from vlagents_ray.serve.sessions import SessionFinder
 
-_LOOK_S = 0.1  # wait for a checkpoint that another thread loads
+_LOOK_S = 0.1  # period of the checks whether another thread has loaded a checkpoint, s
 
 
 def build_engine(
@@ -37,7 +37,7 @@ def build_engine(
     Args:
         args: The settings, with `environment.process` decided.
         config: The settings of the policy, with those of the deployment's `user_config`.
-        finder: Fetches sessions from other replicas.
+        finder: Fetches sessions from other replicas; None if there are none.
         threaded: Whether a thread of the engine runs the policy.
     """
     settings = EngineSettings(
@@ -60,8 +60,13 @@ def build_engine(
 def policy_metadata(
     args: ServerArgs, engine: Engine, code: GitState | None, program: Program
 ) -> dict[str, Any]:
-    """Return the part of a server's metadata that describes its policy; see `ServerArgs.code`
-    for the last two.
+    """Return the part of a server's metadata that describes its policy.
+
+    Args:
+        args: The settings of the server.
+        engine: The engine of the policy.
+        code: The git state of the policy's code, see `ServerArgs.code`.
+        program: The digests of the policy's files, see `ServerArgs.code`.
     """
     contract, models = engine.contract, engine.models
     return {
@@ -100,8 +105,8 @@ class LocalAgent(Agent):
         contract: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Begin an episode; with `contract`, the policy's is compared with it first, as a server
-        does.
+        """Begin an episode. If there is a `contract`, the policy's contract is first compared with
+        it, as a server does.
         """
         [reply] = self._replies(
             [self], [Request("reset", obs, instruction, kwargs, contract, priority="simulation")]
@@ -111,7 +116,7 @@ class LocalAgent(Agent):
         return reply.info or {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Act in several sessions at once; each result has its `timing` in its info."""
+        """Act in several sessions at once. The info of each result contains its `timing`."""
         requests = [Request("act", observation, priority="simulation") for observation in obs]
         results: list[Act | Exception] = []
         for reply in self._replies(sessions, requests):
@@ -150,18 +155,19 @@ class LocalAgent(Agent):
 
 
 class LocalPolicy(LocalAgent):
-    """A deployment's policy as an agent, of which `sessions` opens more sessions."""
+    """A deployment's policy as an agent. `sessions` opens more sessions of it."""
 
     def __init__(
         self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False
     ) -> None:
-        """Set the policy; `initialize` loads it.
+        """Create the agent; `initialize` loads the policy.
 
         Args:
-            args: The settings; a policy in a Python environment of its own runs in a child process.
+            args: The settings. A policy with its own Python environment runs in a child process.
             config: The settings of the policy, with those of the deployment's `user_config`.
-            threaded: Whether a thread runs the policy, in batches of sessions that act at once. By
-                default the caller's does, so that a debugger stops in it.
+            threaded: Whether a separate thread runs the policy, in batches of sessions that act at
+                the same time. By default, the caller's thread runs it, so that a debugger can stop
+                in it.
         """
         environment = args.environment.model_copy(update={"process": "child"})
         local_args = args.model_copy(update={"environment": environment})

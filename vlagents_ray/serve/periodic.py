@@ -10,8 +10,8 @@ logger = logging.getLogger(__name__)
 
 
 class Periodic:
-    """Calls the added functions every `period_s` seconds; its thread runs while there is a
-    function to call.
+    """Calls the added functions every `period_s` seconds. Its thread runs while there is a function
+    to call.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -22,7 +22,7 @@ class Periodic:
         self._thread: threading.Thread | None = None
 
     def add(self, call: Callable[[], None]) -> None:
-        """Call `call` periodically from now on; its errors are logged, and do not end the calls."""
+        """Begin to call `call` periodically. Its errors are logged, and do not end the calls."""
         with self._lock:
             self._calls = [*self._calls, call]
             if self._thread is None:
@@ -33,7 +33,7 @@ class Periodic:
                 self._thread.start()
 
     def remove(self, call: Callable[[], None]) -> None:
-        """Stop calling `call`; does nothing if it was not added.
+        """Stop calling `call`. This does nothing if it was not added.
 
         If it was the last function, this waits for a running call, unless it is called by the
         periodic thread itself.

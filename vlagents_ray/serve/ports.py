@@ -32,9 +32,9 @@ def free_port(host: str = LOOPBACK) -> int:
 
     The server for an earlier port may not listen yet, so this process claims each port that it
     returns. While this process runs, and until it has returned `_CLAIMS` further ports, the
-    function returns that port to no other process on this machine. Ports are drawn with the
-    system's random generator, so that processes with equal seeds for Python's generator do not draw
-    the same ports.
+    function does not return that port in any other process on this machine. Ports are drawn with
+    the system's random generator, so that processes with equal seeds for Python's generator do not
+    draw the same ports.
     """
     for _ in range(100):
         port = _random.randrange(*_PORTS)
@@ -84,8 +84,8 @@ def keep(*ports: int) -> None:
 
 
 def free_block(size: int) -> int:
-    """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips
-    any others in use.
+    """Return the first of `size` consecutive ports for the replicas. The first port is free, and
+    Ray skips others that are in use.
     """
     for _ in range(100):
         base = _random.randrange(*_BLOCKS, size)

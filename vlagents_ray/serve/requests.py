@@ -69,7 +69,7 @@ class Origin:
     """The origin of one sender's requests."""
 
     transport: str = ""  # transport, for the metrics
-    owner: str = ""  # connection with which its sessions end; empty without one
+    owner: str = ""  # connection with which its sessions end; empty if there is none
     # The sender, whose requests share one turn in the queue; if empty, each session has a turn.
     # It starts with the prefix, so that callers with different keys never share a turn.
     connection: str = ""
@@ -88,7 +88,7 @@ NOWHERE = Origin()
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """The reservation of a reset: an episode of its session, with the server's settings."""
+    """The server's decisions about the episode that a reset begins."""
 
     choice: CheckpointChoice
     kwargs: dict[str, Any]  # the options of the request that are for the policy
@@ -170,8 +170,8 @@ class PendingRequest:
 
     @property
     def latest_begin(self) -> float:
-        """Latest time at which the episode of an act can have begun that its connection has not
-        been in before, s.
+        """Latest time at which the episode of an act can have begun if the connection has not used
+        that episode before, s.
 
         A client that continues an episode has begun it before it opened the connection. A later
         episode may have begun after the client sent the act, since requests of several connections
@@ -303,7 +303,7 @@ class IncomingMessage:
             self.sender.deliver(self)
 
     def refuse(self, error: VLAgentsError, request_id: str = "") -> None:
-        """Answer an unreadable message with one error."""
+        """Answer a message that cannot be read with one error."""
         error.__traceback__ = None  # as in `answer`
         self.replies = [Reply(request_id, error=error)]
 

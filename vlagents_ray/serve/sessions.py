@@ -22,12 +22,12 @@ from vlagents_ray.serve.weights import WeightsVersion
 M = TypeVar("M")  # type of a loaded model
 
 
-# Number of remembered sessions that left, whose older states are refused (some 500 bytes each).
+# Number of remembered sessions that left, whose older states are rejected (about 500 bytes each).
 _REMEMBERED = 4096
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step
 # Maximum number of acts at other replicas that neither the client nor this replica has seen.
 _UNSEEN = 2**20
-_MOST_STEP = 2**62  # steps reported by clients are ignored from here on
+_MOST_STEP = 2**62  # larger steps that clients report are ignored
 
 
 class Outdated(UnknownSession):
@@ -37,9 +37,7 @@ class Outdated(UnknownSession):
 
 
 Version = tuple[int, int]
-"""Version of a session's state: its step, and its number of moves. The greater version is the
-newer one.
-"""
+"""Version of a session's state: its step, and its number of moves. Newer versions are greater."""
 
 
 @dataclass(slots=True)
@@ -102,16 +100,15 @@ class SessionFinder(Protocol):
         caller: str = "",
         user: Callable[[dict[str, Any], float], Origin | None] = ...,
     ) -> bool:
-        """Fetch a session that has a `user`, then call `then`, found or not; return False if
-        `caller` has too many.
+        """Fetch a session if a request can act on it (`user`), then call `then` whether it was
+        found or not; return False if `caller` has too many searches.
         """
 
     def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their
-        states are older.
+        """Announce to the other replicas that the session has begun an episode at this replica at
+        `step`, so that they drop older states.
 
-        The `answer` to the reset is delivered once the others have dropped those states, or a short
-        time has passed.
+        The `answer` to the reset is delivered once they have done so, or after a short time.
         """
 
 
@@ -125,10 +122,10 @@ class SessionModels(Protocol[M]):
 class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
 
-    A session's state never goes back: a replica keeps the newest state that it has seen, and
-    refuses older ones. Steps are drawn from the wall clock, so that a step drawn at another replica
-    exceeds all steps drawn before. A step is always above those that the session's client and this
-    replica have seen, even if the clocks are wrong.
+    A session never returns to an older state: a replica keeps the newest state that it has had, and
+    rejects older ones. Steps are drawn from the wall clock, so that a step drawn at another replica
+    exceeds all steps drawn before. A new step is always above all steps that the session's client
+    and this replica know, even if the clocks are wrong.
     """
 
     def __init__(
@@ -164,7 +161,11 @@ class SessionTable(Generic[M]):
         return session_id in self._sessions
 
     def get(self, session_id: str) -> Session[M]:
-        """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
+        """Return the session, and mark it used.
+
+        Raises:
+            UnknownSession: The table does not have the session.
+        """
         session = self._sessions.get(session_id)
         if session is None:
             raise UnknownSession(
@@ -221,8 +222,8 @@ class SessionTable(Generic[M]):
             session.resetting = reset
 
     def undo(self, session_id: str, first: int) -> None:
-        """Undo `begin` for a reset that was cancelled: the current episode continues, here or at
-        another replica.
+        """Undo `begin` for a reset that was cancelled. The current episode continues, at this
+        replica or at another one.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -234,8 +235,8 @@ class SessionTable(Generic[M]):
                 self._end(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
-        """Return whether the session has passed an episode that was to begin at that step, here
-        or elsewhere.
+        """Return whether the session is past an episode that was to begin at that step, at this
+        replica or at another one.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -244,8 +245,8 @@ class SessionTable(Generic[M]):
             )
 
     def require_room(self, session_id: str) -> None:
-        """Raise `PolicyUnavailable` if the session is not here and the replica has reached its
-        limit of sessions.
+        """Raise `PolicyUnavailable` if the session is new and the replica has reached its limit of
+        sessions.
         """
         with self._lock:
             if session_id not in self._sessions and len(self._sessions) >= self.limit:
@@ -257,7 +258,7 @@ class SessionTable(Generic[M]):
         return PolicyUnavailable(f"this replica holds {self.limit} sessions, its limit; {cure}")
 
     def enter(self, arriving: Session[M]) -> None:
-        """Add a session from another replica, in place of an older state of the session.
+        """Add a session from another replica, which replaces an older state of the session.
 
         Its old replica has already released it, so it is added even if the table has become full.
 
@@ -309,9 +310,7 @@ class SessionTable(Generic[M]):
             self._expected = [session for session in self._expected if session is not arriving]
 
     def free(self, session_id: str) -> None:
-        """Forget the states of the session that were here, so that another session may have its
-        id.
-        """
+        """Forget the states of the session, so that another session may have its id."""
         with self._lock:
             self._left.pop(session_id, None)
 
@@ -331,8 +330,8 @@ class SessionTable(Generic[M]):
             return {session.id: session.version for session in self._sessions.values()}
 
     def drop_older(self, steps: Mapping[str, int]) -> None:
-        """Close sessions with states before `steps`, at which other replicas began episodes, and
-        refuse such states.
+        """Close the sessions whose states are older than `steps`, at which other replicas began
+        episodes, and reject such states.
         """
         with self._lock:
             for session_id, step in steps.items():
@@ -368,8 +367,8 @@ class SessionTable(Generic[M]):
             self._forget(session_id)
 
     def release(self, session_id: str, version: Version) -> bool:
-        """Release the session to another replica, which has a copy of that version; False if its
-        version differs.
+        """Release the session to another replica, which has a copy of that version; return False if
+        the session's version differs.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -395,7 +394,7 @@ class SessionTable(Generic[M]):
                 self._forget(session.id)
 
     def all(self) -> list[Session[M]]:
-        """Return all sessions, without a lock, so that callers may hold theirs."""
+        """Return all sessions, without a lock, so that callers may hold their locks."""
         return list(self._sessions.values())
 
     def by_transport(self) -> dict[str, int]:
@@ -449,9 +448,9 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections to move to another replica: all of them if this replica drains, otherwise
-    those that others have room for, each of which gets the request in its next reply, once.
-    Thread-safe.
+    """The connections that are to move to another replica: all of them if this replica drains,
+    otherwise those for which other replicas have room. The next reply over each of the latter asks
+    the client to reconnect, once. Thread-safe.
 
     `vlagents_ray.serve.scaling.rebalancer` selects the latter.
     """
@@ -468,15 +467,15 @@ class DrainList:
         self.draining = True
 
     def mark(self, connections: set[str]) -> None:
-        """Replace the set of connections requested to reconnect."""
+        """Replace the set of connections whose clients are asked to reconnect."""
         with self._lock:
             self._marked = connections
 
     def ask(self, connection: str) -> bool:
-        """Return whether the current reply must request the reconnection of that connection alone;
+        """Return whether the current reply must ask for the reconnection of this connection alone;
         if so, record that.
         """
-        if not self._marked:  # nearly always, so that an answer takes no lock
+        if not self._marked:  # nearly always the case; then no lock is taken
             return False
         with self._lock:
             if connection not in self._marked:
@@ -486,13 +485,13 @@ class DrainList:
             return True
 
     def asked_within(self, seconds: float) -> set[str]:
-        """Return the connections that were requested to reconnect within the last `seconds`."""
+        """Return the connections whose clients were asked to reconnect in the last `seconds`."""
         since = time.monotonic() - seconds
         with self._lock:
             return {connection for connection, when in self._asked.items() if when >= since}
 
     def forget_older(self, seconds: float) -> None:
-        """Forget the connections that were requested to reconnect more than `seconds` ago."""
+        """Forget the connections whose clients were asked to reconnect more than `seconds` ago."""
         since = time.monotonic() - seconds
         with self._lock:
             self._asked = {

@@ -12,15 +12,15 @@ class TokenBucket:
         Args:
             rate: Tokens that are added each second.
             now: The present time, s.
-            capacity: Maximum number of tokens; by default those of one second, and at least one.
+            capacity: Maximum number of tokens; by default the tokens of one second, at least one.
         """
         self.rate = rate
         self._tokens = self._capacity = max(1.0, rate) if capacity is None else capacity
         self._refilled = now
 
     def take(self, now: float, number: int = 1) -> float:
-        """Take `number` tokens and return 0 if there are so many; otherwise return the time until
-        there are, s.
+        """Take `number` tokens and return 0 if there are enough; otherwise return the time until
+        there are enough, s.
 
         The number must not exceed the capacity.
         """

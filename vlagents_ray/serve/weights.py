@@ -1,16 +1,15 @@
-"""The versions of one model's weights: which are held, which one the agent has, and which one each
-session acts with.
+"""The versions of one model's weights, and the version with which each session acts.
 
-Version 0 is the loaded checkpoint. A push stages a version, which is checked and held but not used,
-and commits it when all replicas hold it; a part of the replica coordinates that (`serve.replica`).
-A commit copies and loads nothing: before a batch, a reset or an observation, the policy's thread
-loads the sessions' version into the agent (`ModelWeights.use`), which takes no time if the agent
-has it already. A version is freed when no session acts with it and it is neither the newest nor the
-pinned one.
+Version 0 is the loaded checkpoint. A push stages a version, which is checked and stored but not
+used, and commits it when all replicas have it; a part of the replica coordinates that
+(`serve.replica`). A commit copies and loads nothing: before a batch, a reset or an observation, the
+policy's thread loads the sessions' version into the agent (`ModelWeights.use`), which takes no time
+if the agent already has it. A version is freed when no session acts with it and it is neither the
+newest nor the pinned one.
 
-On a GPU, the agent's version is that in its parameters, where another one takes its place. Two
-versions share its memory, the agent's and a staged one; those with which no session acts are in the
-memory of the host meanwhile.
+On a GPU, the agent's version is in its parameters, where loading another version replaces it. The
+GPU's memory holds at most two versions, the agent's and a staged one. Versions with which no
+session acts are moved to the memory of the host.
 """
 
 from __future__ import annotations
@@ -66,11 +65,11 @@ class PushOptions:
     """The options of a push."""
 
     mode: PushMode = "next_episode"  # when sessions change
-    partial: bool = False  # whether names may be missing, whose values are kept
+    partial: bool = False  # whether names may be missing; their values are then kept
     allow_same: bool = False  # whether all values may equal those of the newest version
     # Whether sessions that do not follow the newest version also get it, at their next reset.
     pin: bool = False
-    # Its number, such as the training step; by default the newest one's + 1.
+    # The number of the version, such as the training step; by default, one above the newest.
     version: int | None = None
 
     def __post_init__(self) -> None:
@@ -83,7 +82,7 @@ class PushOptions:
 
 
 class VersionNotHeld(UnknownSession):
-    """Raised if a session acts with a version of the weights that the replica does not hold."""
+    """Raised if a session acts with a version of the weights that the replica does not have."""
 
 
 class WeightsVersion:
@@ -94,19 +93,19 @@ class WeightsVersion:
     def __init__(self, number: int, digest: str, values: dict[str, Any] | None) -> None:
         self.number = number
         self.fingerprint = digest
-        self.values = values  # by name; None if the agent alone holds them
+        self.values = values  # by name; None if only the agent has them
         self.on_host = False  # whether they were moved out of the GPU's memory
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """A step between acting and acting again."""
+    """A step of the sleep of a policy, during which it does not act."""
 
     step: RestStep
     # Whether "sleep" moves weights to the memory of the host, and frees CUDA graphs.
     offload: bool = True
-    # Time after which a replica wakes by itself, since its learner may have died, s.
+    # Time after which a replica wakes without its learner, which may have died, s.
     at_most_s: float = 600.0
 
     def __post_init__(self) -> None:
@@ -149,7 +148,7 @@ class ModelWeights:
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
         self._device: Any = "cpu"  # the GPU of its values, if they are on one
-        # The agent's, if another version takes their place in memory.
+        # The agent's values, if other versions are loaded into the same memory.
         self._live_values: Mapping[str, Any] = {}
         self._lock = threading.Lock()
         try:
@@ -164,14 +163,10 @@ class ModelWeights:
             policy: Any = agent
             while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            own, copied = (
-                type(policy).load_parameters is not Agent.load_parameters,
-                trainable.is_copied(values or {}),
-            )
-            self._in_place, self._swaps = (
-                own or copied,
-                copied and not own and trainable.are_apart(values or {}),
-            )
+            loads_itself = type(policy).load_parameters is not Agent.load_parameters
+            is_copied = trainable.is_copied(values or {})
+            self._in_place = loads_itself or is_copied
+            self._swaps = is_copied and not loads_itself and trainable.are_apart(values or {})
             first = WeightsVersion(
                 0, trainable.fingerprint(values or {}), None if self._in_place else values
             )
@@ -194,10 +189,10 @@ class ModelWeights:
         self._live: WeightsVersion | None = first
         self._alive = WeakValueDictionary({0: first})
         self._asleep = False
-        # Memory of the host with the values of the GPU, while it sleeps.
+        # Copies of the GPU's values in the memory of the host, while the policy sleeps.
         self._moved: list[tuple[Any, Any]] = []
-        # Is increased when another version begins to become the agent's, and when it has: odd in
-        # between.
+        # A counter that is increased before and after another version is loaded into the agent, so
+        # it is odd in between.
         self._switches = 0
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
@@ -219,7 +214,7 @@ class ModelWeights:
         mode "keep".
 
         Raises:
-            VersionNotHeld: The version is not held here; see `restore`.
+            VersionNotHeld: This replica does not have the version; see `restore`.
         """
         with self._lock:
             if follows and number < self.kept:
@@ -232,7 +227,7 @@ class ModelWeights:
         return version
 
     def restore(self, number: int, digest: str, values: Mapping[str, Any]) -> WeightsVersion:
-        """Hold a version again that was freed here, or never pushed to this replica, as long as a
+        """Add a version that was freed, or never pushed to this replica. It is kept as long as a
         session uses it.
 
         Args:
@@ -253,8 +248,8 @@ class ModelWeights:
             return self._alive.setdefault(number, restored)
 
     def catch_up(self, session: FollowingSession) -> None:
-        """Change a session that was not in the table of sessions to the last version pushed with
-        the mode "keep".
+        """Change a session, which was not in the table of sessions at the time, to the last version
+        that was pushed with the mode "keep".
         """
         with self._lock:
             acts_with = session.weights
@@ -264,8 +259,8 @@ class ModelWeights:
     def use(self, version: WeightsVersion) -> None:
         """Load a version into the agent. Called with `busy` held, on the policy's thread.
 
-        The memory of freed versions stays torch's, for the next push: its return would wait for the
-        GPU.
+        The memory of freed versions is not returned but stays in torch's cache for the next push,
+        since returning it would wait for the GPU.
         """
         if version is self._live:
             return
@@ -311,17 +306,17 @@ class ModelWeights:
         """
         if self._refusal is not None:
             raise self._refusal
-        held = self._held(self.newest)
+        layout = self._layout(self.newest)
         # Each entry has its name, a type, numbers of up to 15 digits, and at most 60 further
         # characters of JSON.
-        most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
+        most = 4096 + 2 * sum(len(name) + 90 + 16 * len(layout[name].shape) for name in layout)
         if len(header) > most:
             raise MessageTooLarge(
-                f"weights: expected a header of at most {most} bytes for the policy's {len(held)} "
-                f"names, got {len(header)}"
+                f"weights: expected a header of at most {most} bytes for the policy's "
+                f"{len(layout)} names, got {len(header)}"
             )
         announced = read_header(header)
-        trainable.require_fit(held, announced, partial=options.partial)
+        trainable.require_fit(layout, announced, partial=options.partial)
         return announced
 
     def stage(
@@ -331,7 +326,7 @@ class ModelWeights:
         options: PushOptions,
         sessions: Callable[[], Iterable[FollowingSession]] = tuple,
     ) -> str:
-        """Check a new version and hold it without using it; return its fingerprint.
+        """Check and store a new version without using it; return its fingerprint.
 
         It is dropped unless it is committed within a minute, since its learner may have died.
 
@@ -387,31 +382,33 @@ class ModelWeights:
         pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
     ) -> WeightsVersion:
-        """Return a version of pushed values, which have been checked; missing names have the
-        values of the newest.
+        """Return a version of pushed values, which have been checked. Names that are missing have
+        the values of the newest version.
         """
         with (
             self._uncaptured(),
             opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named,
         ):
-            new = trainable.accepted(self._held(newest), named, partial=options.partial)
+            new = trainable.accepted(self._layout(newest), named, partial=options.partial)
 
-            def completed(held: Mapping[str, Any]) -> dict[str, Any]:
+            def completed(current: Mapping[str, Any]) -> dict[str, Any]:
                 return trainable.completed(
-                    held, new, allow_same=options.allow_same, in_place=self._in_place
+                    current, new, allow_same=options.allow_same, in_place=self._in_place
                 )
 
             reads_none = options.allow_same and not options.partial
-            values = completed(self._held(newest)) if reads_none else self._read(newest, completed)
+            values = (
+                completed(self._layout(newest)) if reads_none else self._read(newest, completed)
+            )
             return WeightsVersion(number, trainable.fingerprint(values), values)
 
     def admit(self, version: WeightsVersion) -> None:
-        """Let `find` return a version while it is held."""
+        """Let `find` return a version as long as it is in use."""
         self._alive[version.number] = version
 
     def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
-        """Act with a version in all sessions and coming episodes, in a child process, whose
-        replica decides on it.
+        """Act with a version in all sessions and later episodes. It is called in a child process,
+        whose replica chooses the version.
         """
         with self._lock:
             self.newest = self.pinned = version
@@ -422,7 +419,7 @@ class ModelWeights:
     def commit(
         self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]
     ) -> None:
-        """Use a staged version from now on. A repeated commit of the newest version does nothing.
+        """Use a staged version. A repeated commit of the newest version does nothing.
 
         Args:
             number: The number of the version.
@@ -472,10 +469,10 @@ class ModelWeights:
             return {name: trainable.portable(value) for name, value in values.items()}
 
     def sleep(self, *, offload: bool) -> None:
-        """Free the memory that torch has cached and, with `offload`, that of all versions and
-        graphs, until `wake`.
+        """Free the memory in torch's cache until `wake`. With `offload`, also free the memory of
+        all versions and graphs.
 
-        The caller keeps the agent from acting meanwhile.
+        The caller must keep the agent from acting until then.
 
         Raises:
             NotTrainable: The agent names no parameters, which `offload` would move.
@@ -486,10 +483,10 @@ class ModelWeights:
             if offload:
                 self._asleep = True
                 self._agent.sleep()
-                held = [
+                values = [
                     version.values for version in self._alive.values() if version.values is not None
                 ]
-                trainable.to_host([self._agent.parameters(), *held], self._moved)
+                trainable.to_host([self._agent.parameters(), *values], self._moved)
         free_memory()
 
     def wake(self) -> None:
@@ -516,8 +513,11 @@ class ModelWeights:
 
     @contextmanager
     def _uncaptured(self) -> Iterator[None]:
-        """Work on versions beside the acts, but not beside a capture; raises `PolicyUnavailable`
-        while they sleep.
+        """Return a context manager for work on versions, which may run during acts, but not during
+        the capture of a CUDA graph.
+
+        Raises:
+            PolicyUnavailable: The policy sleeps.
         """
         with CAPTURES.pushes:
             if self._asleep:
@@ -534,16 +534,16 @@ class ModelWeights:
             self._timer.cancel()
             self._timer = None
 
-    def _held(self, version: WeightsVersion) -> Mapping[str, Any]:
-        """Return references to values with the types, shapes and devices of the version's,
-        without waiting for acts.
+    def _layout(self, version: WeightsVersion) -> Mapping[str, Any]:
+        """Return references to values that have the types, shapes and devices of the version's
+        values, without waiting for acts.
         """
         values = version.values
         return self._parameters() if values is None or version.on_host else values
 
     def _parameters(self) -> Mapping[str, Any]:
-        """Return the agent's own values. Lazy layers have none before the first act, which has
-        their sizes.
+        """Return the agent's values. Lazy layers have none before the first act, which sets their
+        sizes.
         """
         if not self._live_values:
             with self._busy:
@@ -553,8 +553,8 @@ class ModelWeights:
     def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:
         """Return the result of a function of a version's values, which may be the agent's.
 
-        It does not wait for acts. If another version becomes the agent's meanwhile, in the same
-        memory, the function is called once more, between two acts.
+        It does not wait for acts. If another version is loaded into the same memory meanwhile, the
+        function is called once more, between two acts.
         """
 
         def result() -> T:
@@ -568,13 +568,13 @@ class ModelWeights:
         switches = self._switches
         if switches % 2 == 0:
             try:
-                found = result()
+                value = result()
             except VLAgentsError:
                 if self._switches == switches:
                     raise
             else:
                 if self._switches == switches:
-                    return found
+                    return value
         with self._busy:
             return result()
 
@@ -582,8 +582,8 @@ class ModelWeights:
         return trainable.mapped(trainable.own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
-        """Move the pinned and the newest version out of the GPU's memory, unless it is the
-        agent's or one of `used`.
+        """Move the pinned and the newest version out of the GPU's memory, unless the agent has it
+        or it is in `used`.
         """
         for version in {self.pinned, self.newest} - used:
             switches, values = self._switches, version.values
@@ -596,7 +596,7 @@ class ModelWeights:
 
 
 class HoldsWeights(ABC):
-    """An agent that holds the versions of its weights itself, such as one in another process."""
+    """An agent that manages the versions of its weights itself, for example in another process."""
 
     @abstractmethod
     def model_weights(
@@ -612,8 +612,8 @@ class NewestVersion:
     number: int
     # Equal in replicas that loaded the same checkpoint with the same settings.
     model: tuple[str, str]
-    # UUIDs of the GPUs whose memory it can copy: that of its weights, and its peers; none if there
-    # is no single GPU
+    # UUIDs of the GPUs whose memory it can copy: the GPU of its weights and the peers of that GPU;
+    # empty if the weights are not on a single GPU
     gpus: tuple[str, ...] = ()
 
 
@@ -660,43 +660,42 @@ class WeightUpdates:
         # Held while the policy's thread runs a batch, and while the policy sleeps.
         self.acting_lock = threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
-        # Those of the policy that sleeps, for which `acting` is held.
+        # The weights of the policy that sleeps; `acting_lock` is then held.
         self._asleep: ModelWeights | None = None
         self._alarm: threading.Timer | None = None
-        # In a child process: those that its replica refers to.
-        self._given: dict[int, WeightsVersion] = {}
+        # In a child process: the versions to which its replica refers, by their names.
+        self._by_name: dict[int, WeightsVersion] = {}
 
-    def own(self) -> ModelWeights:
+    def current(self) -> ModelWeights:
         """Return the weights; raise `PolicyUnavailable` while the policy loads."""
         return self._models.own_weights
 
     def stage(
         self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> str:
-        """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage`
+        """Check and store a new version, and return its fingerprint, as `ModelWeights.stage`
         does.
         """
-        return self.own().stage(number, pushed, options, self._sessions.all)
+        return self.current().stage(number, pushed, options, self._sessions.all)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""
-        self.own().commit(number, options, self._sessions.all)
+        self.current().commit(number, options, self._sessions.all)
 
-    def held(self) -> list[HeldVersion]:
-        """Return the pinned and the newest version, the older one first, except for the
-        checkpoint itself.
-        """
-        own = self.own()
-        pinned, newest = own.pinned, own.newest
+    def pushed_versions(self) -> list[HeldVersion]:
+        """Return the pinned and the newest version, the older one first, if they were pushed."""
+        weights = self.current()
+        pinned, newest = weights.pinned, weights.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
-        return [
-            HeldVersion(one.number, one is pinned, own.kept, own.portable_values(one))
-            for one in pushed
-        ]
+        versions = []
+        for version in pushed:
+            values = weights.portable_values(version)
+            versions.append(HeldVersion(version.number, version is pinned, weights.kept, values))
+        return versions
 
     def drop(self, number: int) -> None:
         """Drop the staged version."""
-        self.own().drop(number)
+        self.current().drop(number)
 
     def rest(self, rest: Rest) -> None:
         """Make the policy sleep after the running batch, restore its memory, or let it act again.
@@ -709,10 +708,10 @@ class WeightUpdates:
             Overloaded: It sleeps already.
             NotTrainable: See `ModelWeights.sleep`.
         """
-        own = self.own()
+        weights = self.current()
         with self._resting:
             if rest.step == "sleep":
-                self._sleep(own, rest)
+                self._sleep(weights, rest)
             elif self._asleep is not None:
                 self._asleep.wake()
                 if rest.step == "wake":
@@ -721,19 +720,19 @@ class WeightUpdates:
                     if self._alarm is not None:
                         self._alarm.cancel()
 
-    def _sleep(self, own: ModelWeights, rest: Rest) -> None:
+    def _sleep(self, weights: ModelWeights, rest: Rest) -> None:
         if self._asleep is not None:
             raise Overloaded("sleep: the policy sleeps already; call wake first")
         self.acting_lock.acquire()
         try:
-            own.sleep(offload=rest.offload)
+            weights.sleep(offload=rest.offload)
         except BaseException:
             try:
-                own.wake()
+                weights.wake()
             finally:
                 self.acting_lock.release()
             raise
-        self._asleep = own
+        self._asleep = weights
         self._set_alarm(rest.at_most_s)
 
     def _set_alarm(self, seconds: float) -> None:
@@ -754,8 +753,9 @@ class WeightUpdates:
                 logger.exception("the policy does not wake; tried again in %g s", seconds)
                 self._set_alarm(seconds)
 
-    # In a child process: its replica decides which version acts, and when one is dropped. It names
-    # version 0 as 0, and others by numbers of its own, as a version may be pushed twice.
+    # The following methods run in a child process. Its replica decides which version acts, and when
+    # one is dropped. The replica gives version 0 the name 0, and other versions numbers as names,
+    # since a version may be pushed twice.
 
     def make(
         self,
@@ -766,29 +766,30 @@ class WeightUpdates:
         options: PushOptions,
     ) -> str:
         """Make a version from pushed values and those of `base`, and return its fingerprint."""
-        own = self.own()
-        made = self._given[name] = own.make(number, self.given(base), pushed, options)
-        own.admit(made)
-        return made.fingerprint
+        weights = self.current()
+        version = weights.make(number, self.version_named(base), pushed, options)
+        self._by_name[name] = version
+        weights.admit(version)
+        return version.fingerprint
 
-    def given(self, name: int) -> WeightsVersion:
-        """Return the version that the replica named so."""
-        if not self._given:
-            self._given[0] = self.own().newest
-        return self._given[name]
+    def version_named(self, name: int) -> WeightsVersion:
+        """Return the version with this name of the replica."""
+        if not self._by_name:
+            self._by_name[0] = self.current().newest
+        return self._by_name[name]
 
     def obey(self, use: int | None = None, forget: int | None = None) -> None:
-        """Act with one version from now on, or drop one. Called on the policy's thread, between
-        two batches.
+        """Change to one version, or drop one. It is called on the policy's thread, between two
+        batches.
         """
         if use is not None:
-            self.own().act_with(self.given(use), self._sessions.all())
+            self.current().act_with(self.version_named(use), self._sessions.all())
         if forget is not None:
-            self._given.pop(forget, None)
+            self._by_name.pop(forget, None)
 
     def acting(self) -> tuple[int, str]:
         """Return number and fingerprint of the version with which all sessions act."""
-        newest = self.own().newest
+        newest = self.current().newest
         return newest.number, newest.fingerprint
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
@@ -796,21 +797,21 @@ class WeightUpdates:
         None while it loads.
         """
         try:
-            own = self.own()
+            weights = self.current()
         except PolicyUnavailable:
             return None
-        return {"newest": own.newest.info[POLICY], "pinned": own.pinned.info[POLICY]}
+        return {"newest": weights.newest.info[POLICY], "pinned": weights.pinned.info[POLICY]}
 
     def newest(self) -> NewestVersion:
         """Return the newest version; raise `PolicyUnavailable` while the policy loads."""
-        own = self.own()
-        return NewestVersion(own.newest.number, own.model, own.gpus)
+        weights = self.current()
+        return NewestVersion(weights.newest.number, weights.model, weights.gpus)
 
     @property
     def number(self) -> int:
         """Number of the newest version; 0 while the policy loads."""
         try:
-            return self.own().newest.number
+            return self.current().newest.number
         except PolicyUnavailable:
             return 0
 
@@ -822,9 +823,9 @@ def follows(options: dict[str, Any], *, by_default: bool) -> bool:
     Raises:
         InvalidInput: The option has another value than "follow" or "pinned".
     """
-    wanted = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
-    if not isinstance(wanted, str) or wanted not in (_FOLLOW, _PINNED):
+    choice = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
+    if not isinstance(choice, str) or choice not in (_FOLLOW, _PINNED):
         raise InvalidInput(
-            f"{OPTION}: expected {_FOLLOW!r} (the newest version) or {_PINNED!r}, got {wanted!r}"
+            f"{OPTION}: expected {_FOLLOW!r} (the newest version) or {_PINNED!r}, got {choice!r}"
         )
-    return bool(wanted == _FOLLOW)
+    return bool(choice == _FOLLOW)

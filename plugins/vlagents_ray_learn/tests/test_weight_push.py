@@ -101,9 +101,9 @@ class _ReplicaFromAfar(WeightsReplica):
         self._note("drop")
         await self._replica.drop(number)
 
-    async def held(self) -> list[HeldVersion]:
-        self._note("held")
-        return await self._replica.held()
+    async def pushed_versions(self) -> list[HeldVersion]:
+        self._note("pushed_versions")
+        return await self._replica.pushed_versions()
 
     async def rest(self, rest: Rest) -> None:
         self._note("rest")

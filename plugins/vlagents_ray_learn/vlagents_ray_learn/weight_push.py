@@ -72,7 +72,7 @@ class WeightsReplica(Protocol):
     async def drop(self, number: int) -> None:
         """Drop the staged version."""
 
-    async def held(self) -> list[HeldVersion]:
+    async def pushed_versions(self) -> list[HeldVersion]:
         """Return the versions that a replica that has missed them needs."""
 
     async def rest(self, rest: Rest) -> None:
@@ -101,8 +101,8 @@ class ThisReplica(WeightsReplica):
     async def drop(self, number: int) -> None:
         await asyncio.to_thread(self._updates.drop, number)
 
-    async def held(self) -> list[HeldVersion]:
-        return await asyncio.to_thread(self._updates.held)
+    async def pushed_versions(self) -> list[HeldVersion]:
+        return await asyncio.to_thread(self._updates.pushed_versions)
 
     async def rest(self, rest: Rest) -> None:
         await asyncio.to_thread(self._updates.rest, rest)
@@ -253,7 +253,7 @@ class WeightPusher:
                 return
 
             last = current.number
-            for version in await source.held():
+            for version in await source.pushed_versions():
                 if version.number <= current.number:
                     continue
                 # Sessions change at once if a version since the last one was pushed with "keep".

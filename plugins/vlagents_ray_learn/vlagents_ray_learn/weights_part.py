@@ -53,7 +53,7 @@ class WeightsPart(ReplicaPart):
     """Accepts new weights from learners for all replicas of the application.
 
     Learners call `push`, `rest_all` and `versions` at any replica. That replica coordinates the
-    others, at which it calls `newest`, `stage`, `commit`, `drop`, `held` and `rest`.
+    others, at which it calls `newest`, `stage`, `commit`, `drop`, `pushed_versions` and `rest`.
     """
 
     sibling_methods: ClassVar[Mapping[str, float | None]] = {
@@ -62,7 +62,7 @@ class WeightsPart(ReplicaPart):
         "stage": _TRANSFER_S,
         "commit": _ANSWER_S,
         "drop": _ANSWER_S,
-        "held": _TRANSFER_S,
+        "pushed_versions": _TRANSFER_S,
         "rest": _TRANSFER_S,
         # For learners in the cluster, which set the time limits of these calls.
         "push": None,
@@ -128,7 +128,7 @@ class WeightsPart(ReplicaPart):
         Raises:
             InvalidWeights: They do not fit the policy.
         """
-        return self._updates.own().read_header(header, options)
+        return self._updates.current().read_header(header, options)
 
     async def rest_all(self, rest: Rest) -> None:
         """Let all replicas sleep, restore their memory, or wake."""
@@ -159,9 +159,9 @@ class WeightsPart(ReplicaPart):
         """Drop the staged version of this replica."""
         self._updates.drop(number)
 
-    def held(self) -> list[HeldVersion]:
+    def pushed_versions(self) -> list[HeldVersion]:
         """Return the versions that a replica that has missed them needs."""
-        return self._updates.held()
+        return self._updates.pushed_versions()
 
     def rest(self, rest: Rest) -> None:
         """Let this replica sleep, restore its memory, or wake."""
@@ -200,8 +200,8 @@ class _OtherReplica(WeightsReplica):
     async def drop(self, number: int) -> None:
         await self._sibling.call(WeightsPart.drop, number)
 
-    async def held(self) -> list[HeldVersion]:
-        versions: list[HeldVersion] = await self._sibling.call(WeightsPart.held)
+    async def pushed_versions(self) -> list[HeldVersion]:
+        versions: list[HeldVersion] = await self._sibling.call(WeightsPart.pushed_versions)
         return versions
 
     async def rest(self, rest: Rest) -> None:

@@ -149,7 +149,7 @@ def test_a_replica_that_starts_later_states_and_does_the_same(
     ]
     # As a training begins.
     push(engines[0], pushed(values["stack"]), partial=True, allow_same=True)
-    [held] = [one for one in engines[0].weights.held() if one.number]
+    [held] = [one for one in engines[0].weights.pushed_versions() if one.number]
     engines[1].weights.stage(held.number, held.values, PushOptions(allow_same=True))
     engines[1].weights.commit(held.number, PushOptions())
     assert played(engines[0]) == played(engines[1])

@@ -349,7 +349,7 @@ def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_
             number,
             number,
         )
-    [held] = served.weights.held()
+    [held] = served.weights.pushed_versions()
     np.testing.assert_equal(held.values, gains(4))
     wait_for(lambda: info(ask(served, "a", "reset", priority="simulation"))["versions"] == 1)
     served.close()

@@ -157,7 +157,7 @@ class Moves(RuleBasedStateMachine):
         first.commit(number, options)
         if missed:
             second.drop(number)
-            [held] = [version for version in first.held() if version.number == number]
+            [held] = [version for version in first.pushed_versions() if version.number == number]
             second.stage(number, held.values, replace(options, allow_same=True))
         second.commit(number, options)
         self.newest = number

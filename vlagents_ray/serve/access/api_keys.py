@@ -2,8 +2,8 @@
 
 A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its
 SHA-256. Slow password hashes are necessary only for passwords that people choose, since those can
-be guessed. These keys are random, and a slow hash at every request would take longer than the
-policy. Therefore users cannot choose keys.
+be guessed. Therefore users cannot choose keys: random keys need no slow hash, which would take
+longer than the policy at every request.
 
 Limits apply per replica and per gateway: two replicas together allow a key twice its rate and
 sessions.
@@ -36,15 +36,15 @@ logger = logging.getLogger(__name__)
 
 FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
 _KEY_PROTOCOL = "vlagents.key."  # prefix of the WebSocket subprotocol that contains a key
-# Minimum and maximum time for which senders with a key over its rate are not read.
+# Minimum and maximum time for which connections of a key over its rate are not read, s.
 _THROTTLED_S = (0.05, 1.0)
 _CHECK_S = 1.0  # minimum time between two checks of the file
-# Maximum time for which a request waits for a check: a network drive that hangs delays one request,
-# possibly on the policy's thread.
+# Maximum time for which a request waits for a check, s. A network drive that hangs delays one
+# request, possibly on the policy's thread.
 _WAIT_S = 0.25
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
 _REMIND_S = 60.0  # time between two log lines about an unreadable file
-_UNREAD = object()  # the state of a file that could not be read: each check tries again
+_UNREAD = object()  # the stamp of a file that could not be read, so that each check tries again
 
 
 class NoKey(enum.Enum):
@@ -57,10 +57,10 @@ class NoKey(enum.Enum):
 class Keys:
     """The keys of a server, read again when their file changes; thread-safe.
 
-    If the file is deleted, all keys are refused. If it cannot be read or parsed, the keys stay
-    valid for `_CLOSE_S`, so that an editing mistake or a short failure of a network drive stops no
-    robot; the log and a metric report it at once. After that time all keys are refused until the
-    file can be read, as some may have been revoked.
+    If the file is deleted, all keys are rejected. If it cannot be read or parsed, the keys stay
+    valid for `_CLOSE_S`, so that an editing mistake or a short failure of a network drive does not
+    stop a robot; the log and a metric report it immediately. After that time, all keys are rejected
+    until the file can be read, as some may have been revoked.
     """
 
     def __init__(
@@ -95,15 +95,17 @@ class Keys:
 
     @classmethod
     def from_file(cls, path: str | Path) -> Keys:
-        """Read the keys from a file, which is then checked for changes; raise `ConfigError` if
-        it is not a key file.
+        """Read the keys from a file, which is then checked for changes.
+
+        Raises:
+            ConfigError: It is not a key file.
         """
         file = Path(path)
         return cls(lambda: read_text(file), lambda: _stamp(file), where=f"keys file {file}")
 
     @classmethod
     def from_text(cls, text: str) -> Keys:
-        """Read the keys from the text of a key file; they cannot be revoked while this process
+        """Read the keys from the text of a key file. They cannot be revoked while this process
         runs.
         """
         return cls(lambda: text, lambda: None)
@@ -169,14 +171,16 @@ class Keys:
             raise error
 
     def throttled_s(self, name: str) -> float:
-        """Return the time for which the key's senders are not read, s; 0 unless one exceeded the
-        key's rate.
+        """Return the time for which the key's connections are not read, s; 0 if the key has not
+        exceeded its rate.
         """
         return max(0.0, self._unread_until.get(name, 0.0) - time.monotonic())
 
     def hold(self, name: str, number: int, limit: int | None) -> None:
-        """Count `number` more connections of a key; over `limit` count none and raise
-        `TooManyRequests`.
+        """Count `number` more connections of a key.
+
+        Raises:
+            TooManyRequests: The key would exceed `limit`; no connection is counted.
         """
         with self._lock:
             connections = self._connections[name]
@@ -221,7 +225,7 @@ class Keys:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed; runs on a separate thread, which a network drive may
+        """Read the file if it has changed. It runs on a separate thread, as a network drive may
         block.
         """
         try:
@@ -239,7 +243,7 @@ class Keys:
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Log that the file is unreadable, and refuse all keys if it has been so for `_CLOSE_S`."""
+        """Log that the file is unreadable, and reject all keys if it has been so for `_CLOSE_S`."""
         is_first = self._unreadable is None
         if self._unreadable is None:
             self._unreadable = now
@@ -262,7 +266,7 @@ class Keys:
         self._reminded = now
 
     def _load(self, text: str | None) -> None:
-        """Replace the keys by those in the text of a key file; by none if there is no file."""
+        """Replace the keys with those in the text of a key file, or with none if it is None."""
         keys = [] if text is None else parse_keys(text, self._where)
         self._keys = {bytes.fromhex(key.sha256): key for key in keys}
 
@@ -289,8 +293,11 @@ class Caller:
         return 0 if key is None else key.sessions
 
     def admit(self, *, free: bool = False, scope: str | None = None) -> None:
-        """Check the key, and its `scope` if one is given, before each request; count the request
-        unless it is `free`.
+        """Check the key before each request, and count the request.
+
+        Args:
+            free: Whether the request is not counted.
+            scope: The scope that the key needs; None if it needs no scope.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
@@ -314,15 +321,16 @@ class Caller:
         return None
 
     def throttled_s(self) -> float:
-        """Return for how long no sender with this key is read, s; 0 if the key is within its rate.
+        """Return the time for which no connection of this key is read, s; 0 if the key is within
+        its rate.
 
-        Receiving a refused message costs time on any connection, so the pause applies to the key,
-        not to one connection.
+        Receiving a message that is then rejected costs time on any connection, so the pause applies
+        to the key and not to one connection.
         """
         return self._keys.throttled_s(self.name)
 
     def require_unthrottled(self) -> None:
-        """Raise `TooManyRequests` for a new connection while senders with this key are not read."""
+        """Raise `TooManyRequests` for a new connection while the key's connections are not read."""
         wait_s = self.throttled_s()
         if wait_s > 0:
             self._keys.audit.refused(self.name, TooManyRequests.code)
@@ -333,8 +341,10 @@ class Caller:
             raise error
 
     def hold(self, number: int = 1) -> None:
-        """Count `number` more (or, negative, fewer) connections; raise `TooManyRequests` over
-        the key's sessions.
+        """Count `number` more connections of the key, or fewer if it is negative.
+
+        Raises:
+            TooManyRequests: The key would have more connections than sessions.
         """
         try:
             self._keys.hold(self.name, number, self.sessions)
@@ -368,11 +378,11 @@ class Caller:
 
 
 def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:
-    """Load the keys in `file` or, if it is None, those that the environment names; return None
-    without either.
+    """Load the keys in `file` or, if it is None, the keys in the environment; return None if there
+    are none.
 
-    In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its
-    text.
+    In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, and `VLAGENTS_RAY_KEYS`
+    is the text of one.
     """
     path = file or environment.get(FILE_VARIABLE)
     if path:
@@ -410,8 +420,10 @@ _CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")
 
 
 def current_caller() -> Identity:
-    """Return the caller of the request that this task processes; raise `LookupError` outside
-    `on_behalf_of`.
+    """Return the caller of the request that this task processes.
+
+    Raises:
+        LookupError: The task runs outside `on_behalf_of`.
     """
     return _CALLER.get()
 
@@ -477,7 +489,7 @@ class ScopeCheck:
     """The check of the keys and scopes of requests to one endpoint."""
 
     subject: str  # the subject of the endpoint, for the error message
-    # Whether other machines reach this server without a key; requests are then refused.
+    # Whether other machines reach this server without a key; requests are then rejected.
     open_to_network: bool
 
     def require(self, scope: str) -> None:

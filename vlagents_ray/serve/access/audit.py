@@ -7,9 +7,10 @@ per request.
     key (none): refused: an unknown key
     key lab: pressed 'pause' for session 'arm-1/7f3a'
 
-A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of
-omitted events. Only the buttons of the live page are always logged, also on a server without keys.
-The log contains names of keys, never keys. Refusals have the level WARNING, all other events INFO.
+A kind of event is logged immediately, and again after `_EVERY_S` at the earliest, with the number
+of omitted events. Only the buttons of the live page are always logged, even on a server without
+keys. The log contains names of keys, never keys. Rejections have the level WARNING, all other
+events INFO.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _EVERY_S = 10.0
 
 
 def write_audit() -> None:
-    """Write this log to stderr, which Ray stores per process, unless logging is already
+    """Write this log to stderr, which Ray stores for each process, unless logging is already
     configured.
     """
     logger.setLevel(logging.INFO)
@@ -38,7 +39,7 @@ def write_audit() -> None:
 
 
 class _StderrHandler(logging.StreamHandler):  # type: ignore[type-arg]  # Python 3.10 has none
-    """Writes to `sys.stderr` as it is at each line, as a program may replace it and close the old
+    """Writes each line to the present `sys.stderr`, as a program may replace it and close the old
     one.
     """
 
@@ -86,7 +87,7 @@ class Audit:
         """Count an event, and decide whether it is logged.
 
         Returns:
-            The end of the event's line in the log, which states the number of omitted events; None
+            The end of the event's line in the log, with the number of omitted events; None
             if such an event was logged within `_EVERY_S`.
         """
         now = time.monotonic()

@@ -31,8 +31,9 @@ from vlagents_ray.protocol.messages import PRIORITIES, PriorityName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Rights of a key in addition to using the policy: push new weights; watch all sessions on the live
-# page; press its buttons, which pause or stop a robot, or mark or save its episode.
+# Rights of a key in addition to using the policy: `weights` to push new weights, `watch` to watch
+# all sessions on the live page, and `operate` to press its buttons, which pause or stop a robot, or
+# mark or save its episode.
 SCOPES = ("weights", "watch", "operate")
 _PREFIX = "vlr_"  # allows scanners of repositories and logs to find leaked keys
 
@@ -46,7 +47,7 @@ class Key:
     apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
     rate: float | None = None  # maximum rate, requests/s
     sessions: int | None = None  # maximum number of sessions at once
-    # "simulation" for all requests of the key; otherwise each request states its priority.
+    # "simulation" applies to all requests of the key; otherwise each request sets its priority.
     priority: PriorityName | None = None
     scopes: tuple[str, ...] = ()  # some of `SCOPES`
     expires: float | None = None  # time of expiry, s since 1970
@@ -102,9 +103,14 @@ class Key:
 
 
 def parse_keys(text: str, where: str = "keys") -> list[Key]:
-    """Return the keys in the text of a key file, which messages call `where`.
+    """Return the keys in the text of a key file.
 
-    Raises `ConfigError` if it is invalid or two keys share a name.
+    Args:
+        text: The text.
+        where: The name of the file in messages.
+
+    Raises:
+        ConfigError: The text is invalid, or two keys have the same name.
     """
     try:
         document = json.loads(text, object_pairs_hook=without_duplicate_keys)
@@ -178,7 +184,7 @@ def read_keys(file: Path) -> list[Key]:
 
 
 def new_key(file: Path, name: str, **allowed: Any) -> str:
-    """Generate a key, add its hash to the file, and return the key, which is stored nowhere.
+    """Generate a key, add its hash to the file, and return the key, which is not stored.
 
     Args:
         file: The key file; a new file is readable by its owner only.
@@ -198,7 +204,7 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
     key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
 
     def add(keys: list[Key]) -> list[Key]:
-        """Return the keys with the new one in place of a revoked one of the same name."""
+        """Return the keys with the new one, which replaces a revoked one of the same name."""
         if any(other.name == name and not other.revoked for other in keys):
             raise ConfigError(
                 f"key {name!r} exists already; choose another name, or revoke it first"
@@ -210,12 +216,14 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
 
 
 def revoke(file: Path, name: str) -> None:
-    """Mark a key as revoked, which running servers detect within seconds; raise `ConfigError`
-    for an unknown name.
+    """Mark a key as revoked, which running servers detect within seconds.
+
+    Raises:
+        ConfigError: There is no key of this name.
     """
 
     def mark(keys: list[Key]) -> list[Key]:
-        """Return the keys, of which the one with that name is revoked."""
+        """Return the keys, with the key of that name revoked."""
         if all(key.name != name for key in keys):
             have = sorted(key.name for key in keys)
             raise ConfigError(
@@ -280,8 +288,8 @@ def _copy_owner(descriptor: int, file: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(file: Path) -> Iterator[int]:
-    """Hold a lock on the file's folder, whose descriptor is yielded, so that no change of two
-    commands is lost.
+    """Return a context manager that locks the file's folder, so that no change is lost if two
+    commands change the file. It yields the descriptor of the folder.
     """
     try:
         descriptor = os.open(file.parent, os.O_RDONLY)

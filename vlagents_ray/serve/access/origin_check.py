@@ -1,14 +1,14 @@
-"""Check of requests from pages in a browser, which can reach a server on their machine like any
-other program.
+"""Checks requests from pages in a browser, which can reach a server on their machine as any program
+can.
 
-A server with API keys needs no such check, since the page also needs a key.
+A server with API keys needs no such check, since a page also needs a key.
 
 A browser sends the site of the requesting page in `origin`, and the host name of the server in
 `host`. Only pages at this server's address are accepted: another site can let its own name resolve
 to this machine once its page is loaded (DNS rebinding), and requests of that page to that name have
-no `origin`. Therefore a request is refused if its `host` is a name that others could own. Accepted
-are addresses, names without a dot, names of private networks, this machine's own name and those in
-`access.hosts`. Programs that send no `host` are not browsers.
+no `origin`. Therefore a request is rejected if its `host` is a name that another site could own.
+Addresses, names without a dot, names of private networks, this machine's name and the names in
+`access.hosts` are accepted. Programs that send no `host` are not browsers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ _LONGEST = 260  # maximum length of a DNS name (253 characters) and a port
 
 
 def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) -> None:
-    """Refuse requests from pages of other sites: raise `Forbidden` if the page belongs, or could
-    belong, to one.
+    """Reject a request from a page of another site.
 
-    Names of `headers` are in lower case, as are `hosts`, further host names of this server, without
-    a port.
+    Args:
+        headers: The headers of the request; their names are in lower case.
+        hosts: Further host names of this server, in lower case and without a port.
+
+    Raises:
+        Forbidden: The page belongs, or could belong, to another site.
     """
     origin = headers.get("origin")
     host = headers.get("host")
@@ -49,8 +52,7 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
 
 
 def require_same_origin(headers: Mapping[str, str]) -> None:
-    """Refuse GETs from other sites' pages, including those without `origin`, such as image
-    requests.
+    """Reject a GET from another site's page, even if it has no `origin`, as requests of images.
 
     Raises:
         Forbidden: The browser reports that another site's page sent the request.
@@ -63,7 +65,7 @@ def require_same_origin(headers: Mapping[str, str]) -> None:
 
 
 def _is_page_of(host: str | None, origin: str) -> bool:
-    """Return whether the page is at the address `host` of this server, which is no DNS name."""
+    """Return whether the page is at the address `host` of this server, which is not a DNS name."""
     try:
         parts = urlsplit(origin)
     except ValueError:  # the origin is not a URL
@@ -86,7 +88,7 @@ def _name_of(host: str) -> tuple[str, bool]:
     """
     try:
         name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
-    except ValueError:  # the header holds no valid host
+    except ValueError:  # the header contains no valid host
         return "", False
     return name, "." not in name or name.endswith(_PRIVATE) or _is_address(name)
 

@@ -65,8 +65,8 @@ class EnvironmentArgs(_DeploymentModel):
                 f"process: expected `python` with it, got {self.process!r} alone; name an "
                 "interpreter, or leave it out"
             )
-        # The check also covers a child process: Serve shows the deployment, and a child may become
-        # a replica.
+        # The check also applies to a child process, as Serve shows the deployment, and a child may
+        # become a replica.
         require_no_secrets({"env_vars": self.env_vars})
         return self
 
@@ -162,8 +162,11 @@ class CheckpointArgs(_DeploymentModel):
     def of(
         self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]
     ) -> Checkpoints:
-        """Return the checkpoints of a policy that `make` builds; `config` are the deployment's
-        own settings of it.
+        """Return the checkpoints of a policy.
+
+        Args:
+            make: Creates an agent from settings.
+            config: The deployment's own settings of the policy.
         """
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
@@ -186,7 +189,7 @@ class SessionArgs(_DeploymentModel):
 
 
 class StreamArgs(_DeploymentModel):
-    """Each replica's own port for WebSockets, which avoids the proxy.
+    """The port of each replica for WebSockets, which bypasses the proxy.
 
     Clients get its address from the metadata; clients that cannot reach it (a firewall, a tunnel)
     use the proxy.
@@ -211,8 +214,8 @@ class StreamArgs(_DeploymentModel):
 
 
 class LimitArgs(_DeploymentModel):
-    """The size limits of a request, over which it gets 413, and the time limits of clients and
-    of the policy.
+    """The size limits of a request, and the time limits of clients and of the policy. A larger
+    request is answered with 413.
     """
 
     slow_s: float = Field(
@@ -340,8 +343,8 @@ class AccessArgs(_DeploymentModel):
 
 
 class AutoscalingArgs(_DeploymentModel):
-    """The number of replicas by measured load over all transports, see
-    `vlagents_ray.serve.scaling.autoscaling`.
+    """The settings of autoscaling, which derives the number of replicas from the load over all
+    transports, see `vlagents_ray.serve.scaling.autoscaling`.
     """
 
     min_replicas: int = Field(default=1, ge=0, le=MOST_WORKERS)

@@ -1,4 +1,4 @@
-"""The settings under `args.dialects` in a deployment file; a dialect that is not named there is
+"""The settings under `args.dialects` in a deployment file. A dialect that is not named there is
 off.
 
 Each dialect defines its own settings as `Config` of its class. This module defines the settings
@@ -29,7 +29,7 @@ MappingSetting = str | dict[str, Any]
 
 
 class DialectConfig(BaseModel, extra="forbid"):
-    """The settings that all dialects have; the `Config` of a dialect adds its own."""
+    """The settings that all dialects have. The `Config` of a dialect adds its own."""
 
     mapping: MappingSetting | None = Field(
         default=None,
@@ -101,8 +101,8 @@ class DialectArgs(RegisteredArgs):
         }
 
     def at_root(self) -> list[str]:
-        """Return the dialects at the root: the first one that has a root, and others with the
-        same protocol there.
+        """Return the dialects at the root path: the first dialect that has a root, and the others
+        that use the same protocol there.
         """
         roots = {name: getattr(dialect_class(name), "root", "") for name in self.on()}
         first = next(filter(None, roots.values()), None)
@@ -127,8 +127,8 @@ class DialectArgs(RegisteredArgs):
         return descriptions
 
     def require_fit(self, contract: Contract | None) -> None:
-        """Raise `ConfigError` if the policy needs a part of the observation that a dialect's
-        mapping lacks.
+        """Raise `ConfigError` if a dialect's mapping lacks a part of the observation that the
+        policy needs.
         """
         misfits = []
         for name, config in self.on().items():
@@ -177,7 +177,11 @@ def presets() -> dict[str, KeyMapping]:
 
 
 def _preset(name: object) -> Mapping[str, Any]:
-    """Return a preset as it is written in its dialect; raise `ConfigError` for an unknown name."""
+    """Return a preset in the form in which its dialect defines it.
+
+    Raises:
+        ConfigError: There is no preset of this name.
+    """
     for dialect_presets in _presets_by_dialect():
         if isinstance(name, str) and name in dialect_presets:
             return dialect_presets[name]
@@ -189,8 +193,8 @@ def _preset(name: object) -> Mapping[str, Any]:
 
 
 def _presets_by_dialect() -> Iterator[Mapping[str, Mapping[str, Any]]]:
-    """Yield the presets of each dialect; one that cannot be imported is left out, and its error
-    is logged.
+    """Yield the presets of each dialect. A dialect that cannot be imported is left out, and its
+    error is logged.
     """
     for name in names("dialects"):
         try:

@@ -11,11 +11,11 @@ from vlagents_ray.serve.config.registered import RegisteredArgs
 
 
 class PartConfig(BaseModel, extra="forbid"):
-    """The settings of a part of a replica; the `Config` of a part adds its own."""
+    """The settings that all parts of a replica have. The `Config` of a part adds its own."""
 
 
 class PartArgs(RegisteredArgs):
-    """The settings of parts, by name; null turns a part off that is on by default."""
+    """The settings of parts, by name. The value null turns off a part that is on by default."""
 
     kind: ClassVar[str] = "replica"
     base: ClassVar[str] = "vlagents_ray.serve.replica.part.ReplicaPart"
@@ -24,8 +24,8 @@ class PartArgs(RegisteredArgs):
     def on(self) -> dict[str, Any]:
         """Return the settings of the enabled parts, by name, in the order of the registry.
 
-        A part that is on by default is on where its plug-in is installed: a policy's own Python may
-        lack it.
+        A part that is on by default is only on if its plug-in is installed, which the Python
+        environment of a policy may lack.
         """
         settings = dict(self.model_extra or {})
         for name, entry in entries(self.kind).items():

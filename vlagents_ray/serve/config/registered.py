@@ -13,10 +13,8 @@ from vlagents_ray.registry import names, registered_class
 
 
 class RegisteredArgs(BaseModel, extra="allow"):
-    """A section of a deployment file with a key for each class that is on: a registered name, or
-    "module:Class".
-
-    A class whose value is null is off.
+    """A section of a deployment file with a key for each class that is on. A key is a registered
+    name or "module:Class". A class whose value is null is off.
     """
 
     kind: ClassVar[str]  # the kind of the names, as in `registry.names`
@@ -26,7 +24,7 @@ class RegisteredArgs(BaseModel, extra="allow"):
     @model_validator(mode="before")
     @classmethod
     def _by_their_own_models(cls, data: Any) -> Any:
-        """Check each class's settings by its `Config`; raise the errors of all of them together."""
+        """Check each class's settings with its `Config`, and raise all errors together."""
         if not isinstance(data, Mapping):
             return data
         fields: dict[str, Any] = {
@@ -40,7 +38,11 @@ class RegisteredArgs(BaseModel, extra="allow"):
 
     @classmethod
     def config_of(cls, name: str) -> type[BaseModel]:
-        """Return the model of the settings of one class; raises `ConfigError` if it has none."""
+        """Return the model of the settings of one class.
+
+        Raises:
+            ConfigError: The class has no `Config`.
+        """
         registered = registered_class(cls.kind, name)
         config = getattr(registered, "Config", None)
         if not (isinstance(config, type) and issubclass(config, cls.config_base)):

@@ -60,9 +60,7 @@ _PLAIN = (
 
 
 class _Shared:
-    """The objects that the sessions of a replica share, in the order in which the pickler found
-    them.
-    """
+    """The objects that the sessions of a replica share, in the order of pickling."""
 
     def __init__(self) -> None:
         self.objects: list[Any] = []
@@ -119,8 +117,8 @@ class _Shared:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles an agent in memory without its shared objects; with `find`, objects that must be
-    shared join them.
+    """Pickles an agent in memory without its shared objects. With `find`, objects that must be
+    shared are added to them.
     """
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
@@ -172,17 +170,21 @@ class AgentCopies:
         return self.load(self._pristine)
 
     def dump(self, agent: Agent, *, find: bool = False) -> bytes:
-        """Pickle the private state of a copy, for `load` in another replica; raises any error of
-        pickling.
+        """Pickle the private state of a copy, for `load` in another replica.
 
-        With `find`, objects that copies must share are added to the shared ones.
+        Args:
+            agent: The copy.
+            find: Whether to add objects that copies must share to the shared ones.
+
+        Raises:
+            Exception: Any error of pickling.
         """
         file = io.BytesIO()
         _Pickler(file, self._shared, find=find).dump(agent)
         return file.getvalue()
 
     def load(self, data: bytes) -> Agent:
-        """Return the copy that `dump` wrote in this replica, or in one with the same
+        """Return the copy that `dump` wrote, in this replica or in another one with the same
         fingerprint.
         """
         agent: Agent = _Unpickler(data, self._shared).load()

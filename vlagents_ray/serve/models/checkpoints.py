@@ -1,5 +1,5 @@
-"""The checkpoints that a deployment offers, and a session's choice among them; this module loads
-nothing.
+"""The checkpoints that a deployment offers, and a session's choice among them. This module does not
+load checkpoints.
 
 A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint:
 /runs/a/{step}`, `checkpoint_step: 20000`). A session chooses among the checkpoints in the
@@ -49,19 +49,20 @@ class Checkpoints:
         """
         self.make = make
         self.limit = loaded
-        offered = choices or {}
+        all_choices = choices or {}
         self._adapters = {
-            name: settings[ADAPTER] for name, settings in offered.items() if ADAPTER in settings
+            name: settings[ADAPTER] for name, settings in all_choices.items() if ADAPTER in settings
         }
         self._choices = {
-            name: dict(settings) for name, settings in offered.items() if name not in self._adapters
+            name: dict(settings)
+            for name, settings in all_choices.items()
+            if name not in self._adapters
         }
         self._steps = steps
-        self.config = self.own(config or {})
+        self.config = self.with_adapters(config or {})
 
-    def own(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the deployment's own settings `config`, with the offered adapters added to those
-        in `config`.
+    def with_adapters(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the deployment's own settings `config` with all adapters that sessions may choose.
 
         Raises:
             ConfigError: Two adapters have the same name, or the adapters in `config` are not a
@@ -108,12 +109,12 @@ class Checkpoints:
             return DEFAULT, {**rest, ADAPTER: choice}
 
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
-            raise UnknownCheckpoint(f"{CHOICE}: expected {self._offered()}, got {choice!r}")
+            raise UnknownCheckpoint(f"{CHOICE}: expected {self._choices_text()}, got {choice!r}")
 
         if step is not None:
             if not self._steps:
                 raise UnknownCheckpoint(
-                    f"{STEP}: expected {self._offered()}, got {step!r}; leave it out"
+                    f"{STEP}: expected {self._choices_text()}, got {step!r}; leave it out"
                 )
             if isinstance(step, bool) or not isinstance(step, int) or step < 0:
                 raise UnknownCheckpoint(
@@ -122,7 +123,7 @@ class Checkpoints:
         return CheckpointChoice(choice, step), rest
 
     def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of an agent for that choice, based on the deployment's own
+        """Return the settings of an agent for that choice, which are based on the deployment's own
         settings `config`.
         """
         chosen = {} if choice.name is None else self._choices[choice.name]
@@ -132,8 +133,8 @@ class Checkpoints:
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
     def examples(self) -> list[CheckpointChoice]:
-        """Return one example of each choice: the deployment's own, every named one, and a step
-        if steps are offered.
+        """Return an example of each choice: the deployment's own checkpoint, every named one, and a
+        step if sessions may choose steps.
         """
         return [
             DEFAULT,
@@ -159,15 +160,14 @@ class Checkpoints:
             and self.settings(choice, config) == settings
         )
 
-    def _offered(self) -> str:
+    def _choices_text(self) -> str:
+        """Return the choices in words, for an error."""
         names = sorted({*self._choices, *self._adapters})
-        offered = [f"one of {names}"] if names else []
-        offered += [f"a {STEP}"] if self._steps else []
-        return (
-            " or ".join([*offered, "none, for its own"])
-            if offered
-            else "none, as there is only one"
-        )
+        texts = [f"one of {names}"] if names else []
+        texts += [f"a {STEP}"] if self._steps else []
+        if not texts:
+            return "none, as there is only one"
+        return " or ".join([*texts, "none, for its own"])
 
 
 def resolved(settings: Mapping[str, Any]) -> str | None:

@@ -50,11 +50,13 @@ def powers_up_to(largest: int) -> list[int]:
 
 
 class Padding:
-    """Dummy sessions that pad a batch to the next of `sizes`. Use them on the policy's thread only.
+    """Dummy sessions that pad a batch to the next of `sizes`. They are only used on the policy's
+    thread.
 
-    Each is a pristine copy of the agent, reset with the first reset request that the policy
-    accepted, and acts on an observation of a real session in the same batch. Its actions and errors
-    are dropped. If a dummy session cannot be created, the policy gets batches without padding.
+    Each dummy session is a pristine copy of the agent. It is reset with the first reset request
+    that the policy accepted, and acts on an observation of a real session in the same batch. Its
+    actions and errors are dropped. If a dummy session cannot be created, the policy gets batches
+    without padding.
 
     Args:
         sizes: Batch sizes for which the model is compiled.
@@ -68,14 +70,14 @@ class Padding:
         self._rows: list[_DummySession] = []
 
     def record_reset(self, request: Request, kwargs: dict[str, Any]) -> None:
-        """Store the first reset that the policy accepted, which resets the padding sessions."""
+        """Store the first reset that the policy accepted. It also resets the dummy sessions."""
         if self._first is None and self._sizes and request.obs is not None:
             # The request is copied, since the observation may be in the sender's memory.
             self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
 
     def sessions(self, rows: int) -> list[Agent]:
-        """Return the dummy sessions that pad a batch of `rows` to the next size; none beyond the
-        largest size.
+        """Return the dummy sessions that pad a batch of `rows` to the next size; none if it exceeds
+        the largest size.
         """
         missing = next((size for size in self._sizes if size >= rows), rows) - rows
         if self._first is None:  # all sessions so far were moved here from other replicas
@@ -128,7 +130,7 @@ class LoadedModel:
     busy: threading.Lock  # lock held while its agent runs, or is being closed
     report: LoadingReport  # devices and other facts that it reported while loading
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
-    sessions: int = 0  # number of sessions that hold it
+    sessions: int = 0  # number of sessions that use it
     closed: bool = False
     key: str = field(init=False)  # `key_of(settings)`
     # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA
@@ -171,10 +173,10 @@ class LoadedModel:
                 check_observation(obs, self.contract)
 
     def call(self, op: str, kind: Hashable = None) -> PolicyCall:
-        """Return a context for a call of the agent, which detects a call that does not return.
+        """Return a context manager for a call of the agent, which detects calls that do not return.
 
-        Calls with the same `op` and `kind` take similarly long, and never run on two threads at
-        once.
+        Calls with the same `op` and `kind` take similarly long, and never run on two threads at the
+        same time.
         """
         call = self._calls_by_kind.get((op, kind))
         if call is None:
@@ -191,8 +193,8 @@ class LoadedModel:
             )
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
-        """Append rows that fill a batch up to the next size; return their number. Runs on the
-        policy's thread only.
+        """Append rows that pad a batch to the next size, and return their number. It is only called
+        on the policy's thread.
         """
         with self.call("reset", "padding"):
             padding = self.padding.sessions(len(agents))
@@ -298,7 +300,7 @@ class Loader:
             )
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
-            # The statistics are for the comparison with a robot, also of weights without a digest.
+            # The statistics are compared with a robot. They may exist for weights without a digest.
             if agent.statistics is not None:
                 weights = {
                     "digest": None,

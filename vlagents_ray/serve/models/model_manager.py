@@ -1,17 +1,17 @@
-"""The checkpoints that a replica holds in memory: loaded on demand, and evicted when another needs
-the memory.
+"""Manages the checkpoints in the memory of a replica. They are loaded on demand, and evicted when
+another checkpoint needs the memory.
 
 The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the
 others, one at a time, while sessions of loaded checkpoints act. `ModelCache` decides which one is
 next.
 
-Ray's `serve.multiplexed` counts models alone: at its limit it unloads the one that was requested
-least recently, also while sessions act with it, and it never waits for them. Hence this cache,
-which tracks the sessions.
+Ray's `serve.multiplexed` only counts models. At its limit it unloads the least recently requested
+one, even while sessions act with it, and never waits for them. Therefore this cache exists, which
+tracks the sessions.
 
-A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded
-beside the old one. New episodes then use the new checkpoint, and the old one is evicted when its
-last episode has ended.
+A deployment's own settings can change (`ModelManager.configure`). The new checkpoint is then loaded
+next to the old one. New episodes use the new checkpoint, and the old one is evicted when its last
+episode has ended.
 """
 
 from __future__ import annotations
@@ -130,14 +130,14 @@ class ModelCache:
         return self.loaded.get(key_of(self._settings(choice)))
 
     def free(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice may use now; None if the episode has
-        to wait for it.
+        """Return the model that an episode of that choice may use now; None if the episode must
+        wait for it.
         """
         model = self.find(choice)
         return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
-        """Assign the model to the session, in place of any other, and return the model."""
+        """Assign the model to the session, which may have had another one, and return the model."""
         self._take_model(session)
         # The most recently used model is the last one.
         self.loaded[model.key] = self.loaded.pop(model.key)
@@ -171,8 +171,8 @@ class ModelCache:
         return model
 
     def pop_due(self) -> DueCallbacks:
-        """Remove the sessions whose wait has ended; return their callbacks with the errors, if
-        any.
+        """Remove the sessions whose wait has ended. Return their callbacks, with an error if there
+        was one.
         """
         due: DueCallbacks = []
         for waiter in list(self.waiting):
@@ -192,9 +192,9 @@ class ModelCache:
         return due
 
     def plan(self, fits: Callable[[int], bool]) -> LoadTask | EvictTask | None:
-        """Return the next task, or None; also decides which model is `draining`.
+        """Return the next task, or None. This also decides which model is `draining`.
 
-        `fits` returns whether one more model fits into memory beside so many.
+        `fits` returns whether one more model fits into memory next to the given number.
         """
         self.draining = ""
         idle = [model for model in self.loaded.values() if not model.sessions]
@@ -241,9 +241,7 @@ class ModelCache:
         return self._source.settings(choice, self.config)
 
     def _next_load(self) -> tuple[LoadTask, float] | None:
-        """Return the next model to load, and the start of the wait for it, s; a swap has
-        priority.
-        """
+        """Return the next model to load, and the start of the wait, s. A swap has priority."""
         if self.next is not None:
             return LoadTask(DEFAULT, self.next), float("-inf")
         for waiter in self.waiting:
@@ -258,7 +256,7 @@ def too_late(choice: CheckpointChoice) -> DeadlineExceeded:
 
 
 class ModelManager:
-    """The models of a replica. Thread-safe; it releases its lock before it calls other
+    """Manages the models of a replica. Thread-safe: it releases its lock before it calls other
     components.
     """
 
@@ -273,10 +271,11 @@ class ModelManager:
         """Manage the models of a replica.
 
         Args:
-            source: The checkpoints that may be loaded.
-            loader: Loads them.
+            source: The checkpoints of the deployment.
+            loader: Loads models.
             cache: The loaded models, which the sessions release when they end.
-            sessions: The sessions; those of a model that is evicted at once are closed.
+            sessions: The sessions of the replica. If a model is evicted immediately, its sessions
+                are closed.
             on_step: Called with each step of a long first load, on the loading thread.
         """
         # Whether chunks of the deployment's own model continue the executed plan.
@@ -303,10 +302,10 @@ class ModelManager:
         return self._cache.config
 
     def configure(self, config: Mapping[str, Any]) -> None:
-        """Set the deployment's own settings: the first call sets the initial ones, a later one
+        """Set the deployment's own settings. The first call sets the initial ones; a later call
         starts a swap.
         """
-        settings = self._source.own(config)
+        settings = self._source.with_adapters(config)
         with self._changed:
             if not self._begun:
                 self._begun, self._cache.config = True, settings
@@ -317,8 +316,10 @@ class ModelManager:
                 self._wake()
 
     def start(self) -> None:
-        """Load the deployment's own checkpoint on the calling thread; raises an error if it
-        cannot be served.
+        """Load the deployment's own checkpoint on the calling thread.
+
+        Raises:
+            BaseException: The checkpoint cannot be served.
         """
         self._begun = True
         first, self._first = self._first, None
@@ -387,8 +388,8 @@ class ModelManager:
         return gpu_memory(self.devices)
 
     def _fits(self, loaded: int) -> bool:
-        """Return whether the GPU has room for one more checkpoint: as much as each of the loaded
-        ones takes.
+        """Return whether the GPU has enough memory for one more checkpoint, assuming that it takes
+        as much as each of the loaded ones.
         """
         memory, full = self.gpu_memory() if loaded else {}, self._full
         self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
@@ -403,7 +404,7 @@ class ModelManager:
         return not self._full
 
     def loading(self) -> PolicyUnavailable:
-        """Return the error for clients while the first checkpoint is loaded, which names the
+        """Return the error for clients while the first checkpoint is loaded. It names the present
         step of loading.
         """
         return PolicyUnavailable(
@@ -431,13 +432,13 @@ class ModelManager:
         on_loaded: OnLoaded,
         is_abandoned: Callable[[], bool] = lambda: False,
     ) -> LoadedModel | None:
-        """Return the model for a session's next episode, which the session holds until its next
-        call or its end.
+        """Return the model for a session's next episode. The session keeps it until the next call
+        for this session, or its end.
 
         Args:
             session: The session; it releases the model that it held before.
-            on_loaded: Called if the model has to be loaded or waited for: with None once the
-                session holds it, or with the error.
+            on_loaded: Called only if the session has to wait for the model: with None once the
+                session has it, or with the error.
             is_abandoned: Returns whether the caller no longer waits.
 
         Returns:
@@ -505,8 +506,8 @@ class ModelManager:
             raise _stopping()
 
     def _wake(self) -> None:
-        """Wake the loading thread up to check for work; the first call after `start` starts the
-        thread.
+        """Wake up the loading thread, which then checks for work. The first call after `start`
+        starts the thread.
         """
         if self._thread.ident is None and self._loaded and not self._closed:
             self._thread.start()

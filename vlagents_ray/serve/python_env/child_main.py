@@ -169,7 +169,7 @@ def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
 
     return {
         "values": values,
-        "fingerprint": updates.given(0).fingerprint,
+        "fingerprint": updates.version_named(0).fingerprint,
         "gpus": updates.newest().gpus,
     }
 
@@ -219,7 +219,7 @@ def _execute(
         offload: See `ModelWeights.sleep`; without a file, None lets the policy wake.
     """
     if not values:
-        weights = updates.own()
+        weights = updates.current()
         if offload is None:
             weights.wake()
         else:
@@ -228,7 +228,7 @@ def _execute(
 
     with Path(values).open("r+b") as file:
         if make is None:
-            write_values(file, updates.own().portable_values(updates.given(name)))
+            write_values(file, updates.current().portable_values(updates.version_named(name)))
             return {}
         copied = read_values(file)
 

@@ -147,8 +147,8 @@ class ReplicaProcess(WeightsReplica):
     async def drop(self, number: int) -> None:
         self.ask("drop", number)
 
-    async def held(self) -> list[HeldVersion]:
-        versions: list[HeldVersion] = self.ask("held")
+    async def pushed_versions(self) -> list[HeldVersion]:
+        versions: list[HeldVersion] = self.ask("pushed_versions")
         return versions
 
     async def rest(self, rest: Rest) -> None:
