@@ -292,14 +292,14 @@ class TestAPolicyOfSeveralPartsServedAsOne:
     def test_the_parts_with_as_many_numbers_are_named(self) -> None:
         [told] = differences(Contract(state={"joints": StateSpec(21)}), self.ENV)
         assert told == (
-            "state 'joints': the policy needs 21 numbers, the env gives 7; if it was trained on "
+            "state 'joints': the policy needs 21 numbers, the env provides 7; if it was trained on "
             "several parts, set the policy's `state` to them in their order: [joints, tquat, "
             "xyzrpy, gripper] has 21 numbers here"
         )
 
     def test_all_choices_are_told_where_there_are_several(self) -> None:
         [told] = differences(Contract(state={"q": StateSpec(8)}), self.ENV)
-        assert "the env gives ['joints', 'tquat', 'xyzrpy']" in told
+        assert "the env provides ['joints', 'tquat', 'xyzrpy']" in told
         assert (
             "`state` to them in their order: [joints, gripper] or [tquat, gripper] have 8 numbers "
             "here"
@@ -307,7 +307,7 @@ class TestAPolicyOfSeveralPartsServedAsOne:
 
     def test_where_none_fit_the_policy_is_another_ones(self) -> None:
         [told] = differences(Contract(state={"joints": StateSpec(9)}), self.ENV)
-        assert told.endswith("the env gives 7; is this another task's or robot's policy?")
+        assert told.endswith("the env provides 7; is this another task's or robot's policy?")
 
     def test_where_the_parts_are_set_they_are_not_guessed(self) -> None:
         told = differences(

@@ -173,7 +173,7 @@ def test_a_format_of_a_plugin_has_the_settings_of_its_function(
         "limt=2": "limt: there is no such setting; expected one of .*; did you mean 'limit'",
         "limit=many": "limit: expected a valid integer, got 'many'",
         "columns=env": r"columns: expected a valid list, such as \[env\], got 'env'",
-        "limit=2": "columns: is missing; give --set columns=",
+        "limit=2": "columns: is missing; add --set columns=",
     }
     for setting, message in wrong.items():
         with pytest.raises(ConfigError, match=f"--set, for --to lab: (?s:.*){message}"):

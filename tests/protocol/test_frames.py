@@ -339,7 +339,7 @@ def test_a_long_header_is_refused_unread(values: int, reason: str) -> None:
 
 def test_a_body_over_the_limit_is_too_large() -> None:
     frame = encode_requests([Request("act", Obs({"a": np.zeros((64, 64, 3), np.uint8)}))])
-    with pytest.raises(MessageTooLarge, match="limit is 4096"):
+    with pytest.raises(MessageTooLarge, match="expected at most 4096 bytes"):
         decode_request(frame, MessageLimits(body_bytes=4096))
 
 

@@ -92,7 +92,7 @@ def test_the_limits_of_relative_actions_are_of_the_actions_themselves() -> None:
         Contract(action=ActionSpec(dim=1, delta=True)), limits=LIMITS, hz=HZ, soft_start_s=0
     )
     checked(row(0.003), row(0))
-    with pytest.raises(InvalidAction, match=r"velocity 1\.5"):
+    with pytest.raises(InvalidAction, match=r"velocity of at most 1 .*, got 1\.5"):
         checked(row(0.03), row(0.003))
 
 

@@ -399,7 +399,7 @@ def test_a_dataset_without_a_contract_has_actions_of_the_policys_kind(tmp_path: 
     )
     guard = Guard(Contract(action=spec), limits=folder, hz=HZ)
     guard(episodes[0][1], guard(episodes[0][0]))
-    with pytest.raises(ConfigError, match="low, high for relative actions"):
+    with pytest.raises(ConfigError, match=r"for relative actions, .*, got low, high"):
         Guard(Contract(action=spec), limits=MotionLimits.read(folder), hz=HZ)
 
 

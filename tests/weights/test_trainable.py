@@ -285,7 +285,7 @@ def test_tensors_are_checked_as_arrays_are() -> None:
     held = {"w": torch.zeros(4, dtype=torch.bfloat16), "n": torch.zeros((), dtype=torch.int64)}
     assert fitted(held, {"w": np.ones(4), "n": np.int64(2)})["w"].dtype == torch.bfloat16
     for wrong, says in (
-        (torch.full((4,), float("inf")), "infinite"),
+        (torch.full((4,), float("inf")), "infinity"),
         (torch.ones(4, dtype=torch.int8), "got int8"),
     ):
         with pytest.raises(InvalidWeights, match=says):

@@ -1,5 +1,5 @@
-"""Commands from the live page to a robot, which arrive in the replies to its requests; they can
-only make it stop.
+"""Commands from the live page to a robot, which arrive in the replies to its requests. They can
+only pause or stop it, or end its episode.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from vlagents_ray.errors import ConfigError, printable
 from vlagents_ray.interface import Act, Obs
 
 COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
-# The entry of `Obs.info` with the outcomes of commands, by id: the reason of the refusal, or "" if
-# the command was executed.
+# The entry of `Obs.info` with the outcomes of commands, by id: the reason of the rejection, or ""
+# if the command was executed.
 COMMANDED = "commanded"
 COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
 logger = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class CommandInbox:
         """Create an empty inbox.
 
         Args:
-            allow: The names of the commands that may be executed; others are refused.
+            allow: The names of the commands that may be executed; others are rejected.
 
         Raises:
             ConfigError: `allow` has an unknown name.
@@ -57,7 +57,7 @@ class CommandInbox:
         self.control = RobotControl()  # the control of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
-        # Outcomes by the command's id: the reason of a refusal, or "" if it was executed.
+        # Outcomes by the command's id: the reason of a rejection, or "" if it was executed.
         self._outcomes: dict[str, str] = {}
         self._sent_outcomes: dict[str, str] = {}  # the outcomes in the last request
 
@@ -67,12 +67,12 @@ class CommandInbox:
         return replace(obs, info={**obs.info, COMMANDED: outcomes}) if outcomes else obs
 
     def receive(self, act: Act | Exception) -> None:
-        """Remove the command from the answer to the last request, and queue or refuse it; ignore an
-        invalid entry.
+        """Remove the command from the answer to the last request, and queue or reject it. An
+        invalid entry is ignored.
         """
         if isinstance(act, Exception):
             return
-        for sent_id in self._sent_outcomes:  # these have reached the server
+        for sent_id in self._sent_outcomes:  # the server has received these
             self._outcomes.pop(sent_id, None)
 
         entry = act.info.pop(COMMAND, None)
@@ -95,11 +95,11 @@ class CommandInbox:
 
     @property
     def waiting(self) -> list[Command]:
-        """The commands that were received and not executed yet, oldest first."""
+        """The commands that were received and have not been executed yet, oldest first."""
         return list(self._waiting)
 
     def apply(self, control: RobotControl) -> list[Command]:
-        """Apply the commands received since the last call to the state of the robot, and return
+        """Apply the commands that arrived since the last call to the state of the robot, and return
         them.
         """
         executed = []

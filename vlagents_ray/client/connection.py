@@ -1,4 +1,4 @@
-"""The connection to a server, shared by all sessions of one `RemoteAgent`, and the server's
+"""The connection to a server, which all sessions of a `RemoteAgent` share, and the server's
 metadata.
 """
 
@@ -42,16 +42,17 @@ _CLOSE_S = 2.0
 # The deadline sent to the server is shorter by the time of transport: this share of the deadline,
 # but at most this many seconds.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
-_LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # s to find another replica, and between two attempts
+# The time limit for finding another replica, and the pause between two attempts, s.
+_LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0
 # The time without any answer, s, over one or several calls, after which the next call uses another
 # replica.
 SILENT_S = 5.0
 
 
 class Connection:
-    """Connects on first use, and again after a lost connection or at the replica's request.
+    """Connects on first use, and again after the connection is lost or the replica asks for it.
 
-    A replica that requests a reconnection still answers, so its connection is used until another
+    A replica that asks for a reconnection still answers, so its connection is used until another
     replica has answered. Only one thread may use a connection at a time.
     """
 
@@ -65,10 +66,15 @@ class Connection:
         *,
         leaves_silent: bool = True,
     ) -> None:
-        """Set up the connection, without opening it; each has its own choice by `codec`.
+        """Set up the connection, without opening it.
 
-        The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches
-        to another replica when one no longer answers.
+        Args:
+            url: The URL of the server.
+            new_transport: Makes a transport to the server.
+            codec: The choice of the codec of this connection.
+            timeout_s: The default time limit of a call.
+            connect_timeout_s: The default time limit of `open`.
+            leaves_silent: Whether to switch to another replica when one no longer answers.
         """
         self.url = url
         self.codec = codec
@@ -78,13 +84,13 @@ class Connection:
         self._new_transport = new_transport
         self.transport = new_transport()
 
-        # Both come from the server when a transport connects, and are None before.
+        # The server sends both when a transport connects; they are None before.
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None
         self.users: set[object] = set()  # the owners of the sessions
 
-        # The beginning of the first of the calls without an answer, time.monotonic(); None if the
-        # last call had one.
+        # The time of the first call since the last answer, time.monotonic(); None if the last call
+        # was answered.
         self._silent_since: float | None = None
         self._silent = False  # whether the silence has lasted for `SILENT_S`
         # The transport to the silent replica, kept until another one answers, since its sessions
@@ -96,7 +102,7 @@ class Connection:
 
         self.reconnects = 0  # the number of reconnections
         self._must_reconnect = False  # whether to connect again before the next request
-        # Whether the replica requested a reconnection; it then keeps the sessions when its
+        # Whether the replica asked for a reconnection. It then keeps the sessions when its
         # connection is closed.
         self._asked_to_move = False
 
@@ -109,8 +115,10 @@ class Connection:
         return f"{self._prefix}-{self._requests:x}"
 
     def open(self, timeout_s: float | None = None) -> None:
-        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does
-        not.
+        """Connect, and wait until the server is ready.
+
+        Raises:
+            PolicyUnavailable: The server is not ready in time.
         """
         if self._must_reconnect:
             self._drop_next()
@@ -128,8 +136,8 @@ class Connection:
             self._connected(self.transport.connect(limit_s))
 
     def _connected(self, metadata: dict[str, Any]) -> None:
-        """Store the metadata of the replica to which the transport has connected; close it if
-        they are invalid.
+        """Store the metadata of the replica to which the transport has connected. If they are
+        invalid, close the transport.
         """
         try:
             if metadata.get("protocol") != PROTOCOL_VERSION:
@@ -144,7 +152,7 @@ class Connection:
             self.transport.close()
             raise
 
-        # The URL alone is not sufficient: a tunnel to another machine also begins at a loopback
+        # The URL is not sufficient, as a tunnel to another machine also begins at a loopback
         # address.
         is_near = (
             local is not None
@@ -156,8 +164,8 @@ class Connection:
         self.metadata = metadata
 
     def _move(self) -> None:
-        """Switch to the next transport once it is connected; if it fails, keep the current one
-        and retry later.
+        """Switch to the next transport once it is connected. If it fails, keep the current one and
+        retry later.
         """
         if self._next is None or not self._next.ended:
             return
@@ -179,8 +187,8 @@ class Connection:
             self._next = None
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests in one message and return their replies; a transport error replaces a
-        reply.
+        """Send requests in one message and return their replies. A reply may be a transport
+        error.
         """
         begun = time.monotonic()
         try:
@@ -231,7 +239,7 @@ class Connection:
             if isinstance(reply.error, UnknownApp):
                 reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
 
-        if len(replies) != len(requests):  # one reply is for the whole frame
+        if len(replies) != len(requests):  # a single reply applies to the whole frame
             error = replies[0].error or PolicyUnavailable(
                 f"expected {len(requests)} replies, one for each request, got {len(replies)}"
             )
@@ -246,8 +254,8 @@ class Connection:
         return replies
 
     def end_session(self, user: object, session: str) -> None:
-        """End the session of `user`, if it was begun; with the last session, close the
-        connection.
+        """End the session of `user`, if it was begun. The connection is closed with the last
+        session.
         """
         was_begun = user in self.users
         self.users.discard(user)
@@ -303,7 +311,7 @@ class _NextTransport:
                 self.transport.close()
 
     def drop(self) -> None:
-        """Close the transport, at once or when its attempt to connect ends."""
+        """Close the transport, immediately or when its attempt to connect ends."""
         with self._lock:
             self._dropped = True
         if self.ended:

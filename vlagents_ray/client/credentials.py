@@ -1,5 +1,5 @@
-"""The credentials of a client: its API key and, over TLS, its certificate and the authorities
-that it trusts.
+"""The credentials of a client: its API key and, for TLS, its certificate and the certificate
+authorities that it trusts.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
 WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.protocol")
-"""The logger for websockets, which at DEBUG logs the headers that it sends: drops lines with the
-key.
+"""The logger for websockets. At the level DEBUG, websockets logs the headers that it sends; this
+logger drops the lines with the key.
 """
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
@@ -32,8 +32,8 @@ _NAME_MISMATCH_CODES = (62, 64)
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """The credentials of one client: its API key, its certificate and key, and the CA; all files
-    are PEM files.
+    """The credentials of a client: its API key, its certificate and private key, and the CA. All
+    files are PEM files.
     """
 
     api_key: str | None = field(default=None, repr=False)
@@ -51,7 +51,7 @@ class Credentials:
         object.__setattr__(self, "api_key", key or None)
 
     def become_default(self) -> None:
-        """Make this key the default of the process, as if its environment had contained it."""
+        """Make this key the default of the process, as if it were in the environment."""
         if self.api_key is not None:
             os.environ[KEY_VARIABLE] = self.api_key
 
@@ -67,8 +67,10 @@ class Credentials:
             warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
 
     def context(self, url: str) -> ssl.SSLContext | None:
-        """Return the TLS context for a URL, None if it is not encrypted; raises `ConfigError`
-        for an unusable file.
+        """Return the TLS context for a URL; None if the URL is not encrypted.
+
+        Raises:
+            ConfigError: A file cannot be used.
         """
         if urlsplit(url).scheme not in ("https", "wss"):
             return None
@@ -97,8 +99,8 @@ ANONYMOUS = Credentials("")
 
 @contextlib.contextmanager
 def withheld() -> Iterator[None]:
-    """Remove the key from the environment within the context, so that processes started in it do
-    not inherit it.
+    """Return a context manager that removes the key from the environment, so that processes that
+    are started within it do not inherit the key.
     """
     key = os.environ.pop(KEY_VARIABLE, None)
     try:
@@ -119,8 +121,8 @@ def warn_of_plain_http(origin: str) -> None:
 
 
 def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
-    """Return the error for a failed TLS handshake, with its cure; only a lost connection is
-    worth a retry.
+    """Return the error for a failed TLS handshake, with its cure. Only after a lost connection is a
+    retry useful.
     """
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
         return ConnectionLost(
@@ -159,7 +161,7 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
 
 
 def require_plain(url: SplitResult, timeout_s: float) -> None:
-    """Raise `ConfigError` if the URL is not encrypted but its port speaks TLS, whatever the
+    """Raise `ConfigError` if the URL is not encrypted but its port uses TLS, with any
     certificate.
     """
     if url.scheme not in ("http", "ws"):

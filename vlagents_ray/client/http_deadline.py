@@ -1,7 +1,7 @@
 """A socket for `http.client` whose exchanges end by a deadline, however slowly the server sends.
 
-The time limit of a plain socket holds for each read: a server that sends a byte now and then would
-keep its client waiting for ever.
+The time limit of a plain socket applies to each read, so a server that sends a byte now and then
+could keep its client waiting forever.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vlagents_ray.protocol.frame_layout import Buffer
 
 
 class DeadlineSocket:
-    """The part of a connected socket that `http.client` uses, with one time limit for all of an
+    """The part of a connected socket that `http.client` uses, with one time limit for a whole
     exchange.
     """
 
@@ -33,14 +33,14 @@ class DeadlineSocket:
         return installed
 
     def begin_exchange(self, timeout_s: float) -> None:
-        """Set the time, s, until which the next request must be sent, and its whole answer
-        received.
-        """
+        """Set the time limit, s, for sending the next request and receiving its whole answer."""
         self._deadline = time.monotonic() + timeout_s
 
     def apply_deadline(self) -> None:
-        """Limit the next operation of the socket to the time that is left; raises `TimeoutError`
-        if none is.
+        """Limit the next operation of the socket to the remaining time.
+
+        Raises:
+            TimeoutError: No time remains.
         """
         left_s = self._deadline - time.monotonic()
         if left_s <= 0:
@@ -73,7 +73,7 @@ class DeadlineSocket:
 
 
 class _AnswerReader(io.RawIOBase):
-    """Reads a socket; each read has the time that is left of the exchange."""
+    """Reads a socket. The time limit of each read is the remaining time of the exchange."""
 
     def __init__(self, deadline_socket: DeadlineSocket, raw: io.RawIOBase) -> None:
         self._deadline_socket, self._raw = deadline_socket, raw

@@ -35,7 +35,7 @@ dump = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def pack(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
-    """Return the pieces of a frame in order, and set "blobs" in `header`; the blobs are not
+    """Return the pieces of a frame in order, and set "blobs" in `header`. The blobs are not
     copied.
     """
     header["blobs"] = [len(blob) for blob in blobs]
@@ -59,7 +59,8 @@ def unpack(
 ) -> tuple[dict[str, Any], list[Buffer]]:
     """Return the header of a frame, and views of its blobs.
 
-    A request's header is charged to `budget`; None is for a reply, whose header may be longer.
+    The header of a request is charged to `budget`. The `budget` of a reply is None, and its header
+    may be longer.
 
     Raises:
         MalformedMessage: The data are not a frame.
@@ -184,8 +185,10 @@ def plain_dtype(dtype: Any) -> np.dtype[Any]:
 
 
 def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
-    """Return a read-only array over `data`; raise `MalformedMessage` unless data, dtype and
-    shape match.
+    """Return a read-only array over `data`.
+
+    Raises:
+        MalformedMessage: The data do not match the dtype and the shape.
     """
     kind = plain_dtype(dtype)
     if not isinstance(data, (bytes, memoryview)):
@@ -205,7 +208,7 @@ def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
     try:
         return np.ndarray(shape, kind, data)
     except (ValueError, OverflowError) as error:
-        # numpy cannot represent such a long axis, even beside an empty one.
+        # numpy cannot represent such a long axis, even if another axis is empty.
         raise MalformedMessage(
             f"array: expected a shape that numpy accepts, got {shown(shape)}"
         ) from error

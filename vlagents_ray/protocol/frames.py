@@ -1,8 +1,8 @@
 """The binary frame: a complete message, with its images and arrays as aligned raw bytes.
 
 HTTP bodies, WebSocket messages and shared memory contain the same frame. Its header (see
-`vlagents_ray.protocol.frame_layout`) is one request or reply, or a list of them under "requests" or
-"replies", as a vector of environments sends them.
+`vlagents_ray.protocol.frame_layout`) is one request or reply. For a vector of environments, it is a
+list of them under "requests" or "replies".
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.protocol.values import ValueReader, ValueWriter, is_number, read_obs, write_obs
 
 CONTENT_TYPE = "application/x-vlagents-frame"
-# With defaults.
+# The optional keys of a request, with their defaults.
 _OPTIONAL: dict[str, Any] = {
     "request_id": "",
     "session": "",
@@ -49,7 +49,7 @@ _OPTIONAL: dict[str, Any] = {
     "deadline_ms": None,
 }
 _WITH_OBS = ("reset", "act", "observe")
-_RESET_PARAMETERS = {"self", "obs", "instruction"}  # which no option of a reset may be named
+_RESET_PARAMETERS = {"self", "obs", "instruction"}  # names that options of a reset may not have
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {
@@ -71,7 +71,7 @@ def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> byt
 
 
 def request_parts(requests: Sequence[Request], codec: ImageCodec = RAW) -> list[Buffer]:
-    """Return the pieces of a frame of requests, in order; raw images and arrays are views, not
+    """Return the pieces of a frame of requests, in order. Raw images and arrays are views, not
     copies.
     """
     writer = ValueWriter()
@@ -101,8 +101,8 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 
 
 class Decoded(NamedTuple):
-    """The requests decoded from a frame, and the error replies to unreadable ones by their index
-    in the frame.
+    """The requests decoded from a frame, and error replies to those that cannot be read, by their
+    index in the frame.
     """
 
     requests: list[Request]
@@ -184,7 +184,7 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
 
 
 def _step(node: dict[str, Any]) -> Any:
-    """Return the `step` of a request or reply. It is sent as text: some JSON parsers round
+    """Return the `step` of a request or reply. It is sent as text, since some JSON parsers round
     numbers above 2**53.
     """
     step = node.get("step")
@@ -198,8 +198,8 @@ def _step(node: dict[str, Any]) -> Any:
 
 
 def check_request(request: Request, limits: MessageLimits) -> Request:
-    """Check the types and sizes that JSON itself does not enforce, for a request of any format;
-    return the request.
+    """Check the types and sizes that JSON itself does not enforce, and return the request. It may
+    come from any format.
     """
     # A reference is an object in JSON, and may be an array, bytes or a number.
     if not isinstance(request.kwargs, dict):
@@ -254,9 +254,9 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
     """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    If `arrived` is given, the time at which the requests arrived, s, of `time.perf_counter()`, the
-    `timing` of replies without an error also gets `encode_ms` and `total_ms`, which exclude only
-    the final joining of the frame.
+    If `arrived` is set, the time at which the requests arrived (s, of `time.perf_counter()`), the
+    `timing` of replies without an error also has `encode_ms` and `total_ms`. They exclude only the
+    final joining of the frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()
@@ -277,7 +277,7 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
             if reply.error is None:
                 reply.timing |= times_ms
 
-    # The timing is encoded last, in a separate loop, so that it covers the encoding of all else.
+    # The timing is encoded last, in a separate loop, so that it includes the encoding of the rest.
     for i, reply in enumerate(replies):
         if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
             times = ",".join(
@@ -313,7 +313,7 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
 
 
 def decode_replies(data: Buffer) -> list[Reply]:
-    """Decode the replies in a frame, at least one."""
+    """Decode the replies in a frame, which has at least one."""
     header, blobs = unpack(data, DEFAULT_LIMITS)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
@@ -368,7 +368,7 @@ def _timing(node: object) -> dict[str, float]:
 
 
 def describe_error(error: VLAgentsError) -> dict[str, Any]:
-    """Return an error as a node of a reply or a problem+json document; the inverse of
+    """Return an error as a node of a reply or of a problem+json document. This is the inverse of
     `read_error`.
     """
     node: dict[str, Any] = {"code": error.code, "detail": str(error)}

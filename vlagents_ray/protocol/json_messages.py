@@ -1,7 +1,7 @@
-"""Requests and replies for clients without this project's frames: JSON, with images as separate
-JPEG or PNG files.
+"""Requests and replies for clients that do not use this project's frames: JSON, with images as
+separate JPEG or PNG files.
 
-The JSON of a request holds `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and
+The JSON of a request contains `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and
 `contract`; each camera is a separate file. Arrays in a reply become lists.
 """
 
@@ -91,8 +91,8 @@ def reply_to_json(reply: Reply) -> dict[str, Any]:
 
 
 def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
-    """Return the problem+json document (RFC 9457) of an error; clients should test `code`, which
-    is stable.
+    """Return the problem+json document (RFC 9457) of an error. Clients should test its `code`,
+    which never changes.
     """
     return {
         "type": "about:blank",

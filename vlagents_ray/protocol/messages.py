@@ -20,23 +20,25 @@ from vlagents_ray.interface import Act, Obs
 PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
-MACHINE_HEADER = "x-boot-id"  # header of GET /v1/metadata: the caller's machine (see `boot_id`), or
-SERVERS_MACHINE = "server"  # the machine of the process that replies
+# A header of GET /v1/metadata: the caller's machine (see `boot_id`), or `SERVERS_MACHINE`, which
+# means the machine of the process that replies.
+MACHINE_HEADER = "x-boot-id"
+SERVERS_MACHINE = "server"
 DEADLINE_HEADER = "x-deadline-ms"
-# header of a reply: the session's step. A request with it is refused if the session is at any other
-# step.
+# A header of a reply: the session's step. A request with this header is rejected if the session is
+# at another step.
 STEP_HEADER = "x-step"
 PRIORITY_HEADER = "x-priority"
-MOST_DEADLINE_MS = 1e9  # 11 days
+MOST_DEADLINE_MS = 1e9  # the longest deadline: 11 days
 NAME_CHARACTERS = 128  # maximum length of a session's or a request's id
 STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable part
-# Maximum size of a WebSocket message: uvicorn's limit, which Serve does not let us change.
+# Maximum size of a WebSocket message: uvicorn's limit, which Serve does not allow to change.
 STREAM_BYTES = 16 * 2**20
 
 
 def is_name(text: str) -> bool:
-    """Return whether a text is a valid session or request id: visible ASCII, which cannot forge
-    a line in a log.
+    """Return whether a text is a valid session or request id, which consists of visible ASCII
+    characters, so that it cannot forge a line in a log.
     """
     return (
         text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
@@ -76,17 +78,17 @@ class Request:
     op: Op
     obs: Obs | None = None  # for reset, act and observe
     instruction: str | None = None  # reset only
-    # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
+    # For reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`.
     kwargs: dict[str, Any] = field(default_factory=dict)
-    # reset only: the contract of the robot or the environment, which the server checks against the
-    # policy's
+    # Reset only: the contract of the robot or the environment, which the server compares with the
+    # policy's contract.
     contract: dict[str, Any] | None = None
     # Reset only: earlier observations of the session, oldest first.
     history: list[Obs] = field(default_factory=list)
     session: str = ""  # id of the sender's session; empty for the only session of its connection
     priority: PriorityName = "robot"
-    # for act and reset: the `step` of the last reply; an act is refused if the session is at
-    # another step
+    # For act and reset: the `step` of the last reply. An act is rejected if the session is at
+    # another step.
     step: int | None = None
     request_id: str = ""
     # Time from the request's arrival after which the reply is of no use.
@@ -109,20 +111,21 @@ class Reply:
     error: VLAgentsError | None = None
     # The session's step: each act adds 1; a reset draws a number above all earlier steps.
     step: int | None = None
-    # The replica stops or is overloaded: the client should reconnect, and its session is moved.
+    # Whether the replica stops or is overloaded. The client should then reconnect, which moves its
+    # session.
     draining: bool = False
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Return whether this is the reply to that request, not an earlier one; an unreadable
-        frame has no id.
+        """Return whether this is the reply to that request, and not to an earlier one. The reply to
+        an unreadable frame has no id.
         """
         return self.request_id in ("", request.request_id)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the checkpoint, its digest and the commit of the weights, as far as the info of
-        a reset names them.
+        """Return the checkpoint, its digest and the commit of the weights, as far as the info of a
+        reset contains them.
         """
         info = self.info or {}
         return {name: info[name] for name in ("checkpoint", "weights", "revision") if name in info}
@@ -130,8 +133,8 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class MessageLimits:
-    """The limits of a decoder; anything larger raises `MessageTooLarge` before memory is
-    allocated for it.
+    """The limits of a decoder. A larger message raises `MessageTooLarge` before memory is allocated
+    for it.
     """
 
     body_bytes: int = 64 * 2**20
@@ -155,11 +158,11 @@ DEFAULT_LIMITS = MessageLimits()
 
 @dataclass(frozen=True, slots=True)
 class LocalAddress:
-    """The address for processes on the server's machine: `local` in the metadata."""
+    """The address for processes on the server's machine. It is `local` in the metadata."""
 
     socket: str  # name of a Unix socket in the abstract namespace, not in a file system
     boot_id: str  # random id of the machine, which Linux draws at each boot
-    # Whether the first message is the client's API key, which is replied to only if it is refused.
+    # Whether the first message is the client's API key. It is answered only if it is rejected.
     keyed: bool = False
 
     # The data of a request are in a memory file of the client, which is sent with the first message
@@ -168,19 +171,19 @@ class LocalAddress:
     # file that is sent with it.
     # REQUEST packs the number of the memory file, flags, and the number of bytes in it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")
-    # Bit n: memory file n is free again; flags.
+    # REPLY packs a bit for each memory file, which is set if the file is free again, and flags.
     REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")
-    # flag: the frame of the reply is in the memory file sent with the message.
+    # A flag: the frame of the reply is in the memory file that is sent with the message.
     IN_FILE: ClassVar[int] = 1
-    COMPACT: ClassVar[int] = 2  # flag: no frame
-    # Maximum number of a client's memory files; a policy that keeps observations needs more than
+    COMPACT: ClassVar[int] = 2  # a flag: the content is in compact form, not a frame
+    # Maximum number of memory files of a client. A policy that keeps observations needs more than
     # one.
     FILES: ClassVar[int] = 16
 
 
 @dataclass(frozen=True, slots=True)
 class StreamAddress:
-    """The replica's own port for WebSockets, on the host of the server's URL: `stream` in the
+    """The replica's own port for WebSockets, on the host of the server's URL. It is `stream` in the
     metadata.
     """
 
@@ -201,7 +204,7 @@ class StreamAddress:
 
 @dataclass(frozen=True, slots=True)
 class PlasmaAddress:
-    """The address for processes of the Ray cluster on the replica's node: `plasma` in the
+    """The address for processes of the Ray cluster on the replica's node. It is `plasma` in the
     metadata of the replica.
     """
 
@@ -210,7 +213,8 @@ class PlasmaAddress:
 
     # Ray's id of the channel that contains the frame or the arrays; flags as in `LocalAddress`.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<28sI")
-    # Ray's metadata of the channel's content: out-of-band buffers, to be joined.
+    # The tag in Ray's metadata of the channel: the content is a list of out-of-band buffers to
+    # concatenate.
     TAG: ClassVar[bytes] = b"VLA1"
 
 
@@ -219,12 +223,13 @@ _ADDRESS_TYPES = {"str": str, "int": int, "bool": bool}  # by annotation
 
 
 def read_address(kind: type[Address], document: object) -> Address | None:
-    """Read an address in the metadata of a server, which may be hostile; None if the server has
-    none.
+    """Read an address in the metadata of a server, which may be hostile; return None if the server
+    has no such address.
 
     Args:
         kind: `LocalAddress`, `StreamAddress` or `PlasmaAddress`.
-        document: The entry of the metadata. Its further keys, of a newer server, are ignored.
+        document: The entry of the metadata. Further keys, which a newer server may send, are
+            ignored.
 
     Raises:
         MalformedMessage: A key is missing, or its value has another type.
@@ -298,12 +303,12 @@ _LEAST_DECODING_S = 10e-3
 
 
 class Budget:
-    """The budget of one message: it checks declared sizes before an image is decoded or bytes are
+    """The budget of one message. It checks declared sizes before an image is decoded or bytes are
     copied.
 
-    This class enforces the limits only. A server's subclass also enforces those of the caller's key
-    and of the replica's memory, and chooses the decoding thread:
-    `vlagents_ray.serve.engine.admission.MessageAdmission`.
+    This class enforces only the limits. A server uses the subclass
+    `vlagents_ray.serve.engine.admission.MessageAdmission`, which also enforces the limits of the
+    caller's key and of the replica's memory, and chooses the decoding thread.
     """
 
     __slots__ = ("_left", "_seconds_left", "files", "limits", "serial")
@@ -317,18 +322,18 @@ class Budget:
 
     def begin_message(self) -> None:
         """Count the message for its sender before any of it is parsed; raise an error if it is
-        refused.
+        rejected.
         """
 
     def parse(self, size: int) -> None:
-        """Count the memory for the values of `size` bytes of JSON before they are parsed; raise
-        as `hold`.
+        """Count the memory for the values of `size` bytes of JSON before they are parsed. This
+        raises the errors of `hold`.
         """
         self.hold(_JSON_FACTOR * size)
 
     def begin(self, op: object, priority: object = "robot") -> None:
-        """Begin the next request of the message after its header is parsed; raise an error if it
-        is refused.
+        """Begin the next request of the message after its header is parsed; raise an error if it is
+        rejected.
         """
         self._refill()
 
@@ -338,8 +343,10 @@ class Budget:
         self._seconds_left = _LEAST_DECODING_S + _DECODING_S * self.limits.decoded_bytes
 
     def count(self, size: int) -> None:
-        """Count `size` bytes of the request that are in memory already; raise `MessageTooLarge`
-        over the limit.
+        """Count `size` bytes of the request that are already in memory.
+
+        Raises:
+            MessageTooLarge: The request exceeds the limit.
         """
         self._left -= size
         if self._left < 0:
@@ -361,7 +368,7 @@ class Budget:
 
         Args:
             seconds: Its estimated time on one core, s.
-            scratch_bytes: Memory that it needs until it ends, beside the images, bytes.
+            scratch_bytes: Memory that it needs until it ends, in addition to the images, bytes.
         """
         self._seconds_left -= seconds
         if self._seconds_left < 0:
@@ -373,10 +380,10 @@ class Budget:
         yield
 
 
-# A probe tests the link. It is answered at once, without a session or the policy. It consists of
-# b"VLA?", an unused uint32, and as many bytes as the link should be tested with; it is one
-# WebSocket message, under the limits of a request. The answer is b"VLA!" and the number of bytes
-# that arrived, uint64 little-endian.
+# A probe tests the link. It is answered immediately, without a session or the policy. It consists
+# of b"VLA?", an unused uint32, and any number of bytes to test the link with. It is one WebSocket
+# message, with the limits of a request. The answer is b"VLA!" and the number of bytes that arrived,
+# uint64 little-endian.
 
 _HEAD_BYTES = 8  # size of the tag and the uint32
 _PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"
@@ -389,8 +396,10 @@ def is_probe(message: bytes | memoryview) -> bool:
 
 
 def read_probe(message: bytes, budget: Budget) -> None:
-    """Count a probe as one request of a simulation; raise `MalformedMessage` for any other
-    message.
+    """Count a probe as one request of a simulation.
+
+    Raises:
+        MalformedMessage: The message is not a probe.
     """
     budget.begin_message()
     if not is_probe(message):

@@ -1,11 +1,11 @@
 """A compact form of acts between two processes of one machine, which omits the fields that are the
 same at each step.
 
-An observation's layout (session, class, names and sizes of cameras and state) is sent once, as
-JSON; later messages refer to it by its number. The rest of a request is an `ITEM`, and its arrays,
-which are stored one after the other in shared memory, each at a multiple of 64. A reply consists of
-an `ANSWER`, the action, and the `WEIGHTS` that acted. All other messages (a reset, `info`, an
-error) are sent as frames; see `vlagents_ray.protocol.frames`.
+An observation's layout (session, priority, names and sizes of cameras and state) is sent once, as
+JSON. Later messages refer to it by its number. The rest of a request is an `ITEM` and its arrays,
+which are stored in sequence in shared memory, each at a multiple of 64. A reply consists of an
+`ANSWER`, the action, and the `WEIGHTS` that acted. All other messages (a reset, `info`, an error)
+are sent as frames; see `vlagents_ray.protocol.frames`.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 COUNT = struct.Struct("<I")
-# layout, size of its JSON, step or -1, deadline ms, gripper, request id.
+# Layout, size of its JSON, step or -1, deadline in ms, gripper, request id.
 ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")
-# id, step, flags, dimensions, H, D, batch size, times in ms.
+# Request id, step, flags, dimensions, H, D, batch size, times in ms.
 ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")
 _DONE, _DRAINING, _POLICY = 1, 2, 4
 # The weights of an answer, after all actions, if the flag _POLICY is set: version, digest.
@@ -70,8 +70,8 @@ class Layout:
         return cls(session, priority, tuple(placed[0]), tuple(placed[1]), at)
 
     def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
-        """Return the offset of each array if the first one is at `at`; None if the request is no
-        act of this layout.
+        """Return the offset of each array if the first one is at `at`; None if the request is not
+        an act with this layout.
 
         Comparing each array is faster than computing the request's `_key`.
         """
@@ -117,8 +117,8 @@ class ShmWriter:
         self._latest: dict[str, tuple[int, Layout]] = {}
 
     def write(self, requests: Sequence[Request]) -> Written | None:
-        """Return the message and the offsets of the arrays; None if the requests must be sent as
-        a frame.
+        """Return the message and the offsets of the arrays; None if the requests must be sent as a
+        frame.
         """
         items, texts = [COUNT.pack(len(requests))], []
         arrays: list[tuple[int, np.ndarray]] = []
@@ -173,8 +173,8 @@ class Written:
     arrays: list[tuple[int, np.ndarray]]  # offset, array
 
     def parts(self) -> list[Buffer]:
-        """Return the content of the memory: the arrays, not copied where possible, and the gaps
-        between them.
+        """Return the content of the memory: the arrays, which are not copied if possible, and the
+        gaps between them.
         """
         pieces: list[Buffer] = []
         end = 0
@@ -196,7 +196,8 @@ class ShmReader:
     def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
         """Return the requests of a message, whose arrays are views of `memory`, (N,) uint8.
 
-        Raises `InvalidInput` if the message is malformed.
+        Raises:
+            InvalidInput: The message is malformed.
         """
         try:
             (count,) = COUNT.unpack_from(message)
@@ -302,10 +303,10 @@ class ShmReader:
 
 
 def _is_plain(request: Request, obs: Obs) -> bool:
-    """Return whether a request can be sent in compact form, apart from its arrays."""
+    """Return whether the fields of a request, except its arrays, can be sent in compact form."""
     if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
         return False
-    # An invalid value is sent as a frame, to get an error.
+    # An invalid value is sent as a frame, so that the server answers with an error.
     return obs.gripper is None or 0.0 <= obs.gripper <= 1.0
 
 
@@ -335,8 +336,8 @@ def _key(request: Request) -> tuple[Any, ...] | None:
 
 
 def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
-    """Encode the replies to acts, with the `timing` of `encode_replies`; None if they must be
-    sent as a frame.
+    """Encode the replies to acts, with the `timing` of `encode_replies`; return None if they must
+    be sent as a frame.
     """
     begun = time.perf_counter()
     actions, weights = [], []
@@ -391,9 +392,7 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
 
 
 def _packed(info: Mapping[str, Any]) -> bytes | None:
-    """Encode the weights that the info of an act names; return None if the info contains
-    anything else.
-    """
+    """Encode the weights in the info of an act; return None if the info contains anything else."""
     policy = info.get(POLICY)
     if len(info) != 1 or type(policy) is not dict or len(policy) != 2:
         return None

@@ -55,8 +55,10 @@ class ValueWriter:
         return {"$": ["img", len(self.blobs) - 1]}
 
     def value(self, value: Any) -> Any:
-        """Return the JSON form of a supported value; raise `InvalidInput` with the type of an
-        unsupported one.
+        """Return the JSON form of a value.
+
+        Raises:
+            InvalidInput: The type of the value is not supported; the message names it.
         """
         if value is None or isinstance(value, (bool, str, int)):
             return value
@@ -71,7 +73,7 @@ class ValueWriter:
         if isinstance(value, (bytes, bytearray, memoryview)):
             self.blobs.append(bytes(value))
             return {"$": ["bin", len(self.blobs) - 1]}
-        # `dict` stands first, since the check of an abstract class takes ten times as long.
+        # `dict` comes first, since the check of an abstract class takes ten times as long.
         if isinstance(value, (dict, Mapping)):
             for key in value:
                 if not isinstance(key, str) or key == "$":
@@ -94,10 +96,10 @@ class ValueReader:
         self._blobs, self._budget = blobs, budget
         self.limits = budget.limits
         self._items = 0
-        # The decoded images by blob; each is decoded once, whatever its number of uses.
+        # The decoded images by blob. Each is decoded once, even if it is used several times.
         self._images: dict[int, np.ndarray] = {}
         self._copies: dict[int, bytes] = {}  # the bytes by blob; each is copied once
-        # The blobs that were decoded in advance and have no reference yet.
+        # The blobs that were decoded in advance and have not been referenced yet.
         self._fresh: set[int] = set()
 
     def begin(self) -> None:
@@ -171,7 +173,7 @@ class ValueReader:
             self._images[index] = image
         elif index in self._fresh:  # the budget was charged when the image was decoded
             self._fresh.discard(index)
-        else:  # a reader of the request may copy each reference
+        else:  # the recipient of the request may copy each reference
             self._budget.count(image.nbytes)
             image.flags.writeable = False  # several observations share it
         return image
@@ -195,7 +197,7 @@ class ValueReader:
 
 
 def _reference(node: Any) -> list[Any]:
-    """Return the list in `{"$": [kind, blob, ...]}`; an empty one for anything else."""
+    """Return the list in `{"$": [kind, blob, ...]}`; an empty list for anything else."""
     reference = node.get("$") if isinstance(node, dict) else None
     return reference if isinstance(reference, list) else []
 
@@ -263,7 +265,7 @@ def require_array_name(name: str) -> None:
 
 
 def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
-    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention
+    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits. Errors mention
     `name`.
     """
     if (
@@ -284,7 +286,7 @@ def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
 
 
 def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
-    """Convert a list of numbers or an array to (D,) float32 within the limits; errors mention
+    """Convert a list of numbers or an array to (D,) float32 within the limits. Errors mention
     `name`.
     """
     is_list = isinstance(values, list)
@@ -312,7 +314,7 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
 
 
 def require_obs(obs: Any) -> None:
-    """Raise `InvalidObservation` for a value of a program that cannot be sent as an observation."""
+    """Raise `InvalidObservation` if a value of a program cannot be sent as an observation."""
     if not isinstance(obs, Obs):
         raise InvalidObservation(
             f"observation: expected an Obs, got {described(obs)}; make one, as in "
@@ -358,7 +360,7 @@ def _as_float32(name: str, values: Any) -> np.ndarray:
 
 
 def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:
-    """Convert an observation, which is not changed, to its JSON form; raw images and arrays are
+    """Convert an observation, which is not changed, to its JSON form. Raw images and arrays are
     views, not copies.
     """
     if codec.name == "raw":
@@ -377,8 +379,8 @@ def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a number that a float can represent; a bool is not a number, as
-    in JSON.
+    """Return whether a value is a number that a float can represent. As in JSON, a bool is not a
+    number.
     """
     if isinstance(value, int):
         return not isinstance(value, bool) and value.bit_length() < 1024
@@ -386,8 +388,8 @@ def is_number(value: object) -> bool:
 
 
 def require_plain(value: Any, depth: int) -> None:
-    """Raise an error unless a value of another protocol has only wire types, text keys and at
-    most `depth` levels.
+    """Raise an error if a value of another protocol has a type that frames cannot contain, a key
+    that is not text, or more than `depth` levels.
     """
     if isinstance(value, (dict, list)):
         if depth <= 0:
@@ -406,8 +408,10 @@ def require_plain(value: Any, depth: int) -> None:
 
 
 def to_text(value: Any) -> str:
-    """Convert a supported value to JSON with arrays and bytes in base64; raise `InvalidInput` as
-    `ValueWriter` does.
+    """Convert a value to JSON with arrays and bytes in base64.
+
+    Raises:
+        InvalidInput: The type of the value is not supported, see `ValueWriter`.
     """
     writer = ValueWriter()
     plain = writer.value(value)
@@ -418,7 +422,11 @@ def to_text(value: Any) -> str:
 
 
 def from_text(text: str, budget: Budget) -> Any:
-    """Return the value that `to_text` converted; raise `MalformedMessage` for other text."""
+    """Return the value that `to_text` converted.
+
+    Raises:
+        MalformedMessage: It is another text.
+    """
     document = parse_json(text, "value:", long=True)
     try:
         blobs = [base64.b64decode(blob, validate=True) for blob in document.get("blobs", ())]

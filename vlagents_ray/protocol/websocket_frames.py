@@ -1,4 +1,4 @@
-"""WebSocket frames (RFC 6455, 5.2), with fewer copies and calls than those of the library
+"""Reads and writes WebSocket frames (RFC 6455, 5.2) with fewer copies and calls than the library
 `websockets`.
 """
 
@@ -16,14 +16,14 @@ _SMALL_BYTES = 1024
 _BINARY = 0x80 | Opcode.BINARY  # first byte of a message in one frame
 # Maximum size of a frame's head: two bytes, eight bytes of the size, and a mask of four bytes.
 HEAD_BYTES = 14
-# A connection may send a control frame each second, 16 at once: for keep-alive, one in 20 s is
+# A connection may send one control frame each second, or 16 at once. For keep-alive, one in 20 s is
 # usual.
 CONTROL_FRAMES_PER_S, CONTROL_FRAMES = 1.0, 16
 
 
 def frame_head(size: int, mask: bytes = b"") -> bytes:
-    """Return the head of the frame of a binary message of `size` bytes; a client's frame has a
-    mask of four bytes.
+    """Return the head of the frame of a binary message of `size` bytes. A client's frame has a mask
+    of four bytes.
     """
     bit = 0x80 if mask else 0
     if size < 126:
@@ -34,9 +34,7 @@ def frame_head(size: int, mask: bytes = b"") -> bytes:
 
 
 def frame_size(head: bytes) -> int | None:
-    """Return the size of a frame with its head, in bytes; None if `head` is not the complete
-    head.
-    """
+    """Return the size of a frame with its head, bytes; None if `head` is incomplete."""
     if len(head) < 2:
         return None
     mask_bytes = 4 if head[1] & 0x80 else 0
@@ -53,8 +51,8 @@ def frame_size(head: bytes) -> int | None:
 class ReceiveBuffer(StreamReader):
     """The bytes of WebSocket frames that one connection has received, until they are parsed.
 
-    A message that arrives as a whole is parsed where it was read, and only copied when its mask is
-    removed. The reader of `websockets` copies each message three times.
+    A message that arrives as a whole is parsed in the memory into which it was read, and only
+    copied when its mask is removed. The reader of `websockets` copies each message three times.
     """
 
     buffer: bytes | bytearray | memoryview  # type: ignore[assignment]
@@ -65,13 +63,13 @@ class ReceiveBuffer(StreamReader):
         self._limit = limit
         self._start = 0  # start of the unparsed bytes in `buffer`
         self._between_frames = False  # whether the next byte begins a frame
-        # Whether a frame was a part of a message: the parser then checks all that follow.
+        # Whether a frame was only a part of a message. The parser then checks all later frames.
         self._fragments = False
 
     @property
     def size(self) -> int:
-        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0
-        is reliable.
+        """Number of unparsed bytes. On other threads than the thread of `parse`, it is only
+        reliable whether it is 0.
         """
         return len(self.buffer) - self._start
 
@@ -83,7 +81,7 @@ class ReceiveBuffer(StreamReader):
         self._protocol = protocol
 
     def parse(self, data: bytes | memoryview) -> None:
-        """Parse bytes of memory that is reused, and copy the rest after the last complete frame."""
+        """Parse bytes in memory that will be reused, and copy the incomplete last frame."""
         if self._between_frames and not self._fragments:
             message = self._message(data)
             if message is not None:
@@ -101,7 +99,7 @@ class ReceiveBuffer(StreamReader):
         self._start = 0
 
     def _message(self, data: bytes | memoryview) -> bytes | None:
-        """Return the message if `data` are one binary frame; None if they must be parsed step by
+        """Return the message if `data` is one binary frame; None if it must be parsed step by
         step.
         """
         masked = self._protocol.side is SERVER  # only a client's frames have a mask
@@ -132,8 +130,8 @@ class ReceiveBuffer(StreamReader):
             self.buffer, self._start = data, 0
 
     def read_exact(self, n: int) -> Generator[None, None, bytearray]:
-        """Return the next `n` bytes once they have arrived; many bytes that were just received
-        are a view.
+        """Return the next `n` bytes once they have arrived. Many bytes that were just received are
+        returned as a view.
         """
         while self.size < n:
             if self.eof:
@@ -144,8 +142,8 @@ class ReceiveBuffer(StreamReader):
         return data if n > _SMALL_BYTES else bytearray(data)  # type: ignore[return-value]
 
     def at_eof(self) -> Generator[None, None, bool]:
-        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean
-        that it has not.
+        """Return whether the connection has ended, as soon as that is known. If there are unparsed
+        bytes, it has not.
         """
         while not self.size:
             if self.eof:

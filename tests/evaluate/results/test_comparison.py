@@ -84,7 +84,8 @@ def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
         [folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", env_options={"state_dim": 1})]
     )
     with pytest.raises(
-        ConfigError, match=r"had env_options {} for 'a', but {'state_dim': 1} for 'b'"
+        ConfigError,
+        match=r"expected the same env_options of .*, got {} for 'a' and {'state_dim': 1} for 'b'",
     ):
         compare(results, "a", "b")
     assert comparable(results)[0] == []

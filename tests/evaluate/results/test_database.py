@@ -188,6 +188,7 @@ def test_a_column_that_is_missing_is_named(config: Config, table: str, column: s
         db.execute(f"ALTER TABLE {table} RENAME COLUMN {column} TO odd")
         db.execute(f"ALTER TABLE {table} DROP COLUMN odd")
     with pytest.raises(
-        ConfigError, match=rf"got none of the columns \['{column}'\] in its table '{table}'"
+        ConfigError,
+        match=rf"expected the table '{table}' .*, got none of the columns \['{column}'\]",
     ):
         Results.load(config().out)

@@ -188,7 +188,7 @@ def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
         store.begin_run({})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 3})
         store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
-        with pytest.raises(ConfigError, match=r"expected the checkpoint 'a' .*, got 'b'"):
+        with pytest.raises(ConfigError, match=r"expected checkpoint 'a', .*, got 'b'"):
             store.note_policy("policy", {"policy": "act", "checkpoint": "b"})
         assert Results.load(config().out).policies == {
             "policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}

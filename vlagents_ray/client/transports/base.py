@@ -25,11 +25,11 @@ _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 SPIN_S = 150e-6  # s to poll for an answer before sleeping
-FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
+FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is polled for
 
 
 def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
-    """Return the error of a request without an answer, with its likely causes."""
+    """Return the error for a request without an answer, with likely causes."""
     return DeadlineExceeded(
         f"{address}: no answer within {timeout_s:g} s; the policy may need longer (raise "
         "timeout_s) or hang in a call (the server's log then names the line)"
@@ -37,9 +37,7 @@ def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
 
 
 def connection_lost(address: str, reason: object) -> ConnectionLost:
-    """Return the error of a connection that ended after a request was sent, with its likely
-    causes.
-    """
+    """Return the error for a connection that ended after a request was sent, with likely causes."""
     return ConnectionLost(
         f"{address}: {reason}; if the server was not restarted, the policy may have ended its "
         "process (os._exit, a crash in C code, exhausted memory): see the server's log"
@@ -47,11 +45,10 @@ def connection_lost(address: str, reason: object) -> ConnectionLost:
 
 
 class Transport(Protocol):
-    """Carries the requests of one frame at a time to one replica of a server, which `connect`
-    chooses.
+    """Sends requests, one frame at a time, to the replica of a server that `connect` chooses.
 
-    A request names its session, which ends with its `close` request, or with the connection. Errors
-    that the server replies with are in `Reply.error`. After `close`, `connect` may choose another
+    A request names its session, which ends with its `close` request or with the connection. An
+    error in a reply of the server is in `Reply.error`. After `close`, `connect` may choose another
     replica.
 
     Raises:
@@ -81,11 +78,11 @@ class Transport(Protocol):
 
 
 class ConnectReport:
-    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client
-    retries.
+    """Logs once, after 2 s of failed attempts to connect, that a server is not ready and that the
+    client retries.
 
-    That the host's name is unknown is logged at once: it is most often misspelt, but a container's
-    name may come later.
+    An unknown host name is logged immediately, as it is most often misspelt. The client still
+    retries, since the name of a container may be registered later.
     """
 
     def __init__(self, url: str, timeout_s: float) -> None:
@@ -107,25 +104,27 @@ class ConnectReport:
 
 
 def first_timeout_s(timeout_s: float) -> float:
-    """Return the time limit, s, for the first byte of the first replica, out of `timeout_s`; the
-    next gets twice that.
+    """Return the part of `timeout_s` that is the time limit for the first byte of the first
+    replica, s. The next replica gets twice that.
 
-    So every attempt to connect, however short, tries at least two replicas, the first of which may
+    Every attempt to connect, however short, thus tries at least two replicas, as the first one may
     hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
 
 def left_s(deadline: float) -> float:
-    """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no
-    limit to some calls.
+    """Return the time until a deadline of `time.monotonic`, s. It is at least 1 ms, as 0 means no
+    limit in some calls.
     """
     return max(1e-3, deadline - time.monotonic())
 
 
 def wait(connection: socket.socket, event: int, deadline: float) -> None:
-    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at
-    the deadline.
+    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`.
+
+    Raises:
+        TimeoutError: The deadline has passed.
     """
     left_s = deadline - time.monotonic()
     poller = select.poll()
@@ -137,20 +136,20 @@ def wait(connection: socket.socket, event: int, deadline: float) -> None:
 def await_answer(
     poller: select.poll, connection: socket.socket, spin_until: float, deadline: float
 ) -> None:
-    """Wait for `connection`, which `poller` polls, as `wait`; sleep only after `spin_until`, s
-    of `perf_counter`.
+    """Wait for `connection`, which `poller` polls, as `wait` does, but sleep only after
+    `spin_until`, s of `perf_counter`.
     """
     while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
         if time.perf_counter() < spin_until:
-            # Other processes can use the core; to be woken up takes as long as everything else.
+            # Other processes can use the core; waking up from a sleep would double the latency.
             os.sched_yield()
         else:
             wait(connection, select.POLLIN, deadline)
 
 
 class CodecChoice:
-    """The codec of a connection's cameras: the user's choice, or one that depends on the location
-    of the server.
+    """The codec of a connection's cameras. It is the user's choice, or depends on the location of
+    the server.
 
     Within a machine, "auto" and "exact" select raw pixels; over a network, "auto" selects JPEG and
     "exact" PNG. On one core of a server, JPEG costs 3 ns per byte of pixels, encoded and decoded,
@@ -173,13 +172,13 @@ class CodecChoice:
             self.codec = ImageCodec(requested)
 
     def connected(self, *, near: bool) -> None:
-        """Choose the codec of a new connection; `near` is whether its server is on this machine."""
+        """Choose the codec of a new connection; `near`: whether its server is on this machine."""
         if self._compressed is not None:
             self.codec = RAW if near else self._compressed
 
     def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
-        """Return the codec for an observation; never raw for more than `most_bytes`, unless the
-        user chose that.
+        """Return the codec for an observation. It is not raw for more than `most_bytes`, unless the
+        user chose raw pixels.
         """
         codec = self.codec or RAW
         if self._compressed is not None and obs is not None and codec == RAW:

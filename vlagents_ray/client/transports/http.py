@@ -54,8 +54,8 @@ _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica e
 
 
 class HttpTransport:
-    """The HTTP/1.1 transport; a header names the session, and routes all requests of this object
-    to one replica.
+    """The HTTP/1.1 transport. A header names the session, and routes all requests of this object to
+    one replica.
     """
 
     name = "http"
@@ -64,8 +64,8 @@ class HttpTransport:
     def __init__(
         self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = ""
     ) -> None:
-        """Set the server; with `machine` (see `MACHINE_HEADER`), prefer the least loaded replica
-        on that machine.
+        """Set the server. With `machine` (see `MACHINE_HEADER`), the least loaded replica on that
+        machine is preferred.
         """
         self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
@@ -74,7 +74,7 @@ class HttpTransport:
         self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Return the server's metadata once it answers; retries while it is not ready."""
+        """Return the server's metadata once it answers. This retries while it is not ready."""
         url = self._url.geturl()
         deadline = time.monotonic() + timeout_s
         report = ConnectReport(url, timeout_s)
@@ -142,8 +142,8 @@ class HttpTransport:
         return document
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one POST; a response that is not a frame of replies becomes an error of the
-        server or the proxy.
+        """Send one POST request. A response that is not a frame of replies becomes an error of the
+        server or of the proxy.
         """
         headers = {
             SESSION_HEADER: self._session,
@@ -225,7 +225,7 @@ class HttpTransport:
 
 
 def no_replica(url: str, error: Exception) -> NoReplica:
-    """Return the error of a client that cannot connect."""
+    """Return the error for a client that cannot connect."""
     if isinstance(error, socket.gaierror):
         return NoReplica(
             f"{url}: there is no host of this name ({error}); correct the name, or write its IP "
@@ -235,8 +235,10 @@ def no_replica(url: str, error: Exception) -> NoReplica:
 
 
 def http_url(url: str) -> SplitResult:
-    """Return the http(s) form of a server's URL; raises `ConfigError` if it is not a server's
-    URL.
+    """Return the http(s) form of a server's URL.
+
+    Raises:
+        ConfigError: It is not the URL of a server.
     """
     parts = urlsplit(url)
     scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
@@ -248,7 +250,7 @@ def http_url(url: str) -> SplitResult:
 
 
 def _closed_by_peer(sock: socket.socket | None) -> bool:
-    """Return whether the server closed an idle connection: only then is there anything to read."""
+    """Return whether the server has closed an idle connection, which is then readable."""
     if sock is None:
         return True
     poller = select.poll()
@@ -269,7 +271,7 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
         return MessageTooLarge(
             f"a proxy rejects bodies of this size ({text}); raise its limit, or send JPEG"
         )
-    if status in (401, 403):  # without a JSON document, as when a WebSocket is refused
+    if status in (401, 403):  # without a JSON document, as for a rejected WebSocket
         return (Unauthorized if status == 401 else Forbidden)(
             f"the server rejects this API key, or requires one (HTTP {status}); set api_key or "
             f"{KEY_VARIABLE}"
@@ -284,5 +286,5 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
 def _json(body: bytes) -> Any:
     try:
         return json.loads(body)
-    except (ValueError, RecursionError):  # no JSON, or a hostile server's
+    except (ValueError, RecursionError):  # not JSON, or JSON of a hostile server
         return None

@@ -1,5 +1,5 @@
-"""Selects the transport for a URL; "auto" is the fastest that the server allows when it
-connects.
+"""Selects the transport for a URL. "auto" is the fastest one that the server allows at the time of
+the connection.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
 class AutoTransport:
-    """Uses shared memory if the policy runs on this machine for this user; else a WebSocket.
+    """Uses shared memory if the policy runs on this machine for this user, otherwise a WebSocket.
 
-    Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve
-    handle. Shared memory comes first because it is faster, without Ray's locks and framing; plasma
-    reaches a replica on this node whose socket is in another network namespace. If the object store
-    has no room for a channel, the handle is used instead: its frames are in the store for a moment,
-    or on disk if the store has no room for them.
+    Inside the cluster, it uses shared memory, otherwise a plasma channel on the replica's node,
+    otherwise the Serve handle. Shared memory comes first because it is faster, as it needs no locks
+    and no framing of Ray. Plasma reaches a replica on this node whose socket is in another network
+    namespace. If the object store has no space for a channel, the handle is used instead: its
+    frames are in the store for a moment, or on disk if the store has no space for them.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class AutoTransport:
             metadata_source.close()
             raise
 
-        # A client in the cluster needs a key for shared memory only; without one, it uses another
+        # A client in the cluster needs a key only for shared memory. Without a key, it uses another
         # transport.
         needs_key = local is not None and local.keyed and not self._credentials.api_key
         if handle is not None and not self._only_shm and needs_key:
@@ -114,7 +114,7 @@ class AutoTransport:
         return self._chosen.call(requests, timeout_s)
 
     def close(self) -> None:
-        """End the connection; the next one chooses again, since the server may have moved."""
+        """End the connection. The next one chooses again, since the server may have moved."""
         if self._chosen is not None:
             self._chosen.close()
             self._chosen = self._handle = None
@@ -141,7 +141,11 @@ class AutoTransport:
 def select_transport(
     url: str, transport: str, codec: CodecChoice, credentials: Credentials
 ) -> Transport:
-    """Return the transport for a URL; raises `ConfigError` if the URL does not support it."""
+    """Return the transport for a URL.
+
+    Raises:
+        ConfigError: The URL does not support the transport.
+    """
     is_in_cluster = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
         raise ConfigError(

@@ -41,12 +41,12 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.ray_tools import private
 
-_PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
+_PAUSE_S = 0.2  # s before another replica is requested after one was lost
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
-# The time to wait for the first query, s; an application without a replica does not answer.
+# The longest wait for the first query, s. An application without a replica does not answer.
 _FIRST_QUERY_S = 3.0
 _CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
-_WRITE_MS = 1000  # the channel is free when a frame is written; a longer wait is a fault
+_WRITE_MS = 1000  # longest wait for the channel, which should be free when a frame is written
 
 
 class ClientApi(Protocol):
@@ -64,7 +64,7 @@ class ClientApi(Protocol):
         """Return the replies to a frame of requests."""
 
     async def lease(self, length: int) -> tuple[bytes, int]:
-        """Lease a plasma channel for frames of `length` bytes; return its id and its capacity in
+        """Lease a plasma channel for frames of `length` bytes; return its id and its capacity,
         bytes.
         """
 
@@ -73,7 +73,7 @@ class ClientApi(Protocol):
 
 
 class HandleTransport:
-    """Sends raw frames as plasma objects, which the replica reads in place if it is on this
+    """Sends raw frames as plasma objects, which the replica reads without a copy if it is on this
     node.
     """
 
@@ -81,15 +81,19 @@ class HandleTransport:
     holds_sessions = False
 
     def __init__(self, app: str, *, must_be_near: bool = False) -> None:
-        """Set the application; `must_be_near` accepts no other machine, even if replicas there
-        have far less load.
+        """Set the application.
+
+        Args:
+            app: The name of the application.
+            must_be_near: Whether to accept only replicas on this machine, even if others have far
+                less load.
         """
         self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Choose a replica, again if the chosen one is gone; return the metadata."""
+        """Choose a replica, or another one if the chosen one has ended; return its metadata."""
         import ray
 
         if not ray.is_initialized():
@@ -145,8 +149,8 @@ class HandleTransport:
         """Make one actor call; the frame is in plasma until the reply."""
         import ray
 
-        # A bare buffer is stored in plasma apart from its pickle; an array's pickle depends on the
-        # version of numpy.
+        # Ray stores a plain buffer in plasma, separately from its pickle. The pickle of an array
+        # would depend on the version of numpy.
         content = pickle.PickleBuffer(encode_requests(requests, RAW))
         try:
             frame = ray.put(content)
@@ -172,8 +176,10 @@ class HandleTransport:
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
-        """Call `ClientApi.lease` of the chosen replica; raises its errors if they are of this
-        package.
+        """Call `ClientApi.lease` of the chosen replica.
+
+        Raises:
+            VLAgentsError: The replica raised it.
         """
         import ray
 
@@ -204,8 +210,8 @@ class HandleTransport:
 
 
 class ReplicaNodes:
-    """The nodes on which an application has its replicas, queried with little blocking of the
-    caller.
+    """Queries the nodes on which an application has replicas, while blocking the caller as little
+    as possible.
     """
 
     def __init__(self, app: str) -> None:
@@ -215,8 +221,8 @@ class ReplicaNodes:
         self._answer: Any = None  # the pending answer
 
     def query(self) -> dict[str, int]:
-        """Return the number of replicas on each node, by Ray's id, from the last answer; {} if
-        there is none yet.
+        """Return the number of replicas on each node, by Ray's id, from the last answer; {} before
+        the first answer.
         """
         import ray
         from ray import serve
@@ -239,10 +245,10 @@ class ReplicaNodes:
 
 
 def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_id: str = "") -> Any:
-    """Call a method of one replica, as Serve's own router does; a Serve handle cannot choose its
+    """Call a method of one replica, as Serve's own router does. A Serve handle cannot choose the
     replica.
 
-    `method` is one of `ClientApi`, or one of those between replicas.
+    `method` is a method of `ClientApi` or of `SiblingApi`.
     """
     header = private.replica_request(request_id or uuid.uuid4().hex, method.__name__)
     return replica.handle_request.remote(header, *args)
@@ -253,11 +259,11 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
 
 
 class PlasmaTransport(UnixTransport):
-    """Writes raw frames into a channel that the replica leases to this connection, which is a
+    """Writes raw frames into a channel that the replica leases to this connection, which is one
     session.
 
-    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. A frame
-    that outgrows the channel gets a larger one.
+    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. If a frame
+    is too large for the channel, a larger one is leased.
     """
 
     name: ClassVar[str] = "plasma"
@@ -285,8 +291,8 @@ class PlasmaTransport(UnixTransport):
     def connect_to(
         self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float
     ) -> None:
-        """Connect like `connect`, but to the replica that `handle` chose and whose metadata is
-        passed.
+        """Connect as `connect` does, but to the replica that `handle` chose and that has this
+        metadata.
         """
         node = this_node()
         if node is None:
@@ -326,7 +332,7 @@ class PlasmaTransport(UnixTransport):
             key, self._capacity = self._handle.lease(
                 frame.total_bytes, max(1e-3, deadline - time.monotonic())
             )
-            # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
+            # The id is sufficient, as the replica owns the object and keeps it until it ends.
             self._channel = ray.ObjectRef(key)
             private.register_writer(self._channel)
 
@@ -340,7 +346,7 @@ class PlasmaTransport(UnixTransport):
         return (message if written is None else message + written.message), None
 
     def _unsent(self) -> None:
-        self._unread = False  # if this frame was not read, the channel refuses a later one
+        self._unread = False  # if this frame was not read, the channel rejects a later one
 
     def _answered(self, freed: int) -> None:
         self._unread = False
@@ -352,8 +358,8 @@ class PlasmaTransport(UnixTransport):
 
 
 def _chunks(buffers: Iterable[Buffer]) -> Iterator[memoryview]:
-    """Divide buffers into chunks: Ray copies longer ones with six threads, whose start takes longer
-    than the copy.
+    """Divide buffers into chunks. Ray copies longer buffers with six threads, and starting these
+    takes longer than the copy.
     """
     for buffer in buffers:
         for start in range(0, len(buffer), _CHUNK):
@@ -361,7 +367,7 @@ def _chunks(buffers: Iterable[Buffer]) -> Iterator[memoryview]:
 
 
 def this_node() -> str | None:
-    """Return the id of the Ray node of this process; None for a Ray client, and without Ray."""
+    """Return the id of the Ray node of this process; None for a Ray client, or without Ray."""
     if private.node_of_this_process() is None:
         return None
     import ray

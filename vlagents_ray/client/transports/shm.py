@@ -41,8 +41,8 @@ _PAGE = mmap.PAGESIZE
 
 
 class UnixTransport(ABC):
-    """Sends messages and receives replies; subclasses write the observations. Sessions end with
-    the connection.
+    """Sends messages and receives replies. Subclasses write the observations. Sessions end with the
+    connection.
     """
 
     name: ClassVar[str]
@@ -63,10 +63,14 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        """Write requests to memory that the server reads; return the message and any descriptor to
-        send.
+        """Write requests to memory that the server reads.
 
-        Raises `TimeoutError` at the deadline, and `OSError` if writing fails.
+        Returns:
+            The message to send, and the descriptor to send with it, if any.
+
+        Raises:
+            TimeoutError: The deadline has passed.
+            OSError: Writing failed.
         """
 
     @abstractmethod
@@ -78,8 +82,8 @@ class UnixTransport(ABC):
         """Process a reply. Bit n of `freed` is set if the server no longer reads memory n."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Write requests for the server, send it a message and return its replies; late replies
-        are discarded.
+        """Write requests for the server, send it a message and return its replies. Late replies to
+        earlier requests are discarded.
         """
         deadline = time.monotonic() + timeout_s
         connection = self._socket or self._open(timeout_s)
@@ -102,8 +106,11 @@ class UnixTransport(ABC):
     def _send(
         self, connection: socket.socket, requests: Sequence[Request], deadline: float
     ) -> None:
-        """Write requests to memory that the server reads, and send the message; raises
-        `TimeoutError` or `OSError`.
+        """Write requests to memory that the server reads, and send the message.
+
+        Raises:
+            TimeoutError: The deadline has passed.
+            OSError: Writing or sending failed.
         """
         try:
             while not self._is_free():  # the memory still holds requests that timed out
@@ -131,7 +138,7 @@ class UnixTransport(ABC):
             await_answer(self._poller, connection, spin_until, deadline)
             replies = self._receive(connection)
             if replies[0].answers(requests[0]):
-                if not replies[0].request_id:  # refused before it was parsed
+                if not replies[0].request_id:  # the message was rejected before it was parsed
                     self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < FAST_S
                 return replies
@@ -161,8 +168,10 @@ class UnixTransport(ABC):
         return self._socket
 
     def _receive(self, connection: socket.socket) -> list[Reply]:
-        """Return the next replies, to any requests; raises `BlockingIOError` if there are none
-        yet.
+        """Return the next replies, to any requests.
+
+        Raises:
+            BlockingIOError: There are none yet.
         """
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
@@ -184,7 +193,7 @@ class UnixTransport(ABC):
 def _send_message(
     connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None
 ) -> None:
-    """Send a message and a descriptor, which is then closed; wait while the server does not
+    """Send a message and a descriptor, which is then closed. This waits while the server does not
     read.
     """
     try:
@@ -204,8 +213,8 @@ def _send_message(
 
 
 def _require_same_user(connection: socket.socket) -> None:
-    """Raise `PermissionError` if the server belongs to another user: any user may reuse the name
-    of an ended server.
+    """Raise `PermissionError` if the server belongs to another user, as any user may reuse the name
+    of a server that has ended.
     """
     uid = peer_uid(connection)
     if uid != os.getuid():
@@ -244,7 +253,11 @@ class ShmTransport(UnixTransport):
         self._written: tuple[_Memory, int | None] | None = None
 
     def connect(self, timeout_s: float) -> None:
-        """Connect to the server's socket; raises `PolicyUnavailable` if it does not answer."""
+        """Connect to the server's socket.
+
+        Raises:
+            PolicyUnavailable: The server does not answer.
+        """
         self._open(timeout_s)
 
     def close(self) -> None:
@@ -283,8 +296,8 @@ class ShmTransport(UnixTransport):
         return message, descriptor
 
     def _unsent(self) -> None:
-        """Drop the memory file of the last request, which the server did not receive, to reuse
-        its number.
+        """Drop the memory file of the last request, which the server did not receive, so that its
+        number can be used again.
         """
         if self._written is not None:
             memory, descriptor = self._written

@@ -1,8 +1,8 @@
 """The WebSocket transport: binary frames to a replica's own port, or through the proxy.
 
-Sessions end with the connection. The metadata has the replica's port. If that port cannot be
-reached (because of a firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS
-/v1/stream` on the server's port replaces it, a little slower.
+Sessions end with the connection. The metadata contains the replica's port. If that port cannot be
+reached (because of a firewall, a tunnel of one port, or TLS, which ends at the proxy), the client
+uses `WS /v1/stream` on the server's port, which is a little slower.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 
 logger = logging.getLogger(__name__)
 
-# Transient statuses of a proxy; HAProxy sends 500 for its own 502 to 504, and 404 while it
+# Transient statuses of a proxy. HAProxy sends 500 in place of its own 502 to 504, and 404 while it
 # restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
@@ -72,9 +72,9 @@ _DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the p
 _READ_BYTES = 256 * 1024
 # The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
 _MAX_PIECES = 64
-# A client's frames must have a mask, which keeps a web page from choosing the bytes that a proxy
-# sees (RFC 6455, 10.3). Here is neither page nor proxy, so this one changes nothing, which saves
-# two passes over each message.
+# A client's frames must have a mask, which prevents a web page from choosing the bytes that a proxy
+# reads (RFC 6455, 10.3). This client is no web page, so its mask leaves the bytes unchanged, which
+# saves two passes over each message.
 _NO_MASK = bytes(4)
 
 
@@ -83,7 +83,7 @@ class ProxiedSocket:
 
     def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         """Connect; raises the errors of `websockets`."""
-        # Websockets 17.1 wants `connect` to be a context manager.
+        # In websockets 17.1, `connect` must be used as a context manager.
         self._open = contextlib.ExitStack()
         self._connection = self._open.enter_context(
             connect(
@@ -117,8 +117,12 @@ class ProxiedSocket:
 
 
 def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:
-    """Connect to a path of a server's port; raises `NoReplica`, `PolicyUnavailable`, or a
-    rejection of the key.
+    """Connect to a path of a server's port.
+
+    Raises:
+        NoReplica: The server cannot be reached, or has no replica yet.
+        PolicyUnavailable: The server is not ready.
+        VLAgentsError: The server rejects the key.
     """
     try:
         return ProxiedSocket(url, credentials, timeout_s)
@@ -140,10 +144,10 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
 
 
 class Stream:
-    """A connection to a replica's own port, which the thread that waits for the answer reads and
-    writes itself.
+    """A connection to a replica's own port. The thread that waits for the answer reads and writes
+    it.
 
-    No thread answers pings: the server must rely on the kernel's keep-alive instead.
+    No thread answers pings, so the server must rely on the kernel's keep-alive.
     """
 
     def __init__(
@@ -154,8 +158,11 @@ class Stream:
         timeout_s: float,
         headers: Mapping[str, str] | None = None,
     ) -> None:
-        """Connect to `port` on the host of `base`; raises `OSError` or `InvalidHandshake` if no
-        such server answers.
+        """Connect to `port` on the host of `base`.
+
+        Raises:
+            OSError: The port cannot be reached.
+            InvalidHandshake: Another server answers.
         """
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
@@ -212,8 +219,12 @@ class Stream:
             ) from error
 
     def recv(self, timeout_s: float) -> bytes:
-        """Return the next binary message; raises `ConnectionClosed`, `OSError` if it broke, or
-        `TimeoutError`.
+        """Return the next binary message.
+
+        Raises:
+            ConnectionClosed: The server has closed the connection.
+            OSError: The connection broke.
+            TimeoutError: No message arrived in time.
         """
         begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
@@ -232,9 +243,9 @@ class Stream:
     def close(self) -> None:
         """Close the connection, so that the server notices.
 
-        A message that was not answered in time is useless. Over a lost link the kernel would resend
-        it for minutes, and the server would then execute it and hold the sessions until then; a
-        reset of the connection prevents both.
+        A message that was not answered in time is useless. Over a broken link, the kernel would
+        resend it for minutes. The server would keep the sessions until then, and execute the late
+        message. A reset of the connection prevents both.
         """
         with contextlib.suppress(OSError):
             if self._silent:
@@ -247,8 +258,8 @@ class Stream:
         self._socket.close()
 
     def _check_open(self) -> None:
-        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed
-        by the server.
+        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or if the server is
+        closing it.
         """
         state = self._protocol.state
         if state is State.CLOSED:
@@ -274,9 +285,7 @@ class Stream:
             self._send(memoryview(piece), deadline)
 
     def _send_message(self, pieces: Sequence[Buffer], deadline: float) -> None:
-        """Send a binary message in one frame (RFC 6455, 5.2), from the memory where its pieces
-        are.
-        """
+        """Send a binary message in one frame (RFC 6455, 5.2), without copying its pieces."""
         size = sum(map(len, pieces))
         head = frame_head(size, _NO_MASK)
         pieces = [head, *pieces]
@@ -325,13 +334,13 @@ class WebSocketTransport:
         return metadata
 
     def connect_to(self, metadata: dict[str, Any], timeout_s: float) -> None:
-        """Connect like `connect`, but to the replica with this metadata."""
+        """Connect as `connect` does, but to the replica with this metadata."""
         stream = read_address(StreamAddress, metadata.get("stream"))
         self._address = stream if self._base.scheme == "http" else None
         self._stream(timeout_s)
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one frame and return its replies; replies to earlier requests that timed out are
+        """Send one frame and return its replies. Replies to earlier requests that timed out are
         discarded.
         """
         deadline = time.monotonic() + timeout_s
@@ -386,11 +395,11 @@ class WebSocketTransport:
         return None
 
     def _proxied(self, timeout_s: float) -> ProxiedSocket:
-        """Connect through the proxy; retry while the proxy reports that a replica is starting or
-        stopping.
+        """Connect through the proxy, and retry while the proxy reports that a replica is starting
+        or stopping.
 
-        A missing answer is also retried: the replica that the proxy chose may hang while the next
-        one works.
+        If there is no answer, this also retries, as the replica that the proxy chose may hang while
+        the next one works.
         """
         deadline = time.monotonic() + timeout_s
         attempt_s = first_timeout_s(timeout_s)
