@@ -674,7 +674,7 @@ class HttpDialect(RouteDialect):
                 over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
                 if finder.fetch(session_name, partial(settle, over, None), caller_name()):
                     await over
-            if sessions.held([session_name]):
+            if sessions.versions_of([session_name]):
                 session.episode.began(sessions.get(session_name).instruction)
             self._sessions[key] = session
         return self._sessions[key]
