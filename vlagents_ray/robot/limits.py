@@ -320,9 +320,7 @@ class Chain:
         for name, joint in joints.items():
             joint_of_child[joint.find("child").attrib["link"]] = (name, joint)
         if tip not in joint_of_child:
-            raise ConfigError(
-                f"tip: expected a link, one of {sorted(joint_of_child)}, got {tip!r}"
-            )
+            raise ConfigError(f"tip: expected a link, one of {sorted(joint_of_child)}, got {tip!r}")
 
         self._to_rad = to_rad
         self._joints: list[_Joint] = []  # from the tip to the base
