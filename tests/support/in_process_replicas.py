@@ -178,7 +178,7 @@ class _Peer(Peer):
             raise PeerEnded(self.name)
         if self._number in self._replicas.frozen:
             await asyncio.sleep(60)
-        return await getattr(self._replicas.migrators[self._number].held, method.__name__)(*args)
+        return await getattr(self._replicas.migrators[self._number].sessions, method.__name__)(*args)
 
 
 def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
