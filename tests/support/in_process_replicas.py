@@ -178,7 +178,8 @@ class _Peer(Peer):
             raise PeerEnded(self.name)
         if self._number in self._replicas.frozen:
             await asyncio.sleep(60)
-        return await getattr(self._replicas.migrators[self._number].sessions, method.__name__)(*args)
+        sessions = self._replicas.migrators[self._number].sessions
+        return await getattr(sessions, method.__name__)(*args)
 
 
 def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
