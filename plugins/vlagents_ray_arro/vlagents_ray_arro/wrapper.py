@@ -161,13 +161,13 @@ class ArroConfig(BaseModel, extra="forbid"):
     missing: Literal["refuse", "hide"] = Field(
         default="refuse",
         description="if an object is missing on the first frame: refuse the episode, or begin it "
-        "without the object and search it again as if it were lost",
+        "without the object and search for it again as if it were lost",
     )
     keep_lost: int = Field(
         default=5,
         ge=0,
         description="frames for which a lost segment is shown at its last position; after these, "
-        "and each time that as many have passed, it is searched as on the first frame",
+        "and each time that as many have passed, it is searched for as on the first frame",
     )
 
 
@@ -274,7 +274,7 @@ class Tracking:
                 part.load()
 
     def begin(self, images: Images, phrases: Sequence[str]) -> list[Track]:
-        """Search the objects on each image.
+        """Search for objects on each image.
 
         Args:
             images: The first images of cameras.
@@ -308,7 +308,7 @@ class Tracking:
             self._search([images[i] for i in due], [tracks[i] for i in due])
 
     def _search(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Search missing objects. A track for which some are found begins again with these and
+        """Search for missing objects. A track for which some are found begins again with these and
         its visible segments.
         """
         phrases = []
@@ -474,8 +474,8 @@ class Arro(Wrapper):
 
         Args:
             obs: The first observation.
-            instruction: The task in words, whose objects are searched unless the config names
-                objects.
+            instruction: The task in words, which names the objects to search for unless the config
+                does.
             kwargs: Arguments for the policy.
 
         Returns:
@@ -488,7 +488,7 @@ class Arro(Wrapper):
         return {**super().reset(obs, instruction, **kwargs), INFO: self._report()}
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Search the objects on the first observation, and return it without the rest."""
+        """Search for the objects on the first observation, and return it with the background."""
         names = self._camera_names(obs)
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:

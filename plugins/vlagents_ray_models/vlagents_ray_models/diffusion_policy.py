@@ -85,8 +85,8 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the checkpoint; before it is loaded, only that no instruction is
-        needed.
+        """The contract of the checkpoint. Before the checkpoint is loaded, it declares only that
+        no instruction is needed.
         """
         network: DiffusionNetwork | None = self.model
         if network is None:

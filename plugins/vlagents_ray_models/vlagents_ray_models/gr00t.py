@@ -681,8 +681,8 @@ class Gr00t(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the embodiment; before the checkpoint is loaded, only that an
-        instruction is needed.
+        """The contract of the embodiment. Before the checkpoint is loaded, it declares only that
+        an instruction is needed.
         """
         if self.model is None:
             return Contract(instruction=True)

@@ -100,8 +100,8 @@ class Octo(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the checkpoint; before it is loaded, only the kind of its tasks and the
-        configured window.
+        """The contract of the checkpoint. Before the checkpoint is loaded, it declares only the
+        configured tasks and window.
         """
         instruction = {"language": True, "image": False}.get(self.config.goal)
         network: OctoNetwork | None = self.model

@@ -780,7 +780,7 @@ class OpenPi(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the checkpoint and its robot; empty before they are loaded."""
+        """The contract of the checkpoint and its robot, which is empty before they are loaded."""
         if self.model is None:
             return Contract()
 
