@@ -195,9 +195,19 @@ class SessionTable(Generic[M]):
         session.origin = origin
         return session
 
-    def begin(self, session: Session[M], known: int | None, arrived: float) -> int:
-        """Draw the step at which the session's next episode begins, above `known`, the step that
-        its client reports; the reset `arrived` at that time, s.
+    def begin(
+        self, session: Session[M], known: int | None, arrived: float, origin: Origin = NOWHERE
+    ) -> tuple[int, int | None]:
+        """Draw the step at which the session's next episode begins.
+
+        Args:
+            session: The session.
+            known: The step that its client reports; the drawn one is above it.
+            arrived: Time at which the reset arrived, s, of the engine's clock.
+            origin: Origin of the reset, whose connection is in that episode from now on.
+
+        Returns:
+            The step, and that of the connection's previous episode, or None without one.
         """
         with self._lock:
             before = max(session.version, self._left.get(session.id, (0, 0)))[0]
@@ -206,7 +216,10 @@ class SessionTable(Generic[M]):
             self._drawn = max(self._clock(), self._drawn + 1)
             session.expected = max(self._drawn, before + _UNSEEN)
             session.last_reset = arrived
-            return session.expected
+            previous = origin.sessions.get(session.id)
+            if origin.owner:
+                origin.sessions[session.id] = session.expected
+            return session.expected, previous
 
     def end_episode(self, session: Session[M], reset: PendingRequest, first: int) -> None:
         """End the session's episode, since the policy's thread runs a reset, whose episode begins
@@ -221,11 +234,19 @@ class SessionTable(Generic[M]):
             session.last_reset = max(session.last_reset, reset.arrived)
             session.resetting = reset
 
-    def undo(self, session_id: str, first: int) -> None:
+    def undo(
+        self,
+        session_id: str,
+        first: int,
+        origin: Origin = NOWHERE,
+        previous: int | None = None,
+    ) -> None:
         """Undo `begin` for a reset that was cancelled. The current episode continues, at this
         replica or at another one.
         """
         with self._lock:
+            if origin.sessions.get(session_id) == first:
+                origin.sessions[session_id] = previous
             session = self._sessions.get(session_id)
             if session is None or session.expected != first or session.steps == first:
                 return
@@ -361,9 +382,15 @@ class SessionTable(Generic[M]):
         names = [*self._sessions, *(session.id for session in self._expected)]
         return sum(name.startswith(prefix) for name in names)
 
-    def close(self, session_id: str) -> None:
-        """Close the session; unknown ids are ignored."""
+    def close(self, session_id: str, origin: Origin = NOWHERE) -> None:
+        """Close the session, which is its connection's no more unless that has sent a reset since;
+        unknown ids are ignored.
+        """
         with self._lock:
+            session = self._sessions.get(session_id)
+            first = origin.sessions.get(session_id)
+            if session is None or first is None or first <= session.steps:
+                origin.sessions.pop(session_id, None)
             self._forget(session_id)
 
     def release(self, session_id: str, version: Version) -> bool:

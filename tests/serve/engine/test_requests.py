@@ -121,6 +121,20 @@ def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connec
     assert "other" not in served.engine.sessions
 
 
+def test_a_connection_acts_in_the_episode_that_it_began_before_its_close_was_executed(
+    served: Served,
+) -> None:
+    other = served.sender("other")
+    served.ask(other, "reset")
+    served.occupy()
+    waiting = [served.put(other, op) for op in ("close", "reset")]
+    served.go_on()
+    assert [replies.get(timeout=10)[0].error for replies in waiting] == [None, None]
+    served.ask(other, "act")
+    other.release()
+    assert "other" not in served.engine.sessions, "it ends with its connection"
+
+
 @pytest.mark.parametrize("was_in", ["none", "the episode before"])
 @pytest.mark.parametrize("with_step", [False, True])
 def test_what_comes_late_over_an_old_connection_neither_acts_in_nor_ends_a_newer_episode(

@@ -79,11 +79,14 @@ class Intake:
 
             # An act that was queued before, and has waited for a search, keeps its episode.
             before = pending.reserved
-            episode = before.episode if isinstance(before, ReservedAct) else None
+            known = origin.sessions.get(session_id)
+            episode = before.episode if isinstance(before, ReservedAct) else known
             if episode is None:
-                episode = origin.sessions.get(session_id)
+                episode = known
             if episode is None:
                 episode = _latest_episode(pending, session)
+            if known is None and origin.owner:
+                origin.sessions[session_id] = episode
             if (episode if step is None else step) >= session.expected:
                 # An act of an older episode, which will be refused, does not use the session.
                 session.origin = origin
@@ -94,8 +97,6 @@ class Intake:
             preparation = None
             if self._preparations is not None and self._queue.window.overlaps:
                 preparation = self._preparations.begin(session.agent, request.obs)
-            if origin.owner:
-                origin.sessions[session_id] = episode
             return ReservedAct(session, model, episode, preparation)
 
         if request.op == "reset":
@@ -117,10 +118,7 @@ class Intake:
             model.check(request)
 
         session = self._sessions.open(session_id, origin)
-        first = self._sessions.begin(session, request.step, pending.arrived)
-        previous = origin.sessions.get(session_id)
-        if origin.owner:
-            origin.sessions[session_id] = first
+        first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
         return Opening(choice, kwargs, follows_newest, first, previous)
 
     def withdraw(self, *requests: PendingRequest) -> None:
@@ -137,10 +135,8 @@ class Intake:
         opening = pending.reserved
         if pending.begun or not isinstance(opening, Opening):
             return
-        self._sessions.undo(pending.session_id, opening.first)
-        sessions = pending.origin.sessions
-        if sessions.get(pending.session_id) == opening.first:
-            sessions[pending.session_id] = opening.previous
+        origin = pending.origin
+        self._sessions.undo(pending.session_id, opening.first, origin, opening.previous)
 
     def fail(self, pending: PendingRequest, error: VLAgentsError) -> None:
         """Finish a request with an error, and undo a reset that has not begun."""

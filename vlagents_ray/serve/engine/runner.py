@@ -345,8 +345,7 @@ class Runner:
         elif request.op == "weights":
             self._weights.obey(**request.kwargs)
         else:
-            self._sessions.close(session_id)
-            pending.origin.sessions.pop(session_id, None)
+            self._sessions.close(session_id, pending.origin)
         return pending, Reply(request.request_id, info=info)
 
     def _ready(
