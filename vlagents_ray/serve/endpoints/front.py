@@ -11,6 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
+from vlagents_ray.serve.endpoints.direct_requests import of_this_replica
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 
 
@@ -20,7 +21,9 @@ def middlewares() -> list[Middleware]:
 
 
 class FrontMiddleware:
-    """Refuses headers that are not UTF-8, which Serve decodes; lets the application take the socket
+    """Refuses headers that are not UTF-8, which Serve decodes.
+
+    Lets requests of robots pass by Serve, see `DirectRequests`, and the application take the socket
     of a WebSocket, see `ClientSocket`.
     """
 
@@ -41,8 +44,14 @@ class FrontMiddleware:
                 await refused(scope, receive, send)
                 return
 
-        client = ClientSocket.below(receive) if scope["type"] == "websocket" else None
-        if client is None:
-            await self._app(scope, receive, send)
-        else:
-            await self._app({**scope, SCOPE_KEY: client}, client.receive, client.sending(send))
+        if scope["type"] == "websocket":
+            client = ClientSocket.below(receive)
+            if client is not None:
+                await self._app({**scope, SCOPE_KEY: client}, client.receive, client.sending(send))
+                return
+        elif scope["type"] == "http":
+            direct = of_this_replica()
+            if direct is not None and direct.takes(scope):
+                await direct.serve(scope, receive, send)
+                return
+        await self._app(scope, receive, send)

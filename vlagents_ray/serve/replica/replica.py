@@ -31,6 +31,7 @@ from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSockets
 from vlagents_ray.serve.endpoints.connection import Admit
+from vlagents_ray.serve.endpoints.direct_requests import DirectRequests, set_for_this_replica
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -256,7 +257,9 @@ class PolicyReplica(ClientApi, SiblingApi):
             public=self._parts.pages(inside.routes),
         )
         self._websockets = access.websockets
-        return access
+        direct = DirectRequests(access)
+        set_for_this_replica(direct)
+        return direct
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
