@@ -1,14 +1,14 @@
 """Measurements, in a checkout: `python -m benchmarks.NAME --help`.
 
 `rtt` and `link` compare round trips with those of other policy servers (`peers`), on one machine
-and over a link; `calls` counts the calls and system calls of an act; `throughput` loads one replica
-with many clients; `policy` measures a policy without a server; `report` measures round trips and
-throughput, judges them, and writes docs/measured.md; `checkpoints` makes checkpoints of random
-weights. `overhead` compares an evaluation with bare environments, `evaluation` with the peers'
-evaluations; `soak` runs one for long; `scaling` adds workers on a Ray cluster over several `hosts`,
-which are simulated on one machine; `autoscaling` samples replicas while `robots` and rollouts start
-and end; `hop` measures a child process behind a replica, `adapters` sessions of many fine-tunes,
-`push` new weights during acts, `rollouts` the transitions of a learner, `clients` clients in other
-languages, `ros` a robot behind topics of ROS 2, `far_away` a robot whose policy is behind a long,
-lossy or cut link.
+and over a link; `calls` counts the calls and system calls of an act, and `act_path` lists the files
+that it enters; `throughput` loads one replica with many clients; `policy` measures a policy without
+a server; `report` measures round trips and throughput, judges them, and writes docs/measured.md;
+`checkpoints` makes checkpoints of random weights. `overhead` compares an evaluation with bare
+environments, `evaluation` with the peers' evaluations; `soak` runs one for long; `scaling` adds
+workers on a Ray cluster over several `hosts`, which are simulated on one machine; `autoscaling`
+samples replicas while `robots` and rollouts start and end; `hop` measures a child process behind a
+replica, `adapters` sessions of many fine-tunes, `push` new weights during acts, `rollouts` the
+transitions of a learner, `clients` clients in other languages, `ros` a robot behind topics of ROS
+2, `far_away` a robot whose policy is behind a long, lossy or cut link.
 """
