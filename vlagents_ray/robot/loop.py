@@ -411,7 +411,7 @@ class LoopOptions:
     def __post_init__(self) -> None:
         if self.restart is not None and self.restart not in get_args(Restart):
             raise ConfigError(
-                f"restart: got {self.restart!r}, want one of {list(get_args(Restart))}"
+                f"restart: expected one of {list(get_args(Restart))}, got {self.restart!r}"
             )
 
 

@@ -147,8 +147,8 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
     reasons = _reasons_for_ray(config, cases)
     if config.workers == 0 and reasons:
         raise ConfigError(
-            f"workers: got 0, which plays in this process without Ray, but {reasons[0]}; want 1 or "
-            "more"
+            f"workers: expected 1 or more, as {reasons[0]}, got 0, which runs the episodes in "
+            "this process without Ray; raise it"
         )
     if config.workers is not None:
         return config.workers
