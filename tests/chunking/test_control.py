@@ -214,7 +214,7 @@ def test_a_jump_after_the_release_never_reaches_the_robot(make: Any) -> None:
     leader.held = False
     at = arm.pose.copy()
     act = arm.tick()
-    assert "larger step" in act.info[SAFE]
+    assert "a step of at most max_step" in act.info[SAFE]
     assert act.action == pytest.approx(at)
 
 

@@ -102,7 +102,7 @@ def test_seeds_need_an_environment_each(batch: BatchEnv) -> None:
     for seeds in ([], [1, 2, 3, 4]):
         with pytest.raises(ConfigError, match="expected 1 to 3 seeds"):
             batch.reset(seeds=seeds)
-    with pytest.raises(ConfigError, match="num_envs is 0"):
+    with pytest.raises(ConfigError, match="num_envs: expected a number of at least 1, got 0"):
         make_batch("tabletop", 0)
     with pytest.raises(ConfigError, match="takes"):
         make_batch("tabletop", 2, colour="red")

@@ -130,7 +130,7 @@ def test_the_first_wrapper_is_the_nearest_to_the_robot() -> None:
         (["nothing"], "not registered"),
         ([BRIGHT], "expected a subclass"),
         ([{DIM: {"off": 1}}], "wrapper Dim"),
-        ([{DIM: {}, BRIGHT: {}}], "one name each"),
+        ([{DIM: {}, BRIGHT: {}}], "one name with its settings in each entry"),
     ],
 )
 def test_wrong_entries_are_refused(wrappers: list[Any], said: str) -> None:

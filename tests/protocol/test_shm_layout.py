@@ -353,7 +353,7 @@ def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_ac
     item = ITEM.pack(4, len(text), -1, float("nan"), float("nan"), b"")
     with pytest.raises(InvalidInput, match="below 4"):
         reader.read(memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8))
-    with pytest.raises(InvalidInput, match="the limit is 2"):
+    with pytest.raises(InvalidInput, match="at most 2 acts in one message, got 3"):
         reader.read(memoryview(COUNT.pack(3) + item * 3 + text), np.zeros(64, np.uint8))
 
 

@@ -124,7 +124,7 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
             require_blind(terminal, out)
             terminal.type(next(verdicts) if question.startswith("verdict") else "")
         assert terminal.process.wait() == 0
-    assert b"played again: the evaluation ended before the verdict" in terminal.read
+    assert b"repeated: the evaluation ended before the verdict" in terminal.read
     assert all(name.encode() in terminal.read for name in NAMES), "the table at the end"
     results = Results.load(out)
     config = EvalConfig.model_validate(results.runs[-1].config)

@@ -161,7 +161,7 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
     order = names_by_trial(config)
     assert policies.made[2:] == [order[0], *order]
     assert any("expected a reason in words" in line for line in person.printed)
-    assert any("played again: somebody walked into the scene" in line for line in person.printed)
+    assert any("repeated: somebody walked into the scene" in line for line in person.printed)
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert (attempt.cause, attempt.error, attempt.retried) == (
         "operator",
@@ -221,7 +221,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     [told] = [line for line in person.printed if "repeated" in line]
-    assert told.strip() == f"played again: it could not be played ({code})"
+    assert told.strip() == f"repeated: it could not be run ({code})"
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert attempt.cause == "policy"
     assert ".example" in attempt.error, "what was hidden is told at the end"
@@ -331,7 +331,7 @@ def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     summary = evaluate_on_robot(again, person, agent_factory=later)
     assert later.made[2:] == names_by_trial(config)[2:]
     assert any(
-        "played again: the evaluation ended before the verdict" in line for line in person.printed
+        "repeated: the evaluation ended before the verdict" in line for line in person.printed
     )
     assert (
         summary.total.episodes,

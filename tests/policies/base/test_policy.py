@@ -260,7 +260,7 @@ def test_what_torchao_cannot_quantize_is_named(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "torchao.quantization", torchao)
     monkeypatch.setattr(Wobble, "network", "model")
     with pytest.raises(
-        ConfigError, match=r"cannot use it here \(NotImplementedError: no such kernel\)"
+        ConfigError, match=r"cannot use it on this machine \(NotImplementedError: no such kernel\)"
     ):
         loaded(quantization="int8")
 

@@ -150,8 +150,8 @@ def test_a_graph_that_missed_a_part_is_refused(
 ) -> None:
     part = elsewhere(cuda, lambda x: x.tanh())
     said = refused(cuda, monkeypatch, mode, lambda x: part(x) + x)
-    assert said.startswith(f"4 rows: 'core' by {NAMES[str(mode)]}: its results are off by")
-    with pytest.raises(ConfigError, match="'core' by CUDA graph: its results are off by"):
+    assert said.startswith(f"4 rows: 'core' by {NAMES[str(mode)]}: expected results within")
+    with pytest.raises(ConfigError, match="'core' by CUDA graph: expected results within"):
         compiled(cuda, lambda x: part(x) + x)
 
 

@@ -41,7 +41,10 @@ def application(args: str) -> str:
             "expected a port for each dialect, got 8080",
         ),
         (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
-        (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
+        (
+            application("{policy: noop, replicas: 1, autoscaling: {}}"),
+            "expected replicas or autoscaling, got both",
+        ),
         ("applications: 3", "applications"),
         (application("{policy: noop}") + "\nproxy_location: Nowhere", "proxy_location"),
         (application("{policy: noop}") + "\nlogging_config: {log_level: 3}", "log_level"),

@@ -272,7 +272,7 @@ def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced()
         ("Telling", {"needs": "no_such_package"}, "No module named 'no_such_package'"),
         ("Nobody", {}, "no class 'Nobody'"),
         ("", {}, "'/no/such/python' cannot be started here"),
-        ("Dying", {}, "exit status 3; it said:\n  the driver is too old"),
+        ("Dying", {}, "exit status 3; last output:\n  the driver is too old"),
     ],
 )
 def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any], said: str) -> None:

@@ -221,6 +221,7 @@ def test_an_interpreter_that_does_not_answer_in_time_is_named_without_its_script
 ) -> None:
     monkeypatch.setattr("vlagents_ray.serve.python_env.probe._TIMEOUT_S", 0.001)
     with pytest.raises(
-        ConfigError, match=r"runs here \(no answer in 0.001 s; is the machine busy\?\)$"
+        ConfigError,
+        match=r"runs on this machine, got .* \(no answer in 0.001 s; is the machine busy\?\)$",
     ):
         probe(sys.executable)

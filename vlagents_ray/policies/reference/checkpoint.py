@@ -77,7 +77,7 @@ class Checkpoint(BaseModel, extra="forbid", frozen=True):
             )
         if not 0 < len(words) <= self.sizes.longest:
             raise InvalidObservation(
-                f"instruction: expected 1 to {self.sizes.longest}, got {len(words)} words"
+                f"instruction: expected 1 to {self.sizes.longest} words, got {len(words)}"
             )
 
         tokens = np.zeros(self.sizes.longest, np.int64)
