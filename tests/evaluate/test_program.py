@@ -222,7 +222,7 @@ def test_two_policies_are_not_compared_in_different_environments(
     edit("prog_parts/sea.py")
     played(out, policy="b", resume=True, accept_changes=True)
     with pytest.raises(
-        ConfigError, match=r"(?s)not played in the same environment.*prog_parts/sea.py was"
+        ConfigError, match=r"(?s)in the same environment, got different ones.*prog_parts/sea.py was"
     ):
         compare(Results.load(out), "a", "b")
 
@@ -367,7 +367,8 @@ def test_other_settings_of_a_policy_in_its_file_are_refused_unless_they_are_acce
     played(tmp_path / "other", policy="another")
     both = combined([Results.load(first), Results.load(tmp_path / "other")])
     with pytest.raises(
-        ConfigError, match=r"(?s)were played with .*settings of 'own'.*as --accept-changes allowed"
+        ConfigError,
+        match=r"(?s)with the same files, got .*settings of 'own'.*as --accept-changes allowed",
     ):
         compare(both, "own", "another")
 
@@ -401,7 +402,9 @@ def test_a_case_in_which_a_change_was_accepted_is_not_compared_unless_that_is_ac
     changed_again: dict[str, Any] = {} if identity in of_the_policy else change()
     played(tmp_path / "other", **{**STATED, **changed_again, "policy": "another"})
     both = combined([Results.load(tmp_path / name) for name in ("out", "other")])
-    with pytest.raises(ConfigError, match=r"(?s)were played with .*as --accept-changes allowed"):
+    with pytest.raises(
+        ConfigError, match=r"(?s)with the same files, got .*as --accept-changes allowed"
+    ):
         compare(both, "own", "another")
     assert compare(both, "own", "another", accept_changes=True).total.pairs.total == 2
 

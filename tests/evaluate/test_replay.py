@@ -192,7 +192,9 @@ def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(
         store.record(
             EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4
         )
-    with pytest.raises(ConfigError, match=r"the replay did not end.*: it hung"):
+    with pytest.raises(
+        ConfigError, match=r"expected a finished replay to compare, got one that failed: it hung"
+    ):
         compare(recorded, Results.load(settings.out))
 
 
