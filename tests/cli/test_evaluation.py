@@ -126,7 +126,7 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_starts(tmp_path: 
     assert done.exit_code == 1, done.output
     fits_not = (
         "'noop' in 'libero/libero_spatial/0': policy and env do not fit: - action.dim: the "
-        "policy gives 4, the"
+        "policy returns 4, the"
     )
     assert fits_not in " ".join(done.stderr.split())
     assert not (tmp_path / "out").exists()

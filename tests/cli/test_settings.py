@@ -181,7 +181,7 @@ EVAL = ("--out", "runs/x", "--policy")
         ),
         (
             ("serve", "my_policies:Loaded"),
-            "policy Loaded: checkpoint: is missing; give --set checkpoint=…",
+            "policy Loaded: checkpoint: is missing; add --set checkpoint=…",
         ),
         (
             ("serve", "my_policies:Reach", "--set", "gain"),

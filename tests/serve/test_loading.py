@@ -119,7 +119,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     [
         (
             {"environment": {"python": "/nowhere/.venv-pi/bin/python"}},
-            "ConfigError: environment.python: no such file",
+            "ConfigError: environment.python: expected a Python interpreter",
         ),
         ({"batch": {"max_sise": 3}}, "batch.max_sise"),
     ],

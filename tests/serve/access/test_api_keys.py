@@ -156,7 +156,7 @@ def test_no_nonsense_in_the_file_gets_out_and_before_long_nobody_gets_in(
     assert caller.refusal() is not None
     with pytest.raises(Unauthorized):
         keys.check(token, "noop")
-    assert "all keys are refused: for 300 s" in caplog.text
+    assert "all keys are rejected, as no key file could be read for 300 s" in caplog.text
     file.write_bytes(good)
     keys.check(token, "noop")
     assert keys.unreadable_s == 0
