@@ -37,8 +37,8 @@ _SERVED = [
 ]
 # Of examples/: a loop in which the guard refuses the random policy's actions, and the notebook.
 _LOOP = (
-    "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* than max_step "
-    "allows' said"
+    "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* a step of at most "
+    "max_step' said"
 )
 _SERVED += [
     (EXAMPLES / "robot_loop.py", Block("bash", 1, _LOOP, "random")),
