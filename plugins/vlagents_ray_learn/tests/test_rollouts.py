@@ -24,7 +24,8 @@ from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray_learn import RolloutPlan, Rollouts, arrays, rollouts
+from vlagents_ray_learn import RolloutPlan, Rollouts, arrays
+from vlagents_ray_learn import rollouts as rollouts_module
 
 
 class Workers(InProcessWorkers):
@@ -66,7 +67,7 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
         # start.
         return Workers if plan.workers else InProcessWorkers
 
-    monkeypatch.setattr(rollouts, "workers_class", workers_class)
+    monkeypatch.setattr(rollouts_module, "workers_class", workers_class)
     return Workers
 
 
@@ -93,12 +94,8 @@ def keys(batches: Any) -> list[str]:
 
 def planned(episodes: int, env: str = LINE) -> list[str]:
     """The keys of an evaluation."""
-    return [
-        str(job.key)
-        for job in plan_jobs(
-            plan_cases(flat_config(envs=[env], episodes=episodes, out="out", seed=0))
-        )
-    ]
+    config = flat_config(envs=[env], episodes=episodes, out="out", seed=0)
+    return [str(job.key) for job in plan_jobs(plan_cases(config))]
 
 
 def test_episodes_are_those_of_an_evaluation_in_their_order_whoever_plays_them(
@@ -108,19 +105,19 @@ def test_episodes_are_those_of_an_evaluation_in_their_order_whoever_plays_them(
         batches = list(itertools.islice(several, 8))
     assert keys(batches) == planned(8)
     assert pool.played[:8] != planned(8), "or the test shows nothing"
-    with Rollouts(RolloutPlan(LINE, ToZero)) as one:
-        alone = list(itertools.islice(one, 8))
+    with Rollouts(RolloutPlan(LINE, ToZero)) as single:
+        alone = list(itertools.islice(single, 8))
     assert all(first.equals(second) for first, second in zip(batches, alone, strict=True))
     assert (several.stats.episodes, several.stats.transitions, several.position) == (8, 80, 8)
 
 
 def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as found:
-        table = found.collect(5)
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as rollouts:
+        table = rollouts.collect(5)
         assert sorted(pool.played) == sorted(planned(5))
         assert table.num_rows == 50
         assert arrays(table)["state.position"].shape == (50, 1)
-        assert list(dict.fromkeys(arrays(found.collect(2))["key"])) == planned(7)[5:]
+        assert list(dict.fromkeys(arrays(rollouts.collect(2))["key"])) == planned(7)[5:]
 
 
 PLAY = """
@@ -158,10 +155,11 @@ class Replayed(ToZero):
 
 
 def test_the_replay_is_a_column() -> None:
-    with Rollouts(RolloutPlan(LINE, Replayed, workers=2, want=["replay"])) as found:
-        got = arrays(found.collect(4))
-    assert got["replay.tokens"].shape == (40, 1, 1)
-    np.testing.assert_array_equal(got["replay.tokens"][:, 0], np.rint(100 * got["action"]))
+    with Rollouts(RolloutPlan(LINE, Replayed, workers=2, want=["replay"])) as rollouts:
+        columns = arrays(rollouts.collect(4))
+    tokens = columns["replay.tokens"]
+    assert tokens.shape == (40, 1, 1)
+    np.testing.assert_array_equal(tokens[:, 0], np.rint(100 * columns["action"]))
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -169,14 +167,15 @@ def test_groups_of_several_envs_share_no_number_and_no_two_episodes_of_an_env_sh
     workers: int,
 ) -> None:
     envs = [LINE, "eval_fakes:OtherLine"]
-    with Rollouts(RolloutPlan(envs, ToZero, groups=3, workers=workers, seed=10)) as found:
-        got = [arrays(batch) for batch in itertools.islice(found, 24)]
+    with Rollouts(RolloutPlan(envs, ToZero, groups=3, workers=workers, seed=10)) as rollouts:
+        episodes = [arrays(batch) for batch in itertools.islice(rollouts, 24)]
+
     groups: dict[int, list[str]] = {}
     seeds: dict[str, list[int]] = {}
-    for columns in got:
+    for columns in episodes:
         key = str(columns["key"][0]).partition("~")[0]
-        start, _, rest = key.partition("@")
-        seed, _, policy_seed = rest.partition(":")[0].partition("/")
+        start, _, seeds_and_more = key.partition("@")
+        seed, _, policy_seed = seeds_and_more.partition(":")[0].partition("/")
         groups.setdefault(int(columns["episode"][0]), []).append(start)
         seeds.setdefault(start.partition("#")[0], []).append(int(policy_seed or seed))
     assert sorted(groups) == list(range(8))
@@ -185,15 +184,15 @@ def test_groups_of_several_envs_share_no_number_and_no_two_episodes_of_an_env_sh
 
 
 def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero, groups=3, workers=2, seed=10)) as found:
-        got = [arrays(batch) for batch in itertools.islice(found, 6)]
-    starts = [float(one["state.position"][0, 0]) for one in got]
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=3, workers=2, seed=10)) as rollouts:
+        episodes = [arrays(batch) for batch in itertools.islice(rollouts, 6)]
+    starts = [float(columns["state.position"][0, 0]) for columns in episodes]
     assert starts[0] == starts[1] == starts[2] != starts[3] == starts[4] == starts[5]
-    assert [one["episode"][0] for one in got] == [0, 0, 0, 1, 1, 1]
-    assert len({one["action"].tobytes() for one in got}) == 6
-    assert len({one["key"][0] for one in got}) == 6
+    assert [columns["episode"][0] for columns in episodes] == [0, 0, 0, 1, 1, 1]
+    assert len({columns["action"].tobytes() for columns in episodes}) == 6
+    assert len({columns["key"][0] for columns in episodes}) == 6
     with pytest.raises(ConfigError, match="expected a multiple of groups, 3, got 4 episodes"):
-        found.collect(4)
+        rollouts.collect(4)
 
 
 @pytest.mark.parametrize("collected", [True, False])
@@ -201,18 +200,22 @@ def test_workers_that_die_cost_neither_an_episode_nor_a_second_one(
     pool: type[Workers], collected: bool
 ) -> None:
     pool.dying = 2
-    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as found:
-        batches = found.collect(8).to_batches() if collected else list(itertools.islice(found, 8))
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as rollouts:
+        batches = (
+            rollouts.collect(8).to_batches() if collected else list(itertools.islice(rollouts, 8))
+        )
     assert keys(batches) == planned(8)
-    assert (found.stats.retries, found.stats.lost) == (2, 0)
+    assert (rollouts.stats.retries, rollouts.stats.lost) == (2, 0)
 
 
 def test_an_episode_that_no_attempt_ends_is_left_out_and_counted() -> None:
     broken = {"trouble": {"raise": [2]}}
-    with Rollouts(RolloutPlan(LINE, ToZero, env_options=broken, settings={"retries": 1})) as found:
-        batches = list(itertools.islice(found, 4))
+    with Rollouts(
+        RolloutPlan(LINE, ToZero, env_options=broken, settings={"retries": 1})
+    ) as rollouts:
+        batches = list(itertools.islice(rollouts, 4))
     assert [int(batch.column("episode")[0].as_py()) for batch in batches] == [0, 1, 3, 4]
-    assert (found.stats.retries, found.stats.lost, found.position) == (1, 1, 5)
+    assert (rollouts.stats.retries, rollouts.stats.lost, rollouts.position) == (1, 1, 5)
 
 
 def test_too_many_lost_in_a_row_end_it_with_their_error() -> None:
@@ -220,10 +223,10 @@ def test_too_many_lost_in_a_row_end_it_with_their_error() -> None:
         return ToZero(lost_on=EVERY)
 
     with (
-        Rollouts(RolloutPlan(LINE, lost, settings={"retries": 0, "abort_after": 3})) as found,
+        Rollouts(RolloutPlan(LINE, lost, settings={"retries": 0, "abort_after": 3})) as rollouts,
         pytest.raises(ConnectionLost, match=r"3 episodes in a row lost .*first=rollouts.position"),
     ):
-        found.collect(4)
+        rollouts.collect(4)
 
 
 def test_an_error_of_the_policy_loses_the_episode_and_ends_it_if_it_stays() -> None:
@@ -232,40 +235,39 @@ def test_an_error_of_the_policy_loses_the_episode_and_ends_it_if_it_stays() -> N
             return Act(np.full(1, np.nan, np.float32))
 
     with (
-        Rollouts(RolloutPlan(LINE, Nan, settings={"abort_after": 2})) as found,
+        Rollouts(RolloutPlan(LINE, Nan, settings={"abort_after": 2})) as rollouts,
         pytest.raises(PolicyFailed, match="2 episodes in"),
     ):
-        next(found)
-    assert (found.stats.lost, found.stats.retries) == (2, 0)
+        next(rollouts)
+    assert (rollouts.stats.lost, rollouts.stats.retries) == (2, 0)
 
 
 def test_on_policy_by_default_older_episodes_are_played_again(versioned: type[Versioned]) -> None:
-    with Rollouts(RolloutPlan(LINE, versioned, workers=3)) as found:
-        first = next(found)
-        versioned.version = found.version = 1
-        rest = list(itertools.islice(found, 5))
-    assert keys([first, *rest]) == planned(6)
-    assert [set(batch.column("version").to_pylist()) for batch in [first, *rest]] == [{0}] + [
-        {1}
-    ] * 5
-    assert found.stats.stale > 0
+    with Rollouts(RolloutPlan(LINE, versioned, workers=3)) as rollouts:
+        first = next(rollouts)
+        versioned.version = rollouts.version = 1
+        later = list(itertools.islice(rollouts, 5))
+    assert keys([first, *later]) == planned(6)
+    versions = [set(batch.column("version").to_pylist()) for batch in [first, *later]]
+    assert versions == [{0}, {1}, {1}, {1}, {1}, {1}]
+    assert rollouts.stats.stale > 0
 
 
 def test_a_version_that_no_act_names_is_an_error_and_not_an_endless_repetition() -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero)) as found:
-        next(found)
-        found.version += 1
+    with Rollouts(RolloutPlan(LINE, ToZero)) as rollouts:
+        next(rollouts)
+        rollouts.version += 1
         with pytest.raises(
             ConfigError, match=r"set to 1, but its acts name 0; set it to what a push returned"
         ):
-            found.collect(4)
+            rollouts.collect(4)
 
 
 def test_the_version_rises_with_that_of_the_acts(versioned: type[Versioned]) -> None:
-    with Rollouts(RolloutPlan(LINE, versioned)) as found:
+    with Rollouts(RolloutPlan(LINE, versioned)) as rollouts:
         versioned.version = 4
-        next(found)
-        assert found.version == 4
+        next(rollouts)
+        assert rollouts.version == 4
 
 
 @pytest.mark.parametrize(("lag", "stale"), [(1, 0), (None, 0), (0, 1)])
@@ -277,9 +279,9 @@ def test_a_lag_may_be_allowed(versioned: type[Versioned], lag: int | None, stale
             type(self).version = versioned.version = 1
             return act
 
-    with Rollouts(RolloutPlan(LINE, Pushed, max_lag=lag)) as found:
-        table = found.collect(2)
-    assert found.stats.stale == stale
+    with Rollouts(RolloutPlan(LINE, Pushed, max_lag=lag)) as rollouts:
+        table = rollouts.collect(2)
+    assert rollouts.stats.stale == stale
     assert (0 in table.column("version").to_pylist()) is (stale == 0)
 
 
@@ -301,8 +303,8 @@ def test_a_simulator_of_many_environments_is_one_worker_with_one_question_a_step
     monkeypatch.setattr(Line, "batched", together)
     served = Replicas([ToZero()])
     try:
-        with Rollouts(RolloutPlan(LINE, served.agent, num_envs=4, groups=2)) as found:
-            table = found.collect(8)
+        with Rollouts(RolloutPlan(LINE, served.agent, num_envs=4, groups=2)) as rollouts:
+            table = rollouts.collect(8)
     finally:
         served.close()
     assert [env.num_envs for env in made] == [4]
@@ -314,30 +316,30 @@ def test_a_simulator_of_many_environments_is_one_worker_with_one_question_a_step
 
 
 def test_they_go_on_where_a_learner_that_died_was() -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero, groups=2)) as found:
-        found.collect(4)
-        batches = list(itertools.islice(found, 3))
-    with Rollouts(RolloutPlan(LINE, ToZero, groups=2, first=4)) as again:
-        assert all(
-            one.equals(other)
-            for one, other in zip(batches, itertools.islice(again, 3), strict=True)
-        )
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=2)) as rollouts:
+        rollouts.collect(4)
+        batches = list(itertools.islice(rollouts, 3))
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=2, first=4)) as continued:
+        continued_batches = list(itertools.islice(continued, 3))
+    assert len(continued_batches) == 3
+    for batch, continued_batch in zip(batches, continued_batches, strict=True):
+        assert batch.equals(continued_batch)
 
 
 def test_closed_and_asked_for_more_they_begin_again_what_was_not_delivered() -> None:
-    found = Rollouts(RolloutPlan(LINE, ToZero, workers=3))
-    first = next(found)
-    found.close()
-    found.close()
-    assert keys([first, *itertools.islice(found, 4)]) == planned(5)
-    found.close()
+    rollouts = Rollouts(RolloutPlan(LINE, ToZero, workers=3))
+    first = next(rollouts)
+    rollouts.close()
+    rollouts.close()
+    assert keys([first, *itertools.islice(rollouts, 4)]) == planned(5)
+    rollouts.close()
 
 
 def test_several_envs_take_turns() -> None:
-    with Rollouts(RolloutPlan([LINE, OTHER_LINE], ToZero)) as found:
-        got = keys(itertools.islice(found, 4))
-    one, other = planned(2), planned(2, OTHER_LINE)
-    assert got == [one[0], other[0], one[1], other[1]]
+    with Rollouts(RolloutPlan([LINE, OTHER_LINE], ToZero)) as rollouts:
+        delivered = keys(itertools.islice(rollouts, 4))
+    line, other_line = planned(2), planned(2, OTHER_LINE)
+    assert delivered == [line[0], other_line[0], line[1], other_line[1]]
 
 
 def test_envs_of_different_columns_do_not_fit_into_one_table(
@@ -356,10 +358,10 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(
             return super().reset(obs, instruction, **kwargs)
 
     with (
-        Rollouts(RolloutPlan([LINE, "eval_fakes:SevenLine"], Seven)) as found,
+        Rollouts(RolloutPlan([LINE, "eval_fakes:SevenLine"], Seven)) as rollouts,
         pytest.raises(ConfigError, match="iterate"),
     ):
-        found.collect(2)
+        rollouts.collect(2)
 
 
 @pytest.mark.parametrize(
@@ -387,10 +389,10 @@ def test_an_env_that_nobody_knows_is_an_error_at_once() -> None:
 def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(
     pool: type[Workers],
 ) -> None:
-    with Rollouts(RolloutPlan(LINE, ToZero, workers=2)) as found:
-        next(found)
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=2)) as rollouts:
+        next(rollouts)
         wait_for(lambda: len(pool.played) == 5)  # without a further call: two for each of the two
-        table = found.collect(2)
+        table = rollouts.collect(2)
         assert list(dict.fromkeys(arrays(table)["key"])) == planned(3)[1:]
         assert sorted(pool.played) == sorted(planned(5))
     assert not [thread for thread in threading.enumerate() if thread.name == "rollouts"]
@@ -402,17 +404,23 @@ def test_at_a_steady_pace_no_episode_is_played_twice(
     pool: type[Workers], versioned: type[Versioned], lag: int, step: int
 ) -> None:
     before = 0
-    with Rollouts(RolloutPlan(LINE, versioned, workers=2, max_lag=lag)) as found:
+    with Rollouts(RolloutPlan(LINE, versioned, workers=2, max_lag=lag)) as rollouts:
         for number in range(8):
-            lags = [found.version - next(found).column("version")[0].as_py() for _ in range(2)]
-            stale = found.stats.stale
+            lags = [
+                rollouts.version - next(rollouts).column("version")[0].as_py() for _ in range(2)
+            ]
+            stale = rollouts.stats.stale
             if number > 3:
                 assert stale == before, "the pace is known"
                 assert max(lags) == (min(lag, 2) if step == 1 else 0)
             before = stale
-            wait_for(lambda: found._player is None or not (found._driver.queue or found._pool.busy))  # type: ignore[union-attr]
-            versioned.version = found.version = versioned.version + step
-    assert len(pool.played) == len(set(pool.played)) + found.stats.stale
+            wait_for(
+                lambda: (
+                    rollouts._player is None or not (rollouts._driver.queue or rollouts._pool.busy)
+                )
+            )  # type: ignore[union-attr]
+            versioned.version = rollouts.version = versioned.version + step
+    assert len(pool.played) == len(set(pool.played)) + rollouts.stats.stale
 
 
 def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(
@@ -424,10 +432,10 @@ def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(
         def act(self, obs: Obs) -> Act:
             return Act(np.full(1, np.nan, np.float32)) if type(self).broken else super().act(obs)
 
-    with Rollouts(RolloutPlan(LINE, Breaks, settings={"abort_after": 1})) as found:
-        first = next(found)
+    with Rollouts(RolloutPlan(LINE, Breaks, settings={"abort_after": 1})) as rollouts:
+        first = next(rollouts)
         monkeypatch.setattr(Breaks, "broken", True)
         with pytest.raises(PolicyFailed, match="1 episodes in a row"):
-            list(itertools.islice(found, 5))
+            list(itertools.islice(rollouts, 5))
         monkeypatch.setattr(Breaks, "broken", False)
-        assert found.collect(1).num_rows == first.num_rows, "it goes on"
+        assert rollouts.collect(1).num_rows == first.num_rows, "it goes on"
