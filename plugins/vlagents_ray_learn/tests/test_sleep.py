@@ -234,7 +234,7 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
             PolicyUnavailable, match="too little memory for the policy, which still sleeps"
         ):
             weights.wake()
-    assert calls == [3], "weight, bias, and the bias of version 1"
+    assert calls == [5], "weight and bias, and the weight, bias and part that version 1 keeps"
     weights.wake()
     assert all(memory.nbytes() for memory in memories)
     assert acted(engine) == before
