@@ -16,6 +16,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from vlagents_ray.cli.robot import command_parser
@@ -195,7 +196,8 @@ def paths() -> Iterator[str]:
     weights = importlib.import_module("vlagents_ray_learn.weights_endpoint")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
-    app = http.build_http_app(None, dict, None, more=[*watched, *pushed])
+    engine = SimpleNamespace(stats=None)  # the routes need it only for requests
+    app = http.build_http_app(engine, dict, None, more=[*watched, *pushed])
     for route in app.routes:
         methods = " ".join(sorted((getattr(route, "methods", None) or {"WS"}) - {"HEAD"}))
         yield f"{methods} {route.path}"
@@ -208,17 +210,24 @@ def series() -> list[str]:
         *ROOT.glob("plugins/*/vlagents_ray_*/**/*.py"),
     )
     texts = [
-        text for text in (file.read_text() for file in files) if "make = partial(series, " in text
+        text
+        for text in (file.read_text() for file in files)
+        if "make = partial(series, " in text or "= series(" in text
     ]
     found = []
     for call in (node for text in texts for node in ast.walk(ast.parse(text))):
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "make":
+        name_of_call = getattr(call.func, "id", "") if isinstance(call, ast.Call) else ""
+        if name_of_call == "series":
+            _, kind, name, _, *tags = call.args
+        elif name_of_call == "make":  # `partial` of it, with the first argument
             kind, name, _, *tags = call.args
-            words = [ast.literal_eval(tag) for tag in tags]
-            found.append(
-                f"ray_vlagents_{ast.literal_eval(name)} {ast.unparse(kind).lower()} "
-                f"[{', '.join(words)}]"
-            )
+        else:
+            continue
+        words = [ast.literal_eval(tag) for tag in tags]
+        found.append(
+            f"ray_vlagents_{ast.literal_eval(name)} {ast.unparse(kind).lower()} "
+            f"[{', '.join(words)}]"
+        )
     return sorted(found)
 
 
