@@ -41,7 +41,8 @@ def offset(picture):
     red, green = picture[..., 0] > 200, picture[..., 1] > 200
     if not (red.any() and green.any()):
         raise InvalidObservation(
-            "camera 'front': got a picture without a red hook and a green mark, want both in it"
+            "camera 'front': expected a red hook and a green mark in the picture, got one without "
+            "both of them; move the camera"
         )
     hook, mark = (np.argwhere(colour).mean(axis=0)[::-1] for colour in (red, green))
     return (mark - hook) / picture.shape[1]

@@ -81,6 +81,6 @@ def named_colour(instruction: str | None) -> str:
     found = re.search(r"the (\w+) puck", instruction or "")
     if found is None or found[1] not in WORDS:
         raise InvalidObservation(
-            f"instruction: got {instruction!r}, want 'lift the COLOUR puck' with one of {WORDS}"
+            f"instruction: expected 'lift the COLOUR puck' with one of {WORDS}, got {instruction!r}"
         )
     return found[1]

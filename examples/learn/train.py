@@ -134,12 +134,12 @@ class RunCheckpoints:
             file.write_text(mine)
         elif not plan.resume:
             raise ConfigError(
-                f"{plan.out} already has a run: go on with it (resume), or choose another folder"
+                f"{plan.out} already has a run: continue it (resume), or choose another folder"
             )
         elif (its := file.read_text()) != mine:
             raise ConfigError(
-                f"{plan.out} has a run with other settings: got {mine}, want {its}, or another "
-                "folder"
+                f"{plan.out} has a run with other settings: expected {its}, got {mine}; use its "
+                "settings, or choose another folder"
             )
 
     def save(self, name: str, state: Mapping[str, Any]) -> None:
