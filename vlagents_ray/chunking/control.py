@@ -30,8 +30,8 @@ class Leader(Protocol):
 
     A device that adds up its motions to absolute targets also has a method `rebase(last)`, which is
     called when its action was not executed. The next target then begins at `last`, the executed
-    command, (D,) float32, or at the robot's measured pose if `last` is None. Else targets would run
-    on while the guard refuses them.
+    command, (D,) float32, or at the robot's measured pose if `last` is None. Otherwise, the
+    targets would move on while the guard rejects them.
     """
 
     def engaged(self) -> bool:

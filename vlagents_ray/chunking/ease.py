@@ -121,7 +121,7 @@ class EaseIn:
         return command, 1
 
     def _begin_section(self, known: int) -> None:
-        """Begin the section of the ramp that ends at full speed, or else at the last known row."""
+        """Begin the section of the ramp that ends at full speed, or at the last known row."""
         self._position = 0.0
         first = math.ceil((1.0 - self._speed**2) * self._ramp / 2)
         for rows in range(max(1, first), known + 1):

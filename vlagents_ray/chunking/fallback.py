@@ -32,11 +32,11 @@ Cause = Literal[
     "stale",  # the observation is older than max_age_s
     "lost",  # the server did not answer: no connection, or not in time
     "failed",  # the policy raised an error
-    "limits",  # the guard refused the action: beyond a limit
-    "max_step",  # the guard refused the action: too far from the last one, or too fast
-    "dynamics",  # the guard refused the action: too much acceleration or jerk
-    "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
-    "leader",  # the operator's device gave no action
+    "limits",  # the guard rejected the action: beyond a limit
+    "max_step",  # the guard rejected the action: too far from the last one, or too fast
+    "dynamics",  # the guard rejected the action: too much acceleration or jerk
+    "invalid",  # the action is NaN, has a wrong shape, or was rejected by another check
+    "leader",  # the operator's device returned no action
     "robot",  # the robot must not move (`holds`), for instance because a camera hangs
     "stopped",  # the robot was stopped and not restarted yet
     "paused",  # counted separately
@@ -72,7 +72,7 @@ _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
 def refused(error: InvalidAction) -> Held:
-    """Return why the robot holds still in place of a refused action."""
+    """Return why the robot holds still in place of a rejected action."""
     return Held(error.cause, str(error))
 
 
@@ -181,7 +181,7 @@ class SafeAction:
         grippers = self._gripper_columns(spec.dim)
         if grippers:
             closed, opened = spec.gripper_closed, spec.gripper_open
-            # An observation has one opening, which says too little of several grippers.
+            # An observation has a single opening, which is not enough for several grippers.
             if len(grippers) > 1 or obs.gripper is None or closed is None or opened is None:
                 return None
             action[grippers] = closed + obs.gripper * (opened - closed)
@@ -190,7 +190,7 @@ class SafeAction:
 
 def stopping(spec: ActionSpec) -> SafeName:
     """Return the action that keeps a robot still: "zero" if its actions are known to be
-    relative, else "hold".
+    relative, otherwise "hold".
     """
     return "zero" if spec.relative else "hold"
 

@@ -91,7 +91,7 @@ class AsyncCaller:
         self._jobs.put(obs)
 
     def take(self, wait_s: float = 0.0) -> Act | Exception | None:
-        """Return the policy's answer or its error within `wait_s` seconds, else None."""
+        """Return the policy's answer or its error within `wait_s` seconds, or None."""
         try:
             answer = self._answers.get(timeout=wait_s) if wait_s else self._answers.get_nowait()
         except queue.Empty:
@@ -163,7 +163,7 @@ class PlayerSettings:
     horizon: int | None = None
     max_age_s: float | None = None
     """The largest age of the observation of an executed action. The age counts from
-    `info["captured_at"]`, that of the sensor read first, or else from the call of `act` (see
+    `info["captured_at"]`, that of the sensor read first, or from the call of `act` (see
     `CaptureClock`).
     """
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
@@ -226,11 +226,11 @@ class ChunkPlayer(Agent):
             settings: The requests to the policy, and the use of its answers; default:
                 `PlayerSettings()`.
             check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`.
-                If it refuses an action of the policy, the safe one replaces it, and the plan is
-                dropped; if it refuses a safe one, the last action replaces it if that holds the
-                robot still; else `act` raises `InvalidAction`. It also receives the last action; a
-                `Guard` with `measure` uses the measured pose if there is none, and after safe
-                actions.
+                If it rejects an action of the policy, the safe one replaces it, and the plan is
+                dropped. If it rejects a safe action, the last action replaces it if that holds the
+                robot still; otherwise `act` raises `InvalidAction`. The check also receives the
+                last action. A `Guard` with `measure` uses the measured pose if there is none, and
+                after safe actions.
             override: The operator's device. While it is engaged, `act` returns its actions with
                 `info["intervention"]` and, if known, `info["policy_action"]`. `check` also applies
                 to them.
@@ -320,7 +320,7 @@ class ChunkPlayer(Agent):
                 `vlagents_ray.interface`).
 
         Raises:
-            InvalidAction: The check refuses the action.
+            InvalidAction: The check rejects the action.
         """
         if self._caller is not None:
             self._caller.settle()
@@ -488,7 +488,7 @@ class ChunkPlayer(Agent):
         return info
 
     def _operator_act(self, obs: Obs) -> Act:
-        """Return the operator's action, or the safe one if the guard refuses it."""
+        """Return the operator's action, or the safe one if the guard rejects it."""
         # A silent policy does not stop an operator.
         info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}
         planned = self._next()
@@ -515,7 +515,7 @@ class ChunkPlayer(Agent):
             rebase(last)
 
     def _policy_act(self, obs: Obs, tick: int) -> Act:
-        """Return the policy's action, or the safe one if that is missing or refused."""
+        """Return the policy's action, or the safe one if that is missing or rejected."""
         control_held = self.control.held
         step = None if control_held is not None else self._next()
         why = control_held or (STALE if self._is_old(self._captured(obs)) else self._reason)

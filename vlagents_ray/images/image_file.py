@@ -35,7 +35,7 @@ _BASELINE_BYTE_S, _PROGRESSIVE_BYTE_S = 5e-9, 20e-9  # per byte of a JPEG
 _OWN_PNG_S, _PNG_S = 7e-9, 12e-9
 _PILLOW_S = 70e-6  # per file
 _PILLOW_ROW_S = 0.1e-6  # per row
-# Memory beside the result, per pixel: the image in 32 bits, and copies of it.
+# Memory in addition to the result, per pixel: the image in 32 bits, and copies of it.
 _PILLOW_PIXEL_BYTES = 16
 
 _SOF = {0xC0: "baseline", 0xC1: "extended", 0xC2: "progressive"}
@@ -55,7 +55,7 @@ class ImageFile:
     height: int
     width: int
     decoding_s: float  # estimated time on one core, s
-    scratch_bytes: int  # memory that decoding needs beside the image, bytes
+    scratch_bytes: int  # memory that decoding needs in addition to the image, bytes
     # name, start and end of each critical chunk of a PNG.
     chunks: tuple[tuple[bytes, int, int], ...] = ()
 

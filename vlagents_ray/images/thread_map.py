@@ -36,7 +36,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _LEAST_WORK_S = 0.4e-3  # s; two cameras of 224 x 224 in JPEG gain a fifth of a round trip
-_MOST_HELPERS = 3  # largest number of threads beside the caller's; robots have few cameras
+_MOST_HELPERS = 3  # largest number of threads in addition to the caller's; robots have few cameras
 MOST_THREADS = 1 + _MOST_HELPERS
 
 
