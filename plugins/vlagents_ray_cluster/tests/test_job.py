@@ -38,14 +38,14 @@ def options(**more: str) -> dict[str, str]:
 
 
 def test_ray_gets_what_slurm_gave_and_not_what_the_machine_has() -> None:
-    found = options(SLURM_GPUS_ON_NODE="2", SLURM_MEM_PER_NODE="8192")
-    assert (found["num-cpus"], found["num-gpus"]) == ("1", "2")
-    assert int(found["memory"]) + int(found["object-store-memory"]) == 8192 * 2**20
+    ray_options = options(SLURM_GPUS_ON_NODE="2", SLURM_MEM_PER_NODE="8192")
+    assert (ray_options["num-cpus"], ray_options["num-gpus"]) == ("1", "2")
+    assert int(ray_options["memory"]) + int(ray_options["object-store-memory"]) == 8192 * 2**20
 
 
 def test_memory_may_be_counted_by_cpu_or_not_at_all() -> None:
-    found = options(SLURM_MEM_PER_CPU="4096")
-    assert int(found["memory"]) + int(found["object-store-memory"]) == 4096 * 2**20
+    ray_options = options(SLURM_MEM_PER_CPU="4096")
+    assert int(ray_options["memory"]) + int(ray_options["object-store-memory"]) == 4096 * 2**20
     for more in ({}, {"SLURM_MEM_PER_NODE": "0"}):
         assert "memory" not in options(**more)
 
@@ -57,11 +57,11 @@ def test_a_task_that_is_bound_to_fewer_cpus_counts_those() -> None:
 
 
 def test_the_first_node_is_the_head_and_the_others_join_it() -> None:
-    head, other = options(SLURM_NODEID="0"), options()
+    head, worker = options(SLURM_NODEID="0"), options()
     assert {"head", "block"} <= head.keys()
     assert head["node-ip-address"] == "10.0.0.5"
-    assert other["address"] == f"10.0.0.5:{head['port']}"
-    assert "head" not in other
+    assert worker["address"] == f"10.0.0.5:{head['port']}"
+    assert "head" not in worker
 
 
 @pytest.mark.parametrize("job", [1, 4711, 2_499, 67_043_328])
@@ -69,8 +69,14 @@ def test_jobs_that_follow_each_other_share_no_port(job: int) -> None:
     def ports(number: int) -> Ports:
         return Allocation.here(ENVIRONMENT | {"SLURM_JOB_ID": str(number)}).ports
 
-    def numbers(found: Ports) -> set[int]:
-        return {found.gcs, found.client, found.metrics, found.serve, found.export}
+    def numbers(job_ports: Ports) -> set[int]:
+        return {
+            job_ports.gcs,
+            job_ports.client,
+            job_ports.metrics,
+            job_ports.serve,
+            job_ports.export,
+        }
 
     assert len(numbers(ports(job))) == 5
     assert not numbers(ports(job)) & numbers(ports(job + 1))
@@ -116,39 +122,41 @@ SERVER = {
 
 def test_the_connection_information_has_all_that_a_client_needs() -> None:
     host = socket.gethostname()
-    found = connection_info({"pi0": "/pi0", "noop": "/"}, 9000, SERVER)
-    assert found["apps"] == {"pi0": f"http://{host}:9000/pi0", "noop": f"http://{host}:9000"}
-    assert (found["job"], found["key"], found["address"]) == (12, "vlr_x", "10.0.0.5")
-    assert found["ssh"] == f"ssh -N -L 9000:{host}:9000 me@login1"
+    info = connection_info({"pi0": "/pi0", "noop": "/"}, 9000, SERVER)
+    assert info["apps"] == {"pi0": f"http://{host}:9000/pi0", "noop": f"http://{host}:9000"}
+    assert (info["job"], info["key"], info["address"]) == (12, "vlr_x", "10.0.0.5")
+    assert info["ssh"] == f"ssh -N -L 9000:{host}:9000 me@login1"
+
     started = Allocation.here(ENVIRONMENT | SERVER).ray_start("10.0.0.5", "folder")
     [exported] = [
         word.partition("=")[2] for word in started if word.startswith("--metrics-export-port=")
     ]
-    assert found["metrics"] == f"http://{host}:{exported}/metrics"
+    assert info["metrics"] == f"http://{host}:{exported}/metrics"
 
 
 def test_people_are_told_the_same() -> None:
-    found = connection_info({"pi0": "/pi0"}, 9000, SERVER)
-    text = as_text(found, Path("server.json"))
-    assert all(part in text for part in (found["apps"]["pi0"], found["ssh"], "server.json"))
-    assert "the key that you were given" in as_text(found | {"key": None}, Path("server.json"))
+    info = connection_info({"pi0": "/pi0"}, 9000, SERVER)
+    text = as_text(info, Path("server.json"))
+    assert all(expected in text for expected in (info["apps"]["pi0"], info["ssh"], "server.json"))
+    assert "the key that you were given" in as_text(info | {"key": None}, Path("server.json"))
 
 
 def test_the_log_has_no_key_but_the_command_that_reads_it(tmp_path: Path) -> None:
-    found = connection_info({"pi0": "/pi0"}, 9000, SERVER)
+    info = connection_info({"pi0": "/pi0"}, 9000, SERVER)
     file = tmp_path / 'it\'s "here"' / "server.json"
     file.parent.mkdir()
-    write(file, found)
-    text = as_text(found, file)
+    write(file, info)
+
+    text = as_text(info, file)
     assert "vlr_x" not in text
     (command,) = (line.strip() for line in text.splitlines() if "export" in line)
-    shown = subprocess.run(
+    shell = subprocess.run(
         ["bash", "-c", f"{command}; echo $VLAGENTS_RAY_API_KEY"],
         check=True,
         capture_output=True,
         text=True,
     )
-    assert shown.stdout.strip() == "vlr_x"
+    assert shell.stdout.strip() == "vlr_x"
 
 
 def test_the_file_with_the_key_is_its_owners_alone(tmp_path: Path) -> None:

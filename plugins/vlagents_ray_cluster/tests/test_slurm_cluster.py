@@ -32,10 +32,11 @@ except Unauthorized:
 
 @pytest.fixture(scope="module")
 def slurm() -> Iterator[Slurm]:
-    if (reason := no_slurm()) is not None:
+    reason = no_slurm()
+    if reason is not None:
         pytest.skip(reason)
-    with running_slurm(nodes=2, cpus=2) as found:
-        yield found
+    with running_slurm(nodes=2, cpus=2) as cluster:
+        yield cluster
 
 
 def command(folder: Path, *more: str) -> list[str]:
@@ -95,12 +96,14 @@ def test_a_cancelled_evaluation_is_finished_by_the_same_command_with_each_episod
     assert slurm.wait_for_end(again) == "COMPLETED", log.read_text()
     assert episodes(tmp_path) == sorted([*before, (6, 2), (7, 2)])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["state"] == "complete"
-    assert all(f"{one.name} (2 CPUs, 1 GPUs)" in log.read_text() for one in slurm.nodes)
+    assert all(f"{node.name} (2 CPUs, 1 GPUs)" in log.read_text() for node in slurm.nodes)
     assert {file.name.partition("-")[0] for file in tmp_path.glob("host*-*")} == {
-        one.name for one in slurm.nodes
+        node.name for node in slurm.nodes
     }
     logs = tmp_path / "out" / "slurm" / job
-    assert {file.name for file in logs.iterdir()} >= {f"ray-{one.name}.log" for one in slurm.nodes}
+    assert {file.name for file in logs.iterdir()} >= {
+        f"ray-{node.name}.log" for node in slurm.nodes
+    }
 
 
 def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(
@@ -138,8 +141,8 @@ def test_a_server_in_a_job_says_how_to_get_in_and_lets_nobody_else_in(
     file = tmp_path / job / "server.json"
     slurm.wait_for(job, file.exists)
     assert file.stat().st_mode & 0o777 == 0o600
-    said = slurm.login.run([sys.executable, "-c", CLIENT, str(file)]).splitlines()
-    assert said == ["[0.0, 0.0, 0.0]", "refused"]
+    output = slurm.login.run([sys.executable, "-c", CLIENT, str(file)]).splitlines()
+    assert output == ["[0.0, 0.0, 0.0]", "refused"]
     server = json.loads(file.read_text())
     assert (server["job"], server["host"]) == (int(job), slurm.nodes[0].name)
     log = tmp_path / f"{job}.log"

@@ -35,9 +35,9 @@ def script(*words: str) -> str:
 
 def arguments(*words: str) -> list[str]:
     """What the job's first node is told to do."""
-    found = re.search(r"^arguments=\((.*)\)$", script(*words), re.MULTILINE)
-    assert found is not None
-    return shlex.split(found[1])
+    match = re.search(r"^arguments=\((.*)\)$", script(*words), re.MULTILINE)
+    assert match is not None
+    return shlex.split(match[1])
 
 
 def test_an_evaluation_keeps_its_words_and_sbatch_gets_the_others(tmp_path: Path) -> None:
@@ -117,11 +117,11 @@ def test_a_tracker_that_is_not_registered_is_refused_before_the_job_is_submitted
 
 
 def test_a_server_has_a_key_made_for_it_unless_it_has_some() -> None:
-    made = arguments(*SERVE, "--set", "action_dim=3", "--time=60")
-    assert made == ["serve", "--app=noop=/", "--key", "--", "noop", "--set", "action_dim=3"]
-    mine = arguments(*SERVE, "--keys", "mine.json", "--port", "9000")
-    assert "--key" not in mine
-    assert "--port=9000" in mine
+    without_keys = arguments(*SERVE, "--set", "action_dim=3", "--time=60")
+    assert without_keys == ["serve", "--app=noop=/", "--key", "--", "noop", "--set", "action_dim=3"]
+    with_keys = arguments(*SERVE, "--keys", "mine.json", "--port", "9000")
+    assert "--key" not in with_keys
+    assert "--port=9000" in with_keys
 
 
 def test_what_the_page_shows_becomes_a_script(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ from vlagents_ray_cluster.slurm.submission import (
     submit,
 )
 
-KNOWN = {"--policy": True, "--resume": False, "--out": True}
+COMMAND_OPTIONS = {"--policy": True, "--resume": False, "--out": True}
 
 
 def test_what_the_command_knows_is_its_own_and_the_rest_is_sbatchs() -> None:
@@ -30,25 +30,28 @@ def test_what_the_command_knows_is_its_own_and_the_rest_is_sbatchs() -> None:
         "env/a --policy p --nodes 4 --resume --time=1:00:00 env/b --out=runs/x --gpus-per-node "
         "a100:2 --requeue"
     )
-    own, sbatch = split(words.split(), KNOWN)
-    assert own == ["env/a", "--policy", "p", "--resume", "env/b", "--out=runs/x"]
+    arguments, sbatch = split(words.split(), COMMAND_OPTIONS)
+    assert arguments == ["env/a", "--policy", "p", "--resume", "env/b", "--out=runs/x"]
     assert sbatch == {"nodes": "4", "time": "1:00:00", "gpus-per-node": "a100:2", "requeue": None}
 
 
 def test_a_value_may_look_like_an_option_of_the_other() -> None:
-    assert split(["--policy", "--nodes", "--comment", "--policy"], KNOWN) == (
+    assert split(["--policy", "--nodes", "--comment", "--policy"], COMMAND_OPTIONS) == (
         ["--policy", "--nodes"],
         {"comment": "--policy"},
     )
 
 
 def test_an_option_that_stands_alone_leaves_the_next_word_alone() -> None:
-    assert split(["--exclusive", "env/a"], KNOWN) == (["env/a"], {"exclusive": None})
-    assert split(["--exclusive=user", "env/a"], KNOWN) == (["env/a"], {"exclusive": "user"})
+    assert split(["--exclusive", "env/a"], COMMAND_OPTIONS) == (["env/a"], {"exclusive": None})
+    assert split(["--exclusive=user", "env/a"], COMMAND_OPTIONS) == (
+        ["env/a"],
+        {"exclusive": "user"},
+    )
 
 
 def test_sbatchs_short_options_have_their_long_names() -> None:
-    _, sbatch = split(["-N4", "-p", "gpu", "-t", "30", "-H", "-d", "afterok:7"], KNOWN)
+    _, sbatch = split(["-N4", "-p", "gpu", "-t", "30", "-H", "-d", "afterok:7"], COMMAND_OPTIONS)
     assert sbatch == {
         "nodes": "4",
         "partition": "gpu",
@@ -59,7 +62,7 @@ def test_sbatchs_short_options_have_their_long_names() -> None:
 
 
 def test_an_option_that_only_a_newer_sbatch_knows_is_passed_on() -> None:
-    assert split(["--segment=4", "--oom-kill-step=1"], KNOWN)[1] == {
+    assert split(["--segment=4", "--oom-kill-step=1"], COMMAND_OPTIONS)[1] == {
         "segment": "4",
         "oom-kill-step": "1",
     }
@@ -80,7 +83,7 @@ def test_an_option_that_only_a_newer_sbatch_knows_is_passed_on() -> None:
 )
 def test_words_that_would_not_work_are_told_with_what_would(words: list[str], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
-        split(words, KNOWN)
+        split(words, COMMAND_OPTIONS)
 
 
 def test_the_first_task_of_an_array() -> None:
@@ -150,19 +153,20 @@ def test_no_name_path_or_option_becomes_a_command(
         line for line in head.split(b"arguments=(")[0].splitlines() if not line.startswith(b"#")
     ]
     assert [line.partition(b"=")[0] for line in commands] == [b"", *SETTINGS]
-    shown = b"".join(one.encode() + b"\0" for one in arguments)
+
+    expected = b"".join(argument.encode() + b"\0" for argument in arguments)
     show = b'printf "%s\\0" "${arguments[@]}"\n' if arguments else b""
     done = subprocess.run(["bash"], input=head + show, check=True, capture_output=True)
-    assert (done.stdout, done.stderr) == (shown, b"")
+    assert (done.stdout, done.stderr) == (expected, b"")
 
 
 def test_the_users_options_win_over_the_usual_ones(tmp_path: Path) -> None:
     options = {"nodes": "4", "output": "mine/%j", "no-requeue": None, "comment": "two words"}
     lines = Script("eval", tmp_path, [], options).text().splitlines()
-    found = [line.removeprefix("#SBATCH ") for line in lines if line.startswith("#SBATCH")]
-    assert {"--nodes=4", "--output=mine/%j", "--no-requeue", '--comment="two words"'} <= set(found)
-    assert "--requeue" not in found
-    assert len({line.partition("=")[0] for line in found}) == len(found)
+    sbatch = [line.removeprefix("#SBATCH ") for line in lines if line.startswith("#SBATCH")]
+    assert {"--nodes=4", "--output=mine/%j", "--no-requeue", '--comment="two words"'} <= set(sbatch)
+    assert "--requeue" not in sbatch
+    assert len({line.partition("=")[0] for line in sbatch}) == len(sbatch)
 
 
 def test_a_job_that_is_submitted_from_within_a_job_does_not_inherit_its_options(
@@ -172,10 +176,11 @@ def test_a_job_that_is_submitted_from_within_a_job_does_not_inherit_its_options(
     for name, value in {"SLURM_NTASKS": "8", "SLURM_CONF": "/x", "SBATCH_ACCOUNT": "mine"}.items():
         monkeypatch.setenv(name, value)
     assert submit(script(tmp_path / "s")) == "812"
-    seen = (tmp_path / "environment").read_text()
-    assert "SLURM_NTASKS" not in seen
-    assert "SLURM_CONF=/x\n" in seen
-    assert "SBATCH_ACCOUNT=mine\n" in seen
+
+    environment = (tmp_path / "environment").read_text()
+    assert "SLURM_NTASKS" not in environment
+    assert "SLURM_CONF=/x\n" in environment
+    assert "SBATCH_ACCOUNT=mine\n" in environment
     assert (tmp_path / "words").read_text().split() == [
         "--parsable",
         str(tmp_path / "s" / "eval.sh"),

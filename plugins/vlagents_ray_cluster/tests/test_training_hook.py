@@ -45,8 +45,8 @@ def test_a_checkpoint_is_submitted_once_with_its_path_and_step(
         )
 
     with ThreadPoolExecutor(8) as ranks:
-        found = list(ranks.map(call, range(8)))
-    assert sorted(found, key=str) == ["77", *[None] * 7]
+        jobs = list(ranks.map(call, range(8)))
+    assert sorted(jobs, key=str) == ["77", *[None] * 7]
     assert calls(tmp_path) == 1
     assert "checkpoint=/c/20\n--out\nruns/20\n" in (tmp_path / "words").read_text()
     [mark] = (tmp_path / "record").iterdir()
@@ -121,8 +121,8 @@ def test_a_claim_without_a_job_holds_for_as_long_as_a_submission_may_take(
     os.utime(claimed, (then, then))
     folder = claimed.parents[1]
     with ThreadPoolExecutor(8) as ranks:
-        found = list(ranks.map(lambda _rank: call_for(folder), range(8)))
-    assert [job for job in found if job is not None] == jobs
+        results = list(ranks.map(lambda _rank: call_for(folder), range(8)))
+    assert [job for job in results if job is not None] == jobs
     assert calls(folder) == 1 + len(jobs)
 
 
@@ -130,8 +130,8 @@ def test_the_call_for_a_later_checkpoint_makes_up_for_an_earlier_one(claimed: Pa
     then = time.time() - 361.0
     os.utime(claimed, (then, then))
     assert call_for(claimed.parents[1], step=30) == "77"
-    said = [json.loads(path.read_text()) for path in sorted(claimed.parent.glob("*.json"))]
-    assert [(one["step"], one["job"], one["words"][-1]) for one in said] == [
+    claims = [json.loads(path.read_text()) for path in sorted(claimed.parent.glob("*.json"))]
+    assert [(claim["step"], claim["job"], claim["words"][-1]) for claim in claims] == [
         (20, "77", "runs/20"),
         (30, "77", "runs/30"),
     ]

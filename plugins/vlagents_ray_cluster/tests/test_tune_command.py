@@ -32,15 +32,15 @@ QUICK = ["--seconds", "0.1", "--max-batch", "2"]
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "support"))
-    made = tmp_path / "mine.yaml"
-    made.write_text(FILE)
-    return made
+    deployment_file = tmp_path / "mine.yaml"
+    deployment_file.write_text(FILE)
+    return deployment_file
 
 
 def printed_settings(output: str) -> dict[str, Any]:
     """Return the YAML at the end of the output, after the line that says where it belongs."""
-    found: dict[str, Any] = yaml.safe_load(re.split(r"\nset .*:\n", output)[1])
-    return found
+    settings: dict[str, Any] = yaml.safe_load(re.split(r"\nset .*:\n", output)[1])
+    return settings
 
 
 @pytest.mark.slow  # each variant is measured in a process of its own
@@ -51,6 +51,7 @@ def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None
     assert "\nchosen: compile: true, " in done.output
     assert "\nthe file as it is: own settings, 2 sessions: " in done.output
     assert f"set below args of 'mine' in {file}:" in done.output
+
     settings = printed_settings(done.output)
     assert settings["config"]["compile"] is True
     tuned = yaml.safe_load(FILE)

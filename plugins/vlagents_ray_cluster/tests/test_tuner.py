@@ -23,22 +23,20 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", SUPPORT)
 
 
-def tuner(policy: str = "Tunable", *, batch: dict[str, Any] | None = None, **given: Any) -> Tuner:
-    plan = {name: given.pop(name) for name in list(given) if name in TunePlan.__dataclass_fields__}
+def tuner(policy: str = "Tunable", *, batch: dict[str, Any] | None = None, **options: Any) -> Tuner:
+    """A quick tuner; options are fields of the plan, or else settings of the policy."""
+    plan: dict[str, Any] = {"goal": TuningGoal("throughput"), "max_batch": 2, "seconds": 0.1}
+    config = {}
+    for name, value in options.items():
+        if name in TunePlan.__dataclass_fields__:
+            plan[name] = value
+        else:
+            config[name] = value
+
     args = ServerArgs(
-        policy=f"tuned_policies:{policy}", config=given, batch=batch or {"max_size": 2}
+        policy=f"tuned_policies:{policy}", config=config, batch=batch or {"max_size": 2}
     )
-    return Tuner(
-        TunePlan(
-            **{
-                "args": args,
-                "goal": TuningGoal("throughput"),
-                "max_batch": 2,
-                "seconds": 0.1,
-                **plan,
-            }
-        )
-    )
+    return Tuner(TunePlan(args=args, **plan))
 
 
 def test_compilation_that_helps_is_chosen() -> None:
@@ -47,26 +45,27 @@ def test_compilation_that_helps_is_chosen() -> None:
     chosen = choose(points, TuningGoal("throughput"))
     assert chosen.variant.changes == {"compile": True, "batch_sizes": [1, 2]}
     assert chosen.difference == 0
-    assert {one.variant.name for one in points} == {"own settings", "compile: true"}
-    assert {one.sessions for one in points if not one.variant.changes} == {1, 2}
-    assert all(0 < one.round_trip_ms <= one.p99_ms for one in points)
+    assert {point.variant.name for point in points} == {"own settings", "compile: true"}
+    assert {point.sessions for point in points if not point.variant.changes} == {1, 2}
+    assert all(0 < point.round_trip_ms <= point.p99_ms for point in points)
     assert measured.left_out == []
     assert measured.device == "cpu"
 
 
 def test_the_largest_batch_of_the_file_is_measured_and_only_useful_sizes_are_compiled() -> None:
     points = tuner(batch={"max_size": 3}, row_ms=20.0, eager_ms=0.0).measure()
-    own = [one for one in points if not one.variant.changes]
-    assert [one.sessions for one in own] == [1, 2, 3]
-    best = max(own, key=lambda one: one.actions_per_s).sessions
-    assert {tuple(one.variant.changes["batch_sizes"]) for one in points if one.variant.changes} == {
-        (1, 2, 3)[:best]
-    }
+    unchanged = [point for point in points if not point.variant.changes]
+    assert [point.sessions for point in unchanged] == [1, 2, 3]
+
+    best = max(unchanged, key=lambda point: point.actions_per_s).sessions
+    changed = [point for point in points if point.variant.changes]
+    compiled_sizes = {tuple(point.variant.changes["batch_sizes"]) for point in changed}
+    assert compiled_sizes == {(1, 2, 3)[:best]}
 
 
 def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_left_out() -> None:
     measured = tuner(dtypes=["bfloat16", "float16", "auto"], off=5.0, compile=True)
-    assert {one.variant.name for one in measured.measure()} == {"own settings"}
+    assert {point.variant.name for point in measured.measure()} == {"own settings"}
     refused, crashed = measured.left_out
     assert refused.startswith("dtype: bfloat16: refused, as actions differ by")
     assert crashed == "dtype: float16: ended with exit status 7"
@@ -75,19 +74,17 @@ def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_le
 @pytest.mark.parametrize("name", ["bfloat16", "int8"])
 def test_a_type_whose_actions_are_near_enough_passes(name: str) -> None:
     measured = tuner(dtypes=[name], off=5.0, compile=True, tolerance=10.0)
-    [(changes, off)] = {
-        (tuple(one.variant.changes.items()), one.difference)
-        for one in measured.measure()
-        if one.variant.changes
-    }
-    assert changes == (("quantization" if name == "int8" else "dtype", name),)
-    assert off > 0.01
+    changed = [point for point in measured.measure() if point.variant.changes]
+    [variant] = {point.variant.name: point.variant for point in changed}.values()
+    [difference] = {point.difference for point in changed}
+    assert variant.changes == {"quantization" if name == "int8" else "dtype": name}
+    assert difference > 0.01
     assert measured.left_out == []
 
 
 def test_a_batch_without_memory_ends_the_sizes_and_smaller_ones_stay() -> None:
     measured = tuner(compile=True, most_rows=2, max_batch=4, goal=TuningGoal("robots", 60_000.0))
-    assert [one.sessions for one in measured.measure()] == [1, 2]
+    assert [point.sessions for point in measured.measure()] == [1, 2]
     assert measured.left_out == ["own settings, 4 sessions: MemoryError: 4 rows"]
 
 
@@ -102,7 +99,7 @@ def test_what_is_not_done_in_time_is_left_out() -> None:
 
 def test_variants_that_cannot_be_loaded_leave_the_file_as_it_is() -> None:
     measured = tuner(compiles=False, dtypes=["bfloat16"])
-    names = [one.variant.name for one in measured.measure()]
+    names = [point.variant.name for point in measured.measure()]
     assert set(names) == {"own settings", "dtype: bfloat16"}
     # Nor any with both.
     assert measured.left_out == ["compile: true: ConfigError: compile: this one has no compiler"]
@@ -115,7 +112,7 @@ def test_a_policy_that_is_random_in_itself_cannot_be_compared() -> None:
 
 def test_recorded_observations_are_acted_on_if_they_fit(tmp_path: Path) -> None:
     record(tmp_path / "ep0.npz", 1.0, part="joints")
-    assert {one.variant.name for one in tuner(frames=tmp_path, compile=True).measure()} == {
+    assert {point.variant.name for point in tuner(frames=tmp_path, compile=True).measure()} == {
         "own settings"
     }
     record(tmp_path / "ep0.npz", 1.0)
@@ -126,7 +123,7 @@ def test_recorded_observations_are_acted_on_if_they_fit(tmp_path: Path) -> None:
 def test_a_policy_without_such_settings_gets_a_batch_size() -> None:
     args = ServerArgs(policy="tuned_policies:Plain", batch={"max_size": 2})
     plan = TunePlan(args, TuningGoal("throughput"), max_batch=2, seconds=0.1)
-    assert {one.variant.name for one in Tuner(plan).measure()} == {"own settings"}
+    assert {point.variant.name for point in Tuner(plan).measure()} == {"own settings"}
     with pytest.raises(ConfigError, match="no setting `dtype`"):
         Tuner(TunePlan(args, TuningGoal("throughput"), dtypes=["bfloat16"])).measure()
 
@@ -135,13 +132,13 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
     measured = tuner(
         batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=TuningGoal("robots", 60_000.0)
     )
-    assert [one.sessions for one in measured.measure()] == [2, 3]
+    assert [point.sessions for point in measured.measure()] == [2, 3]
     with pytest.raises(ConfigError, match="--max-batch: got 1"):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
 
 
 @pytest.mark.parametrize(
-    ("own", "modes", "tried"),
+    ("file_mode", "modes", "tried"),
     [
         (False, [False, True], [True]),
         ("graphs", [False, "graphs", True], [False, True]),
@@ -151,11 +148,13 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
     ],
 )
 def test_other_modes_of_compilation_are_tried_unless_the_file_compiles(
-    own: Any, modes: list[Any], tried: list[Any]
+    file_mode: Any, modes: list[Any], tried: list[Any]
 ) -> None:
-    sizes = [1, 2, 4, 8] if own else None  # by default
-    ready = {"settings": {"compile": own, "batch_sizes": sizes}, "dtypes": [], "modes": modes}
-    found = [variant.changes for variant in tuner()._variants(ready, [1, 2])]
-    assert found == [
-        {"compile": mode} | ({"batch_sizes": [1, 2]} if mode else {}) for mode in tried
-    ]
+    sizes = [1, 2, 4, 8] if file_mode else None  # by default
+    settings = {"compile": file_mode, "batch_sizes": sizes}
+    ready = {"settings": settings, "dtypes": [], "modes": modes}
+
+    expected = []
+    for mode in tried:
+        expected.append({"compile": mode, "batch_sizes": [1, 2]} if mode else {"compile": mode})
+    assert [variant.changes for variant in tuner()._variants(ready, [1, 2])] == expected

@@ -30,15 +30,15 @@ from vlagents_ray_cluster.tune.tuner import (
 def test_they_are_spread_over_episodes_and_their_steps(tmp_path: Path) -> None:
     record(tmp_path / "a" / "ep0.npz", 0.0)
     record(tmp_path / "b" / "ep1.npz", 100.0)
-    found = recorded_observations(tmp_path, 4)
-    assert [obs.state["arm/joints"].tolist() for obs in found] == [
+    observations = recorded_observations(tmp_path, 4)
+    assert [obs.state["arm/joints"].tolist() for obs in observations] == [
         [0, 0],
         [5, 5],
         [100, 100],
         [105, 105],
     ]
-    assert [obs.gripper for obs in found] == [0, 1, 0, 1]
-    assert [round(obs.cameras["front"].mean() / 20) for obs in found] == [0, 5, 0, 5]
+    assert [obs.gripper for obs in observations] == [0, 1, 0, 1]
+    assert [round(obs.cameras["front"].mean() / 20) for obs in observations] == [0, 5, 0, 5]
 
 
 def test_one_trajectory_gives_all_and_many_give_one_each(tmp_path: Path) -> None:
@@ -56,10 +56,10 @@ def test_a_file_brings_them_to_another_process(tmp_path: Path) -> None:
     save_observations(observations, tmp_path / "frames")
     loaded = load_observations(tmp_path / "frames")
     assert len(loaded) == 3
-    for one, other in zip(loaded, observations, strict=True):
-        assert one.gripper == other.gripper
-        np.testing.assert_array_equal(one.state["arm/joints"], other.state["arm/joints"])
-        np.testing.assert_array_equal(one.cameras["front"], other.cameras["front"])
+    for obs, saved in zip(loaded, observations, strict=True):
+        assert obs.gripper == saved.gripper
+        np.testing.assert_array_equal(obs.state["arm/joints"], saved.state["arm/joints"])
+        np.testing.assert_array_equal(obs.cameras["front"], saved.cameras["front"])
 
 
 def test_what_cannot_be_read_is_an_error(tmp_path: Path) -> None:
@@ -73,22 +73,22 @@ def test_what_cannot_be_read_is_an_error(tmp_path: Path) -> None:
         recorded_observations(tmp_path, 3)
 
 
-WANTED = [np.array([[0.0, 100.0], [2.0, 100.0]]), np.array([[1.0, 100.0], [4.0, 100.0]])]
+EXPECTED = [np.array([[0.0, 100.0], [2.0, 100.0]]), np.array([[1.0, 100.0], [4.0, 100.0]])]
 
 
 def changed(by: float, column: int) -> list[np.ndarray]:
     off = np.zeros((2, 2))
     off[1, column] = by
-    return [WANTED[0], WANTED[1] + off]
+    return [EXPECTED[0], EXPECTED[1] + off]
 
 
 def test_each_number_of_an_action_is_compared_with_its_own_range() -> None:
-    assert largest_difference(WANTED, WANTED) == 0
-    assert largest_difference(changed(0.1, 0), WANTED) == pytest.approx(0.1 / 4)
+    assert largest_difference(EXPECTED, EXPECTED) == 0
+    assert largest_difference(changed(0.1, 0), EXPECTED) == pytest.approx(0.1 / 4)
 
 
 def test_a_number_that_hardly_moves_has_a_tenth_of_its_magnitude_as_range() -> None:
-    assert largest_difference(changed(-0.1, 1), WANTED) == pytest.approx(0.1 / 10)
+    assert largest_difference(changed(-0.1, 1), EXPECTED) == pytest.approx(0.1 / 10)
 
 
 def test_a_number_that_is_always_zero_may_not_change() -> None:
@@ -98,15 +98,15 @@ def test_a_number_that_is_always_zero_may_not_change() -> None:
 
 
 def test_rows_of_a_batch_that_begins_again_belong_to_the_first_episodes() -> None:
-    assert largest_difference([*WANTED, WANTED[0]], WANTED) == 0
-    assert largest_difference([*WANTED, WANTED[1]], WANTED) > 0
+    assert largest_difference([*EXPECTED, EXPECTED[0]], EXPECTED) == 0
+    assert largest_difference([*EXPECTED, EXPECTED[1]], EXPECTED) > 0
 
 
 @pytest.mark.parametrize(
     "bad", [np.zeros((3, 2)), np.full((2, 2), np.nan), np.full((2, 2), np.inf)]
 )
 def test_other_shapes_and_values_that_are_not_finite_never_pass(bad: np.ndarray) -> None:
-    assert largest_difference([bad], WANTED) == math.inf
+    assert largest_difference([bad], EXPECTED) == math.inf
 
 
 OWN, COMPILED, BF16 = (

@@ -93,8 +93,8 @@ class Slurm:
         except TimeoutError as error:
             shown = self.do("scontrol", "show", "job", job)
             [log] = re.findall(r"StdOut=(.*)", shown)
-            said = Path(log).read_text()[-3000:] if Path(log).exists() else "nothing"
-            raise AssertionError(f"job {job}:\n{shown}\nits log:\n{said}") from error
+            log_text = Path(log).read_text()[-3000:] if Path(log).exists() else "nothing"
+            raise AssertionError(f"job {job}:\n{shown}\nits log:\n{log_text}") from error
 
 
 @contextlib.contextmanager
@@ -104,26 +104,26 @@ def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
     """
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
     try:
-        with hosts(nodes + 1) as [login, *others]:
+        with hosts(nodes + 1) as [login, *node_hosts]:
             (folder / "munge.key").write_bytes(secrets.token_bytes(128))
             (folder / "munge.key").chmod(0o600)
-            lines = [
-                f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} Gres=gpu:1 State=UNKNOWN"
-                for one in others
-            ]
+            lines = []
+            for node in node_hosts:
+                resources = f"CPUs={cpus} Gres=gpu:1 State=UNKNOWN"
+                lines.append(f"NodeName={node.name} NodeAddr={node.address} {resources}")
             configuration = folder / "slurm.conf"
             configuration.write_text(
                 _CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines))
             )
             # A GPU as far as bookkeeping goes.
             (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")
-            for one in (login, *others):
-                one.environment |= {
+            for host in (login, *node_hosts):
+                host.environment |= {
                     "SLURM_CONF": str(configuration),
                     "PYTHONPATH": f"{PYTHONPATH}:{Path(__file__).parent}",
                 }
-                (folder / f"spool-{one.name}").mkdir()
-            slurm = Slurm(login, others)
+                (folder / f"spool-{host.name}").mkdir()
+            slurm = Slurm(login, node_hosts)
             (folder / "state").mkdir()
             with _daemons(slurm, folder):
                 yield slurm
