@@ -705,7 +705,7 @@ ARM = ["--robot", SIMULATED]
         (["--trained-on", "{folder}", *ARM], "statistics"),
         (["--robot", "ros:{folder}"], "cannot be read as a file of ROS topics"),
         (["--robot", "ros:/nowhere.yaml"], "cannot be read as a file of ROS topics"),
-        ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it takes"),
+        ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it accepts"),
         ([*ARM, "--robot-set", "foo"], "expected KEY=VALUE"),
         (
             ["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"],

@@ -104,7 +104,7 @@ def test_seeds_need_an_environment_each(batch: BatchEnv) -> None:
             batch.reset(seeds=seeds)
     with pytest.raises(ConfigError, match="num_envs: expected a number of at least 1, got 0"):
         make_batch("tabletop", 0)
-    with pytest.raises(ConfigError, match="takes"):
+    with pytest.raises(ConfigError, match="it accepts"):
         make_batch("tabletop", 2, colour="red")
 
 
