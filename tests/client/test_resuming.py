@@ -105,7 +105,7 @@ def begun(replicas: Callable[[int], Replicas]) -> Iterator[Begun]:
 def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(begun: Begun) -> None:
     served, agent = begun(2, seed=3)
     drawn = [agent.act(obs(value)).info["random"] for value in (2, 3)]
-    served.engines[0].drain()
+    served.engines[0].drain_list.drain()
     drawn += act_until_moved(agent, served)
     assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()
     assert len(served.engines[1].sessions) == 1
@@ -144,7 +144,7 @@ def test_a_session_stays_where_it_is_until_another_replica_has_answered(
 
     monkeypatch.setattr(InProcess, "connect", fail)
     monkeypatch.setattr(connection, "_LOOK_UP_PAUSE_S", 0.0)
-    served.engines[0].drain()
+    served.engines[0].drain_list.drain()
     drawn = [agent.act(obs(2)).info["random"]]
     for _ in range(1 if look_up == "hangs" else 3):
         while not tried.acquire(blocking=False):
@@ -173,7 +173,7 @@ def test_a_look_up_for_a_session_that_no_longer_needs_it_leaves_no_connection(
         return connect(self, timeout_s)
 
     monkeypatch.setattr(InProcess, "connect", later)
-    served.engines[0].drain()
+    served.engines[0].drain_list.drain()
     agent.act(obs(2))
     assert looked.wait(20)
     if status == "broken":
