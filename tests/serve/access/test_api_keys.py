@@ -88,7 +88,7 @@ def test_a_key_made_anew_under_its_name_shuts_the_old_one_out(file: Path) -> Non
     old = new_key(file, "arm")
     keys = Keys.from_file(file)
     caller = keys.check(old, "noop")
-    with pytest.raises(ConfigError, match="there already"):
+    with pytest.raises(ConfigError, match="exists already"):
         new_key(file, "arm")
     revoke(file, "arm")
     new = new_key(file, "arm")
