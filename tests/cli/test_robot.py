@@ -720,7 +720,10 @@ ARM = ["--robot", SIMULATED]
         (["--robot", "lerobot:nothing"], "lerobot"),
         (["--robot", ":Arm"], "--robot :Arm"),
         (["--robot", "a..b:Arm"], "--robot a..b:Arm"),
-        (["--leader", "{here}:Unmade"], "--leader .*could not be made: TypeError"),
+        (
+            ["--leader", "{here}:Unmade"],
+            "--leader .*expected a class that can be made without arguments, got TypeError",
+        ),
         (["--leader", "builtins:dict"], "got one without engaged, action"),
         (["--leader", "broken_syntax:Leader"], "SyntaxError"),
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
