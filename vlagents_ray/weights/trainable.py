@@ -333,12 +333,14 @@ def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -
         moved: A list to which each moved memory is appended: the GPU's, which has no bytes then,
             and the host's. After an error, it has what was moved before.
     """
-    storages = {}
+    tensors = []
     for values in groups:
-        for value in values.values():
-            if _is_tensor(value) and _on_gpu(value) and value.numel():
-                storage = value.untyped_storage()
-                storages[storage.data_ptr()] = storage
+        tensors += [value for value in values.values() if _is_tensor(value) and _on_gpu(value)]
+    storages = {
+        value.untyped_storage().data_ptr(): value.untyped_storage()
+        for value in tensors
+        if value.numel()
+    }
 
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
