@@ -57,7 +57,7 @@ def test_settings_that_do_not_fit_the_checkpoint(
 
 
 def test_cameras_of_other_names(checkpoint: Checkpoint, checkout: Path) -> None:
-    with pytest.raises(ConfigError, match=r"got \['front'\], want \['ego_view'\]"):
+    with pytest.raises(ConfigError, match=r"expected .* \['ego_view'\], got \['front'\]"):
         load(checkpoint("relative"), checkout, cameras={"front": "front"})
 
 

@@ -195,8 +195,8 @@ def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
 @pytest.mark.parametrize(
     ("config", "text"),
     [
-        ({"cameras": {"side": "front"}}, r"want \['top'\]"),
-        ({"cameras": {}}, r"want \['top'\]"),
+        ({"cameras": {"side": "front"}}, r"expected .* \['top'\]"),
+        ({"cameras": {}}, r"expected .* \['top'\]"),
         ({"masked_cameras": ["top"]}, "needs all its cameras"),
         ({"masked_cameras": ["side"]}, "side"),
         ({"execute": tiny.CHUNK + 1}, f"{tiny.CHUNK} rows"),

@@ -36,7 +36,7 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
         ({"dataset": None}, "no statistics of 'action'.*bridge_dataset"),
         (
             {"cameras": {"image_top": "front"}},
-            r"got \['image_top'\], want \['image_primary', 'image_wrist'\]",
+            r"expected .* \['image_primary', 'image_wrist'\], got \['image_top'\]",
         ),
         (
             {"normalization": "bounds"},

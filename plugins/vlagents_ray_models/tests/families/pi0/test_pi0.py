@@ -185,7 +185,7 @@ def test_a_tensor_of_another_shape_is_an_error(whole: Path) -> None:
 
 @pytest.mark.parametrize("cameras", [{}, {"agentview": "front"}])
 def test_cameras_that_the_model_does_not_have_are_an_error(cameras: dict[str, str]) -> None:
-    with pytest.raises(ConfigError, match=r"want .*base_0_rgb"):
+    with pytest.raises(ConfigError, match=r"expected .*base_0_rgb"):
         Pi0.from_config({"checkpoint": "any", "cameras": cameras})
 
 
