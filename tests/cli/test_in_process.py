@@ -126,7 +126,7 @@ REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
     "packages": (
         {"source": "packages.yaml"},
         [],
-        "but 'noop' has a runtime_env, or another import_path",
+        "as 'noop' has a runtime_env, or another import_path",
     ),
     "worker": ({"source": "noop"}, [], "a worker's runtime_env has 'pip'"),
 }

@@ -89,7 +89,7 @@ def test_mistakes_are_told_in_a_line(words: list[str], text: str, tmp_path: Path
         (["--keys", "nowhere.json"], "keys new"),
         (["--tls-cert", "nowhere.pem"], "--tls-key"),
         (["--tls-cert", "nowhere.pem", "--tls-key", "nowhere.pem"], "PEM"),
-        (["--insecure", "--keys", "nowhere.json"], "exclude each other"),
+        (["--insecure", "--keys", "nowhere.json"], "expected keys or insecure, got both"),
     ],
 )
 def test_a_server_that_would_not_be_safe_does_not_start(words: list[str], text: str) -> None:

@@ -197,9 +197,9 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "cure"),
     [
-        ([], "expected a URL or --env, got neither"),
+        ([], "expected a policy, --leader, or both, got neither"),
         (["--leader", "pedals"], "keyboard"),
-        (["--leader", "keyboard"], "no terminal"),
+        (["--leader", "keyboard"], "expected a terminal"),
         (["scripted", "--mode", "often"], "open_loop"),
         (["http://127.0.0.1:9", "--set", "a=1"], "expected no settings"),
     ],
@@ -224,7 +224,7 @@ def test_a_simulation_has_the_limits_of_a_file(tmp_path: Path) -> None:
     ]
     run = robot(*words)
     assert run.exit_code == 1, run.output
-    assert "got velocity" in run.output
+    assert "expected velocity of at most" in run.output
 
 
 def test_a_person_restarts_the_command_by_a_signal() -> None:

@@ -103,7 +103,7 @@ EVAL = ("--out", "runs/x", "--policy")
     [
         (
             ("serve", "my_policies:Reach", "--set", "gian=1"),
-            "it takes .'gain'.; did you mean 'gain'",
+            "it accepts .'gain'.; did you mean 'gain'",
         ),
         (
             ("serve", "my_policies:Reech"),

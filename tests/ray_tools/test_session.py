@@ -200,7 +200,7 @@ def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_n
         monkeypatch.setenv("RAY_TMPDIR", str(place / "new"))
         key = f"vlr_{os.urandom(8).hex()}"
         monkeypatch.setenv(KEY_VARIABLE, key)
-        with ray_cluster(resolve(flat_config(envs=["tabletop/reach"], out=tmp_path))):
+        with ray_cluster(resolve(flat_config(envs=["tabletop/lift"], out=tmp_path))):
             (sockets,) = session().glob("sockets")
             assert (sockets / "raylet").is_socket()
             closed = [one for one in sockets.parents if one.stat().st_mode & 0o077 == 0]

@@ -119,7 +119,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     [
         (
             {"environment": {"python": "/nowhere/.venv-pi/bin/python"}},
-            "ConfigError: environment.python: expected a Python interpreter",
+            "ConfigError: environment.python: expected an interpreter",
         ),
         ({"batch": {"max_sise": 3}}, "batch.max_sise"),
     ],
@@ -225,11 +225,23 @@ def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -
             _migrator=SimpleNamespace(
                 hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")
             ),
-            **{f"_{name}": part(name) for name in ("parts", "metrics", "local", "stream")},
+            **{
+                f"_{name}": part(name)
+                for name in ("parts", "metrics", "local", "stream", "websockets")
+            },
             _plasma=None,
         )
         await one.close()
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "migrator", "engine", "local", "stream", "parts", "metrics"]
+    assert closed == [
+        "sessions",
+        "migrator",
+        "engine",
+        "local",
+        "stream",
+        "websockets",
+        "parts",
+        "metrics",
+    ]

@@ -102,7 +102,7 @@ def overwrite(replica: Replica) -> None:
 
 def export_at_once(replica: Replica) -> None:
     """To copy a session is to give it up, whether or not the one who asked still waits."""
-    held = replica.migrator.held
+    held = replica.migrator.sessions
 
     async def copy(session_id: str, offered: bool = False) -> dict[str, Any] | None:
         asked = replica.engine.clock()

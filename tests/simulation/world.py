@@ -193,7 +193,7 @@ class _Peer(Peer):
             if not other.alive:
                 world.transport(other, me, partial(_settle, answer, None, PeerEnded(other.name)))
                 return
-            task = other.loop.create_task(getattr(other.migrator.held, method.__name__)(*args))
+            task = other.loop.create_task(getattr(other.migrator.sessions, method.__name__)(*args))
             task.add_done_callback(
                 lambda done: world.transport(other, me, partial(_settle, answer, done.result()))
             )

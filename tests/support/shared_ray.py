@@ -96,7 +96,7 @@ def shared_server(config: Any) -> Iterator[Any]:
     urls = {name: url + path for name, path in paths.items()}
     deadline = time.monotonic() + _READY_S
     try:
-        deploy(client, config, own=True, ingress=True)
+        deploy(client, config, is_own_ray=True, ingress=True)
         wait_for_proxies(proxies, lambda: proxies_now(client))
         wait_until_ready(serve, urls, set(paths), deadline)
         if (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")) is not None:

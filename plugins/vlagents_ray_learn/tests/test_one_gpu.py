@@ -169,12 +169,7 @@ def test_counts_with_another_layout_are_released_by_torch_itself(
     assert [counter for _, counter in released][::-1] == [
         one.counter for one in handles.storages.values()
     ]
-    assert (
-        caplog.text.count(
-            "torch's counts of readers cannot be set (got 0 as the first value of one"
-        )
-        == 1
-    )
+    assert caplog.text.count("torch's counts of readers cannot be set (") == 1
     assert memory.counts.limbo == []
 
 

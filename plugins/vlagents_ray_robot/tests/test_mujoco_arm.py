@@ -53,7 +53,7 @@ def test_a_stop_ends_a_motion_and_forgets_commands() -> None:
         arm.clock.sleep(1.0)
         assert 0.05 < stopped[0] - start[0] < 0.3
         assert np.abs(arm.joints() - stopped).max() < 0.02
-        with pytest.raises(InvalidAction, match=r"expected shape \(8,\)"):
+        with pytest.raises(InvalidAction, match=r"got \(7,\), want \(8,\)"):
             arm.apply(np.zeros(7))
 
 

@@ -145,7 +145,7 @@ HINTS = [  # what is sent, and what the answer says of it
     ),
     (
         form(OBS, ("cameras.left", "f", b"GIF89a"), ("cameras.front", "f", JPEG)),
-        "camera 'left': got 6 bytes starting",
+        "camera 'left': expected a JPEG or PNG file, got 6 bytes",
     ),
 ]
 DOCUMENTS = [

@@ -313,5 +313,5 @@ def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
     answers = ask(reset(second), Request("act", observations[wrong_second], session="s"))
     assert answers[0].error is None
     assert isinstance(answers[1].error, InvalidInput)
-    assert f"want ({choices[second]['dim']},)" in str(answers[1].error)
+    assert f"expected shape ({choices[second]['dim']},)" in str(answers[1].error)
     engine.close()

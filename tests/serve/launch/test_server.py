@@ -64,7 +64,7 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
             "b": with_settings(deployment("noop"), {"action_dim": 3}),
         }
     )
-    deploy(client, two, own=True, ingress=not ends_at_once)
+    deploy(client, two, is_own_ray=True, ingress=not ends_at_once)
     assert client.by_serve == []
     assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
     parts = [app.target._bound_deployment for app in client.built_here]
@@ -91,7 +91,7 @@ def test_what_serve_must_apply_is_deployed_by_serve(
     others, all of it is.
     """
     client = FakeClient(monkeypatch)
-    deploy(client, config, own=config != changed({}), ingress=True)
+    deploy(client, config, is_own_ray=config != changed({}), ingress=True)
     assert (client.by_serve, client.built_here) == ([config.for_serve()], [])
 
 

@@ -110,7 +110,7 @@ def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
     ("settings", "says"),
     [
         ({"topk": 500}, "topk 500 is over samples 400"),
-        ({"cameras": {"front": "front", "wrist": "wrist"}}, "cameras: got"),
+        ({"cameras": {"front": "front", "wrist": "wrist"}}, "cameras: expected"),
         ({"cem_steps": 5}, "cem_steps"),
     ],
 )

@@ -451,7 +451,7 @@ def test_an_action_of_another_length_is_not_published() -> None:
         settings = settings_from(ros_arm.settings(double.url), "arm.yaml")
         with (
             RosRobot(settings) as robot,
-            pytest.raises(InvalidAction, match=r"expected shape \(2,\)"),
+            pytest.raises(InvalidAction, match=r"got \(3,\), want \(2,\)"),
         ):
             robot.apply(np.zeros(3, np.float32))
         assert double.on(COMMANDS) == []
