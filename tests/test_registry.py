@@ -128,10 +128,12 @@ def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
 
 def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
     with pytest.raises(
-        UnknownPolicy, match=r"'scriptd' is not registered.*did you mean 'scripted'"
+        UnknownPolicy, match=r"'scriptd', which is not registered.*did you mean 'scripted'"
     ):
         registry.policy_class("scriptd")
-    with pytest.raises(UnknownEnv, match=r"'tabletopp' is not registered.*did you mean 'tabletop'"):
+    with pytest.raises(
+        UnknownEnv, match=r"'tabletopp', which is not registered.*did you mean 'tabletop'"
+    ):
         registry.env_class("tabletopp/reach")
 
 

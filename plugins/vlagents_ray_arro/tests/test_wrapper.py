@@ -243,7 +243,9 @@ def test_the_package_registers_its_wrapper_by_an_entry_point(
     assert wrapper_class("arro") is Arro
     [listed] = [entry for entry in policies_and_wrappers() if entry.name == "arro"]
     assert (listed.kind, listed.what[:11]) == ("wrapper", "ARRO (arXiv")
-    with pytest.raises(UnknownWrapper, match=r"'aro' is not registered.*did you mean 'arro'"):
+    with pytest.raises(
+        UnknownWrapper, match=r"'aro', which is not registered.*did you mean 'arro'"
+    ):
         wrapper_class("aro")
 
 

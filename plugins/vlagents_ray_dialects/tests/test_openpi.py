@@ -122,7 +122,7 @@ def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) ->
         (wrong, "observation/wrist_image"),
         (openpi.encode({"batch": []}), "want a list of one observation or more"),
         (openpi.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
-        (openpi.encode({"batch": [1]}), "want a map"),
+        (openpi.encode({"batch": [1]}), "expected a map"),
         ("text", "binary"),
     ):
         with client.websocket_connect("/openpi") as socket:
