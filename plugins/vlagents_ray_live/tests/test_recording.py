@@ -269,7 +269,7 @@ def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) ->
 def test_a_full_folder_ends_the_recording_and_no_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(episodes, "_LOOK_S", 0.0)
+    monkeypatch.setattr(episodes, "_CHECK_S", 0.0)
     with recorded(tmp_path, most_gb=1e-9) as server:
         robot = server.robot()
         robot.play(2)

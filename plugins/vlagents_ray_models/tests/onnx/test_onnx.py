@@ -520,7 +520,7 @@ def test_contradictory_settings_are_refused(settings: Any, message: str) -> None
 def test_an_open_length_is_that_of_the_settings(tmp_path: Path) -> None:
     policy = loaded(exported(tmp_path, OPEN), state=["joints"], inputs={"x": {"shape": [-1, 3]}})
     assert policy.contract.state == {"joints": StateSpec(3)}
-    with pytest.raises(InvalidObservation, match=r"got 4 numbers .* want 3"):
+    with pytest.raises(InvalidObservation, match=r"expected 3 numbers.*got 4"):
         action(policy, state_obs(joints=range(4)))
 
 
