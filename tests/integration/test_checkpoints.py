@@ -17,7 +17,7 @@ from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import evaluate
-from vlagents_ray.evaluate.results.summary import stated
+from vlagents_ray.evaluate.results.summary import reported
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
@@ -239,8 +239,8 @@ def test_an_evaluation_says_by_which_checkpoint(
     summary = evaluate(
         flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results")
     )
-    assert [stated(case, "checkpoint") for case in summary.results.cases] == [str(folder / "3")]
-    assert [stated(case, "weights") for case in summary.results.cases] == [digest([folder / "3"])]
+    assert [reported(case, "checkpoint") for case in summary.results.cases] == [str(folder / "3")]
+    assert [reported(case, "weights") for case in summary.results.cases] == [digest([folder / "3"])]
     assert digest([folder / "3"]) in (tmp_path / "results" / "report.html").read_text()
     assert metadata(fresh)["weights"] == {"digest": digest([folder / "1"]), "revision": None}
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
@@ -269,7 +269,7 @@ def test_a_sweep_evaluates_each_checkpoint_on_one_server(
         ("policy@3", 3),
         ("policy@4", 3),
     ]
-    assert [stated(case, "checkpoint") for case in summary.results.cases] == [
+    assert [reported(case, "checkpoint") for case in summary.results.cases] == [
         str(folder / "3"),
         str(folder / "4"),
     ]

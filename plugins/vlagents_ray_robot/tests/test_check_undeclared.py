@@ -133,4 +133,4 @@ def test_an_apply_that_blocks_is_reported_by_the_loop(
     with caplog.at_level(logging.WARNING):
         report = run_loop(Waiting(), Still(), hz=hz, seconds=0.4)
     assert (report.blocking is not None) == blocks
-    assert ("do not wait until the arm is there" in caplog.text) == blocks
+    assert ("without waiting for the arm to arrive" in caplog.text) == blocks

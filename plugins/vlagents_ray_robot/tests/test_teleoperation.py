@@ -105,7 +105,7 @@ def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(
 
 def test_a_keyboard_wants_a_terminal_and_keys_of_its_own(terminal: Terminal) -> None:
     reading, writing = os.pipe()
-    with pytest.raises(ConfigError, match="no terminal"):
+    with pytest.raises(ConfigError, match="expected a terminal"):
         Keyboard(terminal=reading)
     os.close(reading)
     os.close(writing)

@@ -38,7 +38,7 @@ def test_wrong_settings_are_told_with_the_cure(
 ) -> None:
     monkeypatch.delenv("CALVIN_SRC", raising=False)
     with pytest.raises(
-        UnknownEnv, match=r"calvin has no task 'E': want one of \['A', 'B', 'C', 'D'\]"
+        UnknownEnv, match=r"calvin: expected a task of \['A', 'B', 'C', 'D'\], got 'E'"
     ):
         make_env("calvin/E")
     with pytest.raises(ConfigError, match="renderer is 'vulkan', want egl or tiny"):

@@ -165,5 +165,5 @@ def test_tasks_are_known_without_the_packages() -> None:
     assert len(DuoBench.tasks()) == 11
     with pytest.raises(UnknownEnv, match="transfer_cube"):
         make_env("duobench/juggle")
-    with pytest.raises(ConfigError, match="height is 0"):
+    with pytest.raises(ConfigError, match="height: expected a number of at least 1, got 0"):
         make_env("rcs/pick", height=0)

@@ -62,7 +62,7 @@ def test_the_contract_is_known_before_the_simulator_is_made() -> None:
 def test_a_wrong_name_size_or_installation_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UnknownEnv, match="did you mean 'Lift'"):
         make_env("robosuite/Lifts")
-    with pytest.raises(ConfigError, match="width is 0"):
+    with pytest.raises(ConfigError, match="width: expected a number of at least 1, got 0"):
         make_env("robosuite/Lift", width=0)
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     assert "env make robosuite" in str(Robosuite.missing())

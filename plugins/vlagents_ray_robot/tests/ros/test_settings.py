@@ -97,7 +97,7 @@ def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_top
             "front: type: got .*want one",
         ),
         ({"cameras": {"front": "/camera"}}, "cameras.front: got str, want keys"),
-        ({"cameras": {"front": {"topic": 3}}}, "topic: got 3, want str"),
+        ({"cameras": {"front": {"topic": 3}}}, "topic: expected str, got 3"),
         ({"state": {"joints": {"topic": "/j", "names": "a"}}}, "names: got 'a', want a list"),
         (
             {"state": {"joints": {"topic": "/j", "names": [1]}}},

@@ -149,7 +149,7 @@ def test_without_assets_nothing_is_downloaded_but_the_cure_told(
 
 
 def test_what_cannot_be_evaluated_is_refused() -> None:
-    with pytest.raises(UnknownEnv, match=r"no task 'fr3': want one of \['pick'\]"):
+    with pytest.raises(UnknownEnv, match=r"expected a task of \['pick'\].*got 'fr3'"):
         Rcs("fr3")
     with pytest.raises(UnknownEnv, match=r"knows no 'rcs/crane'"):
         Rcs("rcs/crane", module="rcs.envs.configs", max_steps=5)
