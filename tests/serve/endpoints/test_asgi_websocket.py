@@ -12,7 +12,7 @@ from asgi_server import served
 from eval_fakes import wait_for
 from starlette.applications import Starlette
 from starlette.routing import WebSocketRoute
-from starlette.testclient import TestClient, WebSocketDenialResponse
+from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -119,14 +119,10 @@ def test_a_client_that_answers_no_ping_is_cut_off(
         assert present.recv(10) == ANSWER
 
 
-def test_a_websocket_in_memory_has_no_socket_to_take(echo: SlowEcho) -> None:
-    guarded = AccessMiddleware(
-        Starlette(routes=[WebSocketRoute("/", echo.serve)]), None, "app", needs_socket=True
-    )
-    with (
-        pytest.raises(WebSocketDenialResponse) as refused,
-        TestClient(guarded).websocket_connect("/"),
-    ):
-        pass
-    assert refused.value.status_code == 503
-    assert "HAProxy" in refused.value.json()["detail"]
+def test_a_websocket_without_a_socket_is_served_by_its_messages(echo: SlowEcho) -> None:
+    """As behind Serve's own proxy, which passes messages on to another process."""
+    guarded = AccessMiddleware(Starlette(routes=[WebSocketRoute("/", echo.serve)]), None, "app")
+    with TestClient(guarded).websocket_connect("/") as client:
+        client.send_bytes(b"x")
+        assert client.receive_bytes() == ANSWER
+    assert echo.ended.wait(10)

@@ -27,12 +27,12 @@ from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.asgi_websocket import (
-    NO_SOCKET,
     AsgiWebSocket,
     AsgiWebSockets,
     uncancel,
 )
 from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
+from vlagents_ray.serve.endpoints.forwarded_websocket import ForwardedWebSocket, cancel_again
 from vlagents_ray.serve.endpoints.http_messages import (
     headers_of,
     problem_response,
@@ -67,7 +67,6 @@ class AccessMiddleware:
         idle_s: float = 600.0,
         hosts: Collection[str] = (),
         admission: Admission | None = None,
-        needs_socket: bool = False,
         shutdown: Shutdown | None = None,
         public: Collection[str] = (),
     ) -> None:
@@ -82,8 +81,6 @@ class AccessMiddleware:
             hosts: Further host names of the server, see `require_own_page`.
             admission: The memory in flight of the replica, which also counts incomplete messages of
                 WebSockets.
-            needs_socket: Whether WebSockets are refused whose socket cannot be taken from uvicorn,
-                as they would have no limits. That is so behind Serve's own proxy.
             shutdown: The end of the replica; by default it has none.
             public: The paths of pages without data, which need no key.
         """
@@ -93,7 +90,7 @@ class AccessMiddleware:
 
         self._slow_s = slow_s
         self._hosts = hosts
-        self._needs_socket = needs_socket
+        self._idle_s = idle_s
         self._shutdown = shutdown or Shutdown()
         self.websockets = AsgiWebSockets(admission, slow_s, idle_s, self._shutdown)
         self._public = frozenset({_HEALTH, *public})
@@ -155,10 +152,11 @@ class AccessMiddleware:
         if client is not None:
             websocket = AsgiWebSocket(self.websockets, client, caller, receive, send)
             await websocket.run(self._app, scope)
-        elif self._needs_socket:
-            await _refuse(PolicyUnavailable(NO_SOCKET), "", scope, receive, send)
         else:
-            await self._app(scope, receive, send)
+            forwarded = ForwardedWebSocket(
+                caller, self._slow_s, self._idle_s, receive, send, self._shutdown
+            )
+            await forwarded.run(self._app, scope)
 
 
 def _is_page(scope: Scope, public: Collection[str]) -> bool:
@@ -230,7 +228,7 @@ async def _run_upload(
 
     async def receive_in_time() -> Message:
         """Receive a message of the body; the last one ends the time limit."""
-        _cancel_again(refusal is not None)
+        cancel_again(refusal is not None)
         message = await receive()
         if message["type"] == "http.disconnect" or not message.get("more_body", False):
             timer.cancel()
@@ -253,13 +251,3 @@ async def _run_upload(
         await refusal(scope, receive, send)
     finally:
         timer.cancel()
-
-
-def _cancel_again(over: bool) -> None:
-    """Cancel the receiver again if it missed its cancellation.
-
-    Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the awaited
-    event, such as the message of a client whose key has just been revoked.
-    """
-    if over:
-        raise asyncio.CancelledError

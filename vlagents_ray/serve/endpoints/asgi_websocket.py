@@ -44,11 +44,6 @@ from vlagents_ray.serve.queue.poller import Poller
 
 logger = logging.getLogger(__name__)
 
-NO_SOCKET = (
-    "WebSockets reach this replica only with HAProxy as Serve's ingress, which comes with "
-    "ray[serve] (RAY_SERVE_ENABLE_HA_PROXY=1), or at the replica's own port, which `stream` in GET "
-    "/v1/metadata names"
-)
 SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
 _WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages

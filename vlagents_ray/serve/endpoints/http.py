@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+import uuid
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,23 +25,23 @@ from starlette.requests import Request as HttpRequest
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.protocol import messages
-from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_replies
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints import answers, http_messages
-from vlagents_ray.serve.endpoints.asgi_websocket import NO_SOCKET, AsgiWebSocket
 from vlagents_ray.serve.endpoints.asgi_websocket import SCOPE_KEY as WEBSOCKET
+from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSocket
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import IncomingMessage
 
-_TRY_AGAIN_LATER = 1013  # WebSocket close code
+_POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 _HEALTH_S = 1.5  # `/healthz` replies within this time
 _NO_PATH = "no such path; GET /docs lists what there is"
 
@@ -185,10 +186,6 @@ class _HttpEndpoint:
         """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and
         affects no session.
         """
-        websocket: AsgiWebSocket | None = socket.scope.get(WEBSOCKET)
-        if websocket is None:
-            await http_messages.deny(socket, PolicyUnavailable(NO_SOCKET))
-            return
         if len(self.engine.sessions) >= self.engine.sessions.limit:
             full = self.engine.sessions.full()
             await socket.accept()
@@ -196,11 +193,60 @@ class _HttpEndpoint:
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
 
+        websocket: AsgiWebSocket | None = socket.scope.get(WEBSOCKET)
+        if websocket is None:
+            await self._stream_forwarded(socket)
+            return
         caller = current_caller()
         with suppress(OSError):  # the client has closed the connection
             await websocket.serve(
                 lambda connection: RequestStream(connection, self.engine, self.limits, caller)
             )
+
+    async def _stream_forwarded(self, socket: WebSocket) -> None:
+        """Serve a WebSocket whose messages another process passes on."""
+        sender = Sender(self.engine, "websocket", caller=current_caller())
+        await socket.accept()
+        try:
+            while not sender.refused_too_often:
+                await sender.wait_unthrottled()
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    return
+                await socket.send_bytes(await self._answer(sender, message.get("bytes")))
+            await socket.close(_POLICY_VIOLATION, REFUSED)
+        except WebSocketDisconnect:
+            return
+        finally:
+            sender.release()
+
+    async def _answer(self, sender: Sender, frame: bytes | None) -> bytes:
+        """Return the answer to a message of a forwarded WebSocket, a frame or a probe; None is a
+        text message.
+        """
+        if frame is not None and messages.is_probe(frame):
+            try:
+                messages.read_probe(frame, sender.admission(self.limits, len(frame), "simulation"))
+                return messages.probe_answer(len(frame))
+            except VLAgentsError as error:
+                return encode_replies([messages.Reply(error=error)])
+
+        incoming = sender.message()
+        admission = sender.admission(self.limits, 0 if frame is None else len(frame))
+        try:
+            admission.begin_message()
+            if frame is None:
+                raise MalformedMessage("stream: expected a binary message, got a text")
+            decoded = await admission.decoded(partial(decode_requests, frame))
+            incoming.decoded(decoded)
+            await sender.ask(incoming, decoded, admission)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            request_id = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
+            problem = http_messages.public_problem(error, "stream", request_id)
+            incoming.refuse(problem, request_id)
+        data = answers.as_frame(incoming)
+        self.engine.stats.record(incoming)
+        return data
 
 
 def _timed(http: HttpRequest, incoming: IncomingMessage) -> HttpRequest:

@@ -252,7 +252,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             idle_s=idle_s,
             hosts=hosts,
             admission=self._engine.admission,
-            needs_socket=True,
             shutdown=self._shutdown,
             public=self._parts.pages(inside.routes),
         )
