@@ -201,7 +201,9 @@ def test_what_is_unknown_is_named_with_what_there_is() -> None:
         ManiSkill("PushCub-v1")
     with pytest.raises(ConfigError, match=r"no_such_mode.*pd_ee_delta_pose"):
         ManiSkill("PushCube-v1", control_mode="no_such_mode")
-    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*base_camera"):
+    with pytest.raises(
+        ConfigError, match=r"expected cameras of .*'base_camera'.*, got \['wrist'\]"
+    ):
         ManiSkill("PushCube-v1", cameras=["wrist"])
 
 

@@ -86,7 +86,7 @@ def test_a_deviation_from_the_protocol_is_recorded() -> None:
 
 
 def test_a_wrong_option_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*top"):
+    with pytest.raises(ConfigError, match=r"expected cameras of .*'top'.*, got \['wrist'\]"):
         make_env("aloha", cameras=("wrist",))
     with pytest.raises(UnknownEnv, match="did you mean 'insertion'"):
         make_env("aloha/insert")

@@ -76,7 +76,7 @@ def test_what_is_unknown_or_too_long_is_named() -> None:
     assert len(MetaWorld.tasks()) == 50
     with pytest.raises(UnknownEnv, match=r"reach-v2.*reach-v3"):
         MetaWorld("reach-v2")
-    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*corner2"):
+    with pytest.raises(ConfigError, match=r"expected cameras of .*'corner2'.*, got \['wrist'\]"):
         MetaWorld("reach-v3", cameras=("wrist",))
     with pytest.raises(ConfigError, match="500"):
         MetaWorld("reach-v3", max_steps=501)

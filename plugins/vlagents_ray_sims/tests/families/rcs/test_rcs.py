@@ -155,7 +155,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         Rcs("rcs/crane", module="rcs.envs.configs", max_steps=5)
     with pytest.raises(ConfigError, match="set max_steps"):
         Rcs("rcs/fr3", module="rcs.envs.configs")
-    with pytest.raises(ConfigError, match=r"no camera \['top'\].*bird_eye"):
+    with pytest.raises(ConfigError, match=r"expected cameras of .*'bird_eye'.*, got \['top'\]"):
         Rcs("pick", cameras=["top"])
     with Rcs(
         "rcs/fr3", module="rcs.envs.configs", max_steps=5, cameras=[], instruction="wave"
