@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 
@@ -34,11 +35,13 @@ class SlowEcho:
 
     def __init__(self) -> None:
         self.received = 0
+        self.serving = 0  # tasks that serve a WebSocket
         self.ended = threading.Event()
 
     async def serve(self, socket: WebSocket) -> None:
-        await socket.accept()
+        self.serving += 1
         try:
+            await socket.accept()
             while True:
                 await socket.receive_bytes()
                 self.received += 1
@@ -47,6 +50,7 @@ class SlowEcho:
         except WebSocketDisconnect:
             return
         finally:
+            self.serving -= 1
             self.ended.set()
 
 
@@ -126,3 +130,18 @@ def test_a_websocket_without_a_socket_is_served_by_its_messages(echo: SlowEcho) 
         client.send_bytes(b"x")
         assert client.receive_bytes() == ANSWER
     assert echo.ended.wait(10)
+
+
+def test_a_client_that_leaves_before_it_is_accepted_leaves_no_task(
+    port: int, echo: SlowEcho
+) -> None:
+    for _ in range(20):
+        with socket.create_connection(("127.0.0.1", port), 10) as leaving:
+            leaving.sendall(HANDSHAKE)
+            leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    with connected(port) as client:
+        client.send(b"x")
+        assert client.recv(10) == ANSWER
+    assert echo.ended.wait(10)
+    # Each task that serves a WebSocket ends with it; the handshakes above were all received.
+    wait_for(lambda: echo.serving == 0)

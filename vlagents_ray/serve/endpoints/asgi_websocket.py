@@ -14,9 +14,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import logging
 import socket
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
@@ -29,6 +29,7 @@ from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints.client_socket import ClientSocket
 from vlagents_ray.serve.endpoints.connection import (
+    ANSWERS_S,
     INTERNAL_ERROR,
     ConnectionOwner,
     enable_timestamps,
@@ -41,8 +42,6 @@ from vlagents_ray.serve.endpoints.websocket_connection import (
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.poller import Poller
-
-logger = logging.getLogger(__name__)
 
 SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
@@ -87,6 +86,15 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
         super().serve(client, connection)
         if len(self._clients) == 1:
             self.open()
+
+    def close(self) -> None:
+        """End all connections; the polling thread, which goes on, closes them."""
+        clients = list(self._clients)
+        for client in clients:
+            client.end(STOPPING, _SERVICE_RESTART)
+        until = time.monotonic() + ANSWERS_S
+        for client in clients:
+            client.wait_answered(until)
 
     def remove(self, client: TakenConnection) -> None:
         """Remove a client whose connection is closed."""
@@ -158,6 +166,7 @@ class AsgiWebSocket:
         self._messages: _AsgiMessages | None = None  # None if another handler receives them
         self._over = asyncio.Event()  # set when the connection has ended
         self._is_cancelled = False  # whether the application's task was cancelled
+        self._has_left = False  # whether the client left before the WebSocket was accepted
 
     async def run(self, app: ASGIApp, scope: Scope) -> None:
         """Run the application until it returns or the WebSocket has to end."""
@@ -167,11 +176,15 @@ class AsgiWebSocket:
         except asyncio.CancelledError:
             if not self._is_cancelled:
                 raise
-            uncancel(self._task)
+            uncancel(asyncio.current_task())
+        except OSError:
+            if not self._has_left:
+                raise
         except BaseException:
             code, reason = INTERNAL_ERROR, "internal error"
             raise
         finally:
+            self._task = None  # the end of the connection must not cancel what runs after this
             if self._messages is not None and self._messages.ending is not None:
                 reason, code = self._messages.ending
             if self._connection is not None:
@@ -205,6 +218,7 @@ class AsgiWebSocket:
         await self._send_first(message)
         taken = await self._client.take()
         if taken is None:
+            self._has_left = True
             raise OSError("the client has closed the connection")
 
         enable_timestamps(taken)

@@ -15,7 +15,6 @@ from starlette.types import Message, Receive, Send
 
 SCOPE_KEY = "vlagents_ray.client_socket"  # key of the `ClientSocket` in the ASGI scope
 _EXTENSIONS = "Sec-WebSocket-Extensions"
-_CLOSED = 1006  # WebSocket close code: the connection ended without one
 
 
 class ClientSocket:
@@ -28,7 +27,6 @@ class ClientSocket:
     def __init__(self, receive: Receive, protocol: Any) -> None:
         """Stop reading; called on uvicorn's event loop."""
         self._receive = receive
-        self._protocol = protocol
         self._transport = protocol.transport
         self._loop = asyncio.get_running_loop()
         self._is_claimed = False
@@ -101,10 +99,13 @@ class ClientSocket:
 
         async def send_and_read(message: Message) -> None:
             """Send a message as uvicorn's `send`."""
-            await send(message)
-            if message["type"] == "websocket.accept":
-                self._accepted.set()
-                if not self._is_claimed and not self._transport.is_closing():
-                    self._transport.resume_reading()
+            is_accepted = message["type"] == "websocket.accept"
+            try:
+                await send(message)
+            finally:
+                if is_accepted:  # also if the client has left: `take` then finds no connection
+                    self._accepted.set()
+            if is_accepted and not self._is_claimed and not self._transport.is_closing():
+                self._transport.resume_reading()
 
         return send_and_read

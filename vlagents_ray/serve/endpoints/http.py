@@ -13,7 +13,6 @@ import asyncio
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -198,10 +197,9 @@ class _HttpEndpoint:
             await self._stream_forwarded(socket)
             return
         caller = current_caller()
-        with suppress(OSError):  # the client has closed the connection
-            await websocket.serve(
-                lambda connection: RequestStream(connection, self.engine, self.limits, caller)
-            )
+        await websocket.serve(
+            lambda connection: RequestStream(connection, self.engine, self.limits, caller)
+        )
 
     async def _stream_forwarded(self, socket: WebSocket) -> None:
         """Serve a WebSocket whose messages another process passes on."""
