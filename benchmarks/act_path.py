@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -91,9 +91,14 @@ def usual_files(acts: Sequence[Sequence[str]]) -> list[str]:
     Args:
         acts: The files of each act, in order.
     """
-    entered = Counter(file for files in acts for file in files)
+    entered: Counter[str] = Counter()
+    for files in acts:
+        entered.update(files)
     usual = {file for file, number in entered.items() if number > _USUAL * len(acts)}
-    in_order: Iterable[str] = (file for files in reversed(acts) for file in files)
+
+    in_order: list[str] = []
+    for files in reversed(acts):
+        in_order += files
     return [file for file in dict.fromkeys(in_order) if file in usual]
 
 

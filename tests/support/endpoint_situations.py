@@ -84,12 +84,10 @@ class Endpoint:
 
 def cases(endpoints: Sequence[Endpoint]) -> list[tuple[Endpoint, str]]:
     """Each endpoint with each of its situations."""
-    return [
-        (endpoint, situation)
-        for endpoint in endpoints
-        for situation in SITUATIONS
-        if situation in endpoint.situations
-    ]
+    pairs = []
+    for endpoint in endpoints:
+        pairs += [(endpoint, each) for each in SITUATIONS if each in endpoint.situations]
+    return pairs
 
 
 def case_ids(endpoints: Sequence[Endpoint]) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -22,6 +21,7 @@ from vlagents_ray.serve.endpoints.direct_requests import DirectRequests, set_for
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.requests import PendingRequest
 
 HEADERS = {"x-session-id": "robot", "content-type": "application/json"}
 
@@ -129,7 +129,17 @@ def test_a_request_has_the_same_id_in_its_answer_and_in_the_header(server: Serve
     assert len(document["request_id"]) == 32
 
 
-def test_a_request_whose_client_has_left_is_not_acted_on(server: Server) -> None:
+def test_a_request_whose_client_has_left_is_not_acted_on(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    withdrawn = threading.Event()
+    withdraw = server.engine.intake.withdraw
+
+    def withdraw_and_tell(*requests: PendingRequest) -> None:
+        withdraw(*requests)
+        withdrawn.set()
+
+    monkeypatch.setattr(server.engine.intake, "withdraw", withdraw_and_tell)
     server.request("GET", "/v1/metadata")
     for name in ("busy", "robot"):
         server.request("POST", "/v1/reset", {}, {"x-session-id": name})
@@ -147,8 +157,7 @@ def test_a_request_whose_client_has_left_is_not_acted_on(server: Server) -> None
     leaving.request("POST", f"{server.prefix}/v1/act", content, HEADERS)
     wait_for(lambda: server.engine.queue.depth() == 1)
     leaving.close()
-    # The queue drops a withdrawn request when the policy is free; nothing shows the withdrawal.
-    time.sleep(0.5)
+    assert withdrawn.wait(10)
     server.policy.gate.set()
     busy.join()
     assert server.request("POST", "/v1/act", {"info": {"number": 3}})[0] == 200

@@ -39,7 +39,7 @@ from vlagents_ray.serve.endpoints.websocket_connection import (
     MessageHandler,
     WebSocketConnection,
 )
-from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission
+from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.poller import Poller
 
@@ -228,7 +228,7 @@ class AsgiWebSocket:
         self._owner.poller.call_soon(partial(self._owner.serve, connection, taken))
 
     def _make_messages(self, connection: WebSocketConnection) -> MessageHandler:
-        self._messages = _AsgiMessages(connection, self._owner.admission, self._caller, self._loop)
+        self._messages = _AsgiMessages(connection, self._loop)
         return self._messages
 
     async def _receive(self) -> Message:
@@ -260,18 +260,12 @@ class _AsgiMessages(MessageHandler):
     most_unanswered = _WAITING_MESSAGES
     most_unanswered_bytes = _WAITING_BYTES
 
-    def __init__(
-        self,
-        connection: WebSocketConnection,
-        admission: Admission | None,
-        caller: Identity,
-        loop: asyncio.AbstractEventLoop,
-    ) -> None:
+    def __init__(self, connection: WebSocketConnection, loop: asyncio.AbstractEventLoop) -> None:
         self._connection = connection
         self._loop = loop
         # Messages, and their sizes.
         self._queue: asyncio.Queue[tuple[Message, int]] = asyncio.Queue()
-        self._waiting = _WaitingBytes(connection, admission, caller)
+        self._waiting = _WaitingBytes(connection)
         self._current = -1  # size of the message that the application serves; -1 without one
         self._is_over = False  # whether the application has received the end
         # Reason and close code with which the connection ends when the application returns.
@@ -328,17 +322,11 @@ class _WaitingBytes:
     Thread-safe.
     """
 
-    def __init__(
-        self, connection: WebSocketConnection, admission: Admission | None, caller: Identity
-    ) -> None:
+    def __init__(self, connection: WebSocketConnection) -> None:
         self._connection = connection
         self._lock = threading.Lock()
         self._size = 0
-        self._memory: ArrivingBytes | None = None
-        if admission is not None:
-            key = caller.name if isinstance(caller, Caller) else None
-            is_robot = not isinstance(caller, Caller) or caller.priority != "simulation"
-            self._memory = ArrivingBytes(admission, key, is_robot, self._give_up)
+        self._memory = connection.count_bytes()
 
     def add(self, size: int) -> bool:
         """Count `size` more bytes; end the connection and return False if there is no room."""
@@ -366,10 +354,6 @@ class _WaitingBytes:
     def _resize(self) -> None:
         if self._memory is not None:
             self._memory.resize(self._size)
-
-    def _give_up(self) -> None:
-        """End the connection, as a complete message needs the memory; called on any thread."""
-        self._connection.end("a complete message needs the memory", _TRY_AGAIN_LATER)
 
 
 def uncancel(task: asyncio.Task[object] | None) -> None:

@@ -233,6 +233,19 @@ class WebSocketConnection(PolledConnection):
         else:
             self.end(reason, code)
 
+    def count_bytes(self) -> ArrivingBytes | None:
+        """Return a count of bytes that wait in this connection, as part of the memory in flight;
+        None without a replica.
+
+        The connection is ended if a complete message needs the memory.
+        """
+        if self._admission is None:
+            return None
+        caller = self.caller if isinstance(self.caller, Caller) else None
+        is_robot = caller is None or caller.priority != "simulation"
+        key = None if caller is None else caller.name
+        return ArrivingBytes(self._admission, key, is_robot, self._give_up)
+
     def add_unanswered(self, size: int) -> None:
         """Count a message of `size` bytes with its images as unanswered."""
         with self._sending:
@@ -415,11 +428,8 @@ class WebSocketConnection(PolledConnection):
             if not self._is_partial:
                 self._partial = handler.begin()
                 self._is_partial = True
-            if self._arriving is None and self._admission is not None:
-                caller = self.caller if isinstance(self.caller, Caller) else None
-                is_robot = caller is None or caller.priority != "simulation"
-                key = None if caller is None else caller.name
-                self._arriving = ArrivingBytes(self._admission, key, is_robot, self._give_up)
+            if self._arriving is None:
+                self._arriving = self.count_bytes()
             if self._arriving is not None:
                 self._arriving.resize(self._received.size + self._fragments_bytes)
         except TooManyRequests:  # the rest stays unread until the key is under its rate
