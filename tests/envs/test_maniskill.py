@@ -197,7 +197,7 @@ def test_a_robot_without_the_default_control_mode_uses_its_own() -> None:
 
 
 def test_what_is_unknown_is_named_with_what_there_is() -> None:
-    with pytest.raises(UnknownEnv, match=r"PushCub-v1.*PushCube-v1"):
+    with pytest.raises(UnknownEnv, match=r"PushCube-v1.*PushCub-v1"):
         ManiSkill("PushCub-v1")
     with pytest.raises(ConfigError, match=r"no_such_mode.*pd_ee_delta_pose"):
         ManiSkill("PushCube-v1", control_mode="no_such_mode")
