@@ -109,10 +109,10 @@ test: setup
 	@echo '== tests'
 	$(call PLAY,not (integration))
 
+# All of them, whatever becomes of the first.
 integrations: setup
-	@$(MAKE) --no-print-directory docs families
-	@echo '== integrations'
-	$(call PLAY,integration)
+	@status=0; $(MAKE) --no-print-directory --keep-going docs families || status=1; \
+	  echo '== integrations'; $(call PLAY,integration) || status=1; exit $$status
 
 # The tests of one tier, of the whole environment.
 PLAY = VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/python tests/support/play_again.py \
@@ -124,7 +124,7 @@ environments:
 
 # The tests of two at once.
 families: environments
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync $(FAMILIES:%=family-%)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going $(FAMILIES:%=family-%)
 
 family-%: $(VENV)-%/.installed
 	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'

@@ -369,7 +369,8 @@ class Rcs(SimulatorEnv):
         raw, reward, terminated, _, info = self._env.step(self._arms.command(action))
         if "success" not in info:
             raise ConfigError(
-                f"{self._name} does not say what success is: want a scene with a task"
+                f"expected a task that reports success, got none from {self._name}: "
+                "name a scene that has a task"
             )
         # Entries of arms have the names of the arms; the other entries are the task's.
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}
