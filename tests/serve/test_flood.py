@@ -35,8 +35,9 @@ SECONDS = 1.5  # 100 acts
 # Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by
 # `pytest -s`.
 ROW_SECONDS = float(os.environ.get("VLAGENTS_FLOOD_SECONDS", "1.5"))
-# What eight connections of one key may take: for each, a part of a message and what uvicorn copies.
-MEMORY_MB = 150
+# What eight connections of one key may take: the key's half of the 256 MiB in flight, and half as
+# much again of buffers and of the heap, which is not returned at once.
+MEMORY_MB = 200
 # Of one address's observations without an end: its share of what is in flight, 128 MB, and gRPC's
 # buffers and heaps.
 UPLOADS_MEMORY_MB = 256

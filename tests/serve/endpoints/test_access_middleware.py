@@ -31,6 +31,7 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.access.key_store import new_key, revoke
+from vlagents_ray.serve.endpoints import access_middleware
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -198,6 +199,32 @@ def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> Non
             pytest.fail("was let in")
         assert refused.value.response.status_code == status
         assert json.loads(refused.value.response.body or b"")["status"] == status
+
+
+@pytest.mark.parametrize("key", ["no key", "a wrong key", "a key of another application"])
+@pytest.mark.parametrize("way", ["a path", "an upload", "an unknown path"])
+def test_a_connection_without_a_right_key_gets_few_answers(
+    endpoint: Endpoint, way: str, key: str
+) -> None:
+    headers = {
+        "no key": {},
+        "a wrong key": bearer("wrong"),
+        "a key of another application": bearer(endpoint.tokens["other"]),
+    }[key]
+    method, path, body = {
+        "a path": ("GET", "/v1/metadata", None),
+        "an upload": ("POST", "/v1/act", b"x" * 1000),
+        "an unknown path": ("GET", "/nothing", None),
+    }[way]
+    connection = http.client.HTTPConnection("127.0.0.1", endpoint.port, timeout=10)
+    begun = time.monotonic()
+    with contextlib.closing(connection):
+        for _ in range(4):
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+            answer.read()
+            assert answer.status in (401, 403)
+    assert time.monotonic() - begun >= 4 * access_middleware._REFUSAL_S
 
 
 @pytest.mark.parametrize("transport", ["http", "websocket", "auto"])
