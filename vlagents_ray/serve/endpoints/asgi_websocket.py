@@ -31,9 +31,11 @@ from vlagents_ray.serve.endpoints.client_socket import ClientSocket
 from vlagents_ray.serve.endpoints.connection import (
     ANSWERS_S,
     INTERNAL_ERROR,
+    SERVICE_RESTART,
     ConnectionOwner,
     enable_timestamps,
 )
+from vlagents_ray.serve.endpoints.message_connection import TRY_AGAIN_LATER
 from vlagents_ray.serve.endpoints.shutdown import STOPPING, Shutdown
 from vlagents_ray.serve.endpoints.websocket_connection import (
     MessageHandler,
@@ -50,7 +52,7 @@ _WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
 # and period of checking that, s.
 _UNSENT_BYTES = 2**16
 _UNSENT_S = 0.01
-_NORMAL, _SERVICE_RESTART, _TRY_AGAIN_LATER = 1000, 1012, 1013  # close codes
+_NORMAL = 1000  # close code
 _POLL_S = 60.0  # maximum time for which the polling thread waits at once, s
 
 MakeHandler = Callable[[WebSocketConnection], MessageHandler]
@@ -91,7 +93,7 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
         """End all connections; the polling thread, which goes on, closes them."""
         clients = list(self._clients)
         for client in clients:
-            client.end(STOPPING, _SERVICE_RESTART)
+            client.end(STOPPING, SERVICE_RESTART)
         until = time.monotonic() + ANSWERS_S
         for client in clients:
             client.wait_answered(until)
@@ -139,7 +141,7 @@ class TakenConnection(WebSocketConnection):
         """
         cause = super().overdue(now, refusal)
         if cause is None and self._shutdown.is_due(self.silent_s(now)):
-            self.finish(STOPPING, _SERVICE_RESTART)
+            self.finish(STOPPING, SERVICE_RESTART)
         return cause
 
 
@@ -335,7 +337,7 @@ class _WaitingBytes:
             try:
                 self._resize()
             except VLAgentsError as error:
-                self._connection.end(str(error), _TRY_AGAIN_LATER)
+                self._connection.end(str(error), TRY_AGAIN_LATER)
                 return False
         return True
 

@@ -46,7 +46,7 @@ BACKLOG = 1024
 # Maximum number of ended connections that are closed at once; each takes about 0.01 ms.
 _ENDED_AT_ONCE = 64
 MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
-POLICY_VIOLATION, INTERNAL_ERROR, _SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
+POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the
 # policy's thread.
 _ACCEPTED_PER_S = 200.0
@@ -93,6 +93,7 @@ class PolledConnection(ABC):
     def __init__(self, owner: ConnectionOwner[Any], connection: socket.socket) -> None:
         self._poller = owner.poller
         self._remove = owner.remove
+        self._serve = owner.serve
         self._name = owner.name
         self._connection = connection
 
@@ -204,13 +205,17 @@ class PolledConnection(ABC):
         admission: MessageAdmission,
         submit: Callable[[Decoded], None],
         refuse: Callable[[VLAgentsError], None],
+        *,
+        long: bool = False,
     ) -> None:
-        """Decode a message with `read`, on another thread if that is slow, and `submit` its
-        requests.
+        """Decode a message with `read`, on another thread if that is slow or the message is
+        `long`, and `submit` its requests.
 
         An error of the other thread is passed to `refuse`, one of this thread is raised.
         """
         try:
+            if long:
+                raise NeedsDecodingThread
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
@@ -287,6 +292,15 @@ class PolledConnection(ABC):
         s.
         """
 
+    def replace_by(self, successor: PolledConnection) -> None:
+        """Let another connection read the socket from now on; called on the polling thread."""
+        with self._sending:
+            self._ended = True
+        if self._polled:
+            self._poller.unwatch(self._connection)
+        self._remove(self)
+        successor._serve(successor, self._connection)
+
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call this on the polling thread."""
         if not self._ended:
@@ -332,12 +346,12 @@ class ConnectionOwner(Generic[C]):
         clients = list(self._clients)
         reason = "the replica is stopping; connect again"
         for client in clients:
-            client.announce_end(reason, _SERVICE_RESTART)
+            client.announce_end(reason, SERVICE_RESTART)
 
         until = time.monotonic() + ANSWERS_S
         for client in clients:
             client.wait_answered(until)
-            client.end(reason, _SERVICE_RESTART)
+            client.end(reason, SERVICE_RESTART)
             client.release()
 
     def close_overdue(self) -> None:

@@ -28,7 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.protocol import messages
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
+from vlagents_ray.protocol.frames import decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints import answers, http_messages
@@ -156,21 +156,9 @@ class _HttpEndpoint:
                 if decoded.requests:
                     request_id = decoded.requests[0].request_id
 
-                replies = await sender.ask(incoming, decoded, admission)
-                error = replies[0].error if len(replies) == 1 else None
-                if error is not None:
-                    raise error
-                step_header = {}
-                if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
-                    content, media_type = answers.as_frame(incoming), CONTENT_TYPE
-                else:
-                    content, media_type = answers.as_document(incoming), "application/json"
-                    step = replies[0].step
-                    if step is not None:
-                        step_header[messages.STEP_HEADER] = str(step)
-
+                await sender.ask(incoming, decoded, admission)
+                response = http_messages.response_to(incoming, headers)
                 stats.record(incoming)
-                return Response(content, headers=step_header, media_type=media_type)
             except ClientDisconnect:
                 stats.record_failure(incoming, "disconnected")
                 return Response(status_code=499)
@@ -178,6 +166,7 @@ class _HttpEndpoint:
                 problem = http_messages.public_problem(failure, op, request_id)
                 stats.record_failure(incoming, problem.code)
                 return http_messages.problem_response(problem, request_id)
+            return response
 
         return handle
 

@@ -8,14 +8,14 @@ import base64
 import hashlib
 import logging
 import math
+import sys
 import uuid
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
-from starlette.exceptions import HTTPException
-from starlette.formparsers import MultiPartException
+from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request as HttpRequest
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import Message, Receive, Scope
@@ -43,17 +43,21 @@ from vlagents_ray.protocol.messages import (
     REQUEST_ID_HEADER,
     SESSION_HEADER,
     STEP_HEADER,
+    Budget,
     MessageLimits,
     Op,
     Request,
     is_name,
 )
+from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.requests import IncomingMessage
 
 logger = logging.getLogger(__name__)
 
 # Longer JSON or msgpack is decoded on another thread, to keep the event loop responsive.
 LONG_BYTES = 512 * 1024
+FORM_TYPE = "multipart/form-data"
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
@@ -67,6 +71,14 @@ class _Refused(MultiPartException):
         self.error = error
 
 
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A body that has arrived."""
+
+    read: Callable[[Budget], Decoded]  # decodes its requests
+    is_long: bool = False  # whether it is decoded on another thread in any case
+
+
 async def read_requests(
     op: Op, http: HttpRequest, admission: MessageAdmission, name: str
 ) -> Decoded:
@@ -75,32 +87,81 @@ async def read_requests(
 
     An error that concerns the whole body is raised.
     """
+    body = await receive_body(op, http, admission, name)
+    return await admission.decoded(body.read, long=body.is_long)
+
+
+def body_of(op: Op, http: HttpRequest, data: bytes, admission: MessageAdmission, name: str) -> Body:
+    """Return a body whose bytes have all arrived, as `receive_body` does."""
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": data, "more_body": False}
+
+    receiving = receive_body(op, HttpRequest(http.scope, receive), admission, name)
+    try:
+        # It waits only for bytes, as forms are kept in memory.
+        receiving.send(None)
+    except StopIteration as ended:
+        body: Body = ended.value
+        return body
+    receiving.close()
+    raise RuntimeError("the body was not read at once")
+
+
+async def receive_body(op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Body:
+    """Receive the body of a POST to the path of `op`; arguments and errors are those of
+    `read_requests`.
+    """
     headers = headers_of(http.scope)
     limits = admission.limits
-    content_type = headers.get("content-type", "").partition(";")[0].strip().lower()
-    length = headers.get("content-length", "")
-    if length.isdigit() and int(length) > limits.body_bytes:
-        raise MessageTooLarge(f"body: declares {length} bytes, the limit is {limits.body_bytes}")
+    content_type = content_type_of(headers)
+    require_length(headers, limits)
 
-    if content_type == "multipart/form-data":
-        decoded = Decoded([await _read_form(op, http, admission)], {})
+    read: Callable[[Budget], Request | Decoded]
+    is_long = False
+    if content_type == FORM_TYPE:
+        document, files = await _receive_form(http, admission)
+        read = partial(request_from_parts, op, document, files)
+        is_long = len(document) > LONG_BYTES
     elif op == "close" and not content_type:
-        decoded = Decoded([Request("close")], {})
+        read = _bare_close
     else:
         body = await read_body(http, admission)
         if content_type == CONTENT_TYPE:
-            decoded = await admission.decoded(partial(decode_requests, body))
+            read = partial(decode_requests, body)
         elif content_type == "application/json":
             read = partial(request_from_parts, op, body, {})
-            decoded = Decoded([await admission.decoded(read, long=len(body) > LONG_BYTES)], {})
+            is_long = len(body) > LONG_BYTES
         else:
             raise MalformedMessage(
                 f"content-type: got {content_type or 'none'!r}, want multipart/form-data, "
                 f"application/json or {CONTENT_TYPE}"
             )
 
-    _read_headers(op, decoded.requests, headers, name, limits)
-    return decoded
+    def read_with_headers(budget: Budget) -> Decoded:
+        """Decode the requests, and add to them what the headers say."""
+        content = read(budget)
+        decoded = Decoded([content], {}) if isinstance(content, Request) else content
+        _read_headers(op, decoded.requests, headers, name, limits)
+        return decoded
+
+    return Body(read_with_headers, is_long)
+
+
+def content_type_of(headers: Mapping[str, str]) -> str:
+    """Return the content type of a request in lower case, without parameters."""
+    return headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def require_length(headers: Mapping[str, str], limits: MessageLimits) -> None:
+    """Raise `MessageTooLarge` if the headers declare a body above its limit."""
+    length = headers.get("content-length", "")
+    if length.isdigit() and int(length) > limits.body_bytes:
+        raise MessageTooLarge(f"body: declares {length} bytes, the limit is {limits.body_bytes}")
+
+
+def _bare_close(_: Budget) -> Request:
+    return Request("close")
 
 
 def _read_headers(
@@ -135,18 +196,31 @@ def _read_headers(
             check_request(requests[index], limits)
 
 
-async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
-    """Read the request of a form: the JSON document `obs`, and a file for each camera."""
+class _FormParser(MultiPartParser):
+    """A parser that keeps all files in memory, which counts as part of the memory in flight."""
+
+    spool_max_size = sys.maxsize
+
+
+async def _receive_form(
+    http: HttpRequest, admission: MessageAdmission
+) -> tuple[str | bytes, dict[str, bytes]]:
+    """Receive a form; return the JSON document `obs`, and the file of each camera."""
     _require_uncompressed(http)
     limits = admission.limits
     document: str | bytes | None = None
     files: dict[str, bytes] = {}
+    limited = HttpRequest(http.scope, _limited(http, admission))
     try:
-        async with HttpRequest(http.scope, _limited(http, admission)).form(
+        parser = _FormParser(
+            limited.headers,
+            limited.stream(),
             max_files=limits.cameras + 1,
             max_fields=limits.cameras + 1,
             max_part_size=limits.body_bytes,
-        ) as form:
+        )
+        form = await parser.parse()
+        try:
             for name, value in form.multi_items():
                 data = value if isinstance(value, str) else await value.read()
                 camera = name.removeprefix(CAMERA_PREFIX)
@@ -161,18 +235,17 @@ async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> 
                     files[camera] = data
                 else:
                     raise MalformedMessage(f"form: {_describe_wrong_part(name)}")
-    except (MultiPartException, HTTPException) as error:
+        finally:
+            await form.close()
+    except MultiPartException as error:
         for refused in (error, error.__context__):
             if isinstance(refused, _Refused):
                 raise refused.error from None
-        text = error.message if isinstance(error, MultiPartException) else error.detail
-        raise MalformedMessage(f"form: {text}") from error
+        raise MalformedMessage(f"form: {error.message}") from error
 
     if document is None:
         raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
-    return await admission.decoded(
-        partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES
-    )
+    return document, files
 
 
 def _limited(http: HttpRequest, admission: MessageAdmission) -> Receive:
@@ -347,6 +420,28 @@ def _digest(text: str) -> str:
     """Return the SHA-256 of a text as a source of a content security policy."""
     digest = hashlib.sha256(text.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
+def response_to(message: IncomingMessage, headers: Mapping[str, str]) -> Response:
+    """Return the response with the replies of a message.
+
+    Args:
+        headers: The headers of the request.
+
+    Raises:
+        VLAgentsError: The only reply is an error.
+    """
+    replies = message.replies
+    error = replies[0].error if len(replies) == 1 else None
+    if error is not None:
+        raise error
+    if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
+        return Response(answers.as_frame(message), media_type=CONTENT_TYPE)
+
+    step = replies[0].step
+    step_header = {} if step is None else {STEP_HEADER: str(step)}
+    document = answers.as_document(message)
+    return Response(document, headers=step_header, media_type="application/json")
 
 
 def public_problem(error: Exception, operation: str, request_id: str) -> VLAgentsError:

@@ -1,10 +1,12 @@
-"""The WebSocket port of a replica, without a proxy between the robot and the policy thread.
+"""A replica's own port, for WebSockets and HTTP, without a proxy between the robot and the policy
+thread.
 
 Large messages are not copied, and a client that reads slowly delays no other client.
 
 The metadata contains the port and an unguessable path, so that only clients that may read the
-metadata can use the port; with API keys, the handshake must also contain one. Messages are those of
-`WS /v1/stream` on the server's port, which remains for clients that cannot reach this one. As for
+metadata can use the port; with API keys, a handshake or a request must also contain one. Messages
+of WebSockets are those of `WS /v1/stream` on the server's port, requests of HTTP those of
+`POST /v1/act`; both remain for clients that cannot reach this one. As for
 local clients, the policy thread reads the sockets (see `vlagents_ray.serve.endpoints.connection`)
 and decodes the messages.
 """
@@ -13,10 +15,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import secrets
 import socket
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import ClassVar
 
 from websockets.http11 import Request as Handshake
@@ -39,6 +42,13 @@ from vlagents_ray.serve.endpoints.connection import (
     enable_timestamps,
     has_unread,
 )
+from vlagents_ray.serve.endpoints.http_connection import (
+    END_OF_HEAD,
+    HEAD_BYTES,
+    HttpConnection,
+    head_bytes,
+)
+from vlagents_ray.serve.endpoints.message_connection import MessageConnection
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.endpoints.websocket_connection import WebSocketConnection
 from vlagents_ray.serve.engine.engine import Engine
@@ -46,10 +56,10 @@ from vlagents_ray.serve.engine.engine import Engine
 logger = logging.getLogger(__name__)
 
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
-_HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
-_END_OF_HEADERS = b"\r\n\r\n"
+# The head of a WebSocket's handshake; all others are of HTTP requests.
+_HANDSHAKE = re.compile(rb"\AGET .*\r\nupgrade:[ \t]*websocket\b", re.IGNORECASE | re.DOTALL)
 _REFUSED = "its handshake is refused"  # a further reason for not polling a connection
 
 # The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s
@@ -62,8 +72,8 @@ _KEEPALIVE = (
 )
 
 
-class WebSocketServer(PolledServer["PortConnection"]):
-    """Accepts WebSockets at a port of the replica."""
+class WebSocketServer(PolledServer[MessageConnection]):
+    """Accepts WebSockets and HTTP connections at a port of the replica."""
 
     name: ClassVar[str] = "websocket"
 
@@ -99,7 +109,7 @@ class WebSocketServer(PolledServer["PortConnection"]):
         self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
 
         # Connections before their handshake, in order of arrival.
-        self._handshaking: dict[PortConnection, None] = {}
+        self._handshaking: dict[MessageConnection, None] = {}
         self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
@@ -113,34 +123,76 @@ class WebSocketServer(PolledServer["PortConnection"]):
 
         Raises:
             UnknownApp: The path is another one.
-            Unauthorized: The key is missing, unknown, revoked or expired.
-            Forbidden: The key is for other applications, or the page is another site's.
-            TooManyRequests: The key has as many connections as it may hold sessions, or is over its
-                rate.
-            PolicyUnavailable: The replica has as many connections as it may hold sessions.
+            VLAgentsError: The errors of `admit_request` and `count_connection`.
         """
         if not secrets.compare_digest(request.path.encode(), self.path.encode()):
             raise UnknownApp("no such path")
 
         headers = {name.lower(): value for name, value in request.headers.raw_items()}
-        caller: Identity
+        caller, _ = self.admit_request(headers)
+        self.count_connection(client, caller)
+        return caller
+
+    def admit_request(
+        self, headers: Mapping[str, str], known: tuple[Identity, str | None] | None = None
+    ) -> tuple[Identity, str | None]:
+        """Return the owner of the key in the headers, and that key.
+
+        Args:
+            known: The result for the connection's last request, to be returned if the key is the
+                same. The caller then checks whether the key is still valid.
+
+        Raises:
+            Unauthorized: The key is missing, unknown, revoked or expired.
+            Forbidden: The key is for other applications, or the page is another site's.
+        """
         if isinstance(self.admit, NoKey):
             require_own_page(headers, self._hosts)
-            caller = self.admit
-        else:
-            caller = self.admit(token_of(headers))
+            return self.admit, None
+        token = token_of(headers)
+        if known is not None and token == known[1]:
+            return known
+        return self.admit(token), token
 
-        streams = len(self._clients) - len(self._handshaking)
-        if streams >= self.engine.sessions.limit:
-            raise PolicyUnavailable(f"this replica has {streams} streams, its limit of sessions")
+    def count_connection(self, client: MessageConnection, caller: Identity) -> None:
+        """Count the connection for its caller, and no longer as one whose caller is unknown.
+
+        Raises:
+            TooManyRequests: The key has as many connections as it may hold sessions, or is over its
+                rate.
+            PolicyUnavailable: The replica has as many connections as it may hold sessions.
+        """
+        connections = len(self._clients) - len(self._handshaking)
+        if client in self._handshaking and connections >= self.engine.sessions.limit:
+            raise PolicyUnavailable(
+                f"this replica has {connections} streams, its limit of sessions"
+            )
         if isinstance(caller, Caller):
             caller.require_unthrottled()
             caller.hold()
             caller.note("let in by", self.name)
-        del self._handshaking[client]
-        return caller
+        if isinstance(client.caller, Caller):
+            client.caller.hold(-1)
+        self._handshaking.pop(client, None)
 
-    def remove(self, client: PortConnection) -> None:
+    def op_of(self, path: str) -> messages.Op | None:
+        """Return the operation that a path of HTTP names, below the unguessable path of this
+        server; None for any other path.
+        """
+        base, _, name = path.rpartition("/")
+        is_known = secrets.compare_digest(base.encode(), self.path.encode())
+        return next((op for op in messages.OPS if is_known and op == name), None)
+
+    def serve_http(self, client: PortConnection, connection: socket.socket, head: bytes) -> None:
+        """Serve a connection whose first head is that of an HTTP request; without bytes, the head
+        is too long.
+        """
+        successor = HttpConnection(self, connection)
+        client.replace_by(successor)
+        self._handshaking[successor] = None
+        successor.begin(head)
+
+    def remove(self, client: MessageConnection) -> None:
         """Remove a connection, possibly during its handshake."""
         self._handshaking.pop(client, None)
         super().remove(client)
@@ -182,13 +234,7 @@ class PortConnection(WebSocketConnection):
         if self._handler is not None:
             return super()._bytes_to_read()
 
-        peeked = self._connection.recv(_HANDSHAKE_BYTES, socket.MSG_PEEK)
-        # The end of the headers may have arrived in parts.
-        overlap = self._head[1 - len(_END_OF_HEADERS) :]
-        end = (overlap + peeked).find(_END_OF_HEADERS)
-        if end < 0:
-            return len(peeked) or 1
-        return end + len(_END_OF_HEADERS) - len(overlap)
+        return head_bytes(self._connection, self._head)
 
     def _receive_bytes(self, data: bytes | memoryview) -> bool:
         if self._handler is not None:
@@ -198,11 +244,15 @@ class PortConnection(WebSocketConnection):
             self.disconnect()
             return False
         self._head += data
-        is_complete = self._head.endswith(_END_OF_HEADERS)
-        if is_complete or len(self._head) > _HANDSHAKE_BYTES:
-            if not is_complete or not self._accept_handshake(self._head):
-                self._refuse_handshake()
-            self._head = b""
+        is_complete = self._head.endswith(END_OF_HEAD)
+        if not is_complete and len(self._head) <= HEAD_BYTES:
+            return False
+
+        head, self._head = self._head, b""
+        if not is_complete or not _HANDSHAKE.search(head):
+            self._server.serve_http(self, self._connection, head if is_complete else b"")
+        elif not self._accept_handshake(head):
+            self._refuse_handshake()
         return False
 
     def _accept_handshake(self, head: bytes) -> bool:
@@ -245,7 +295,7 @@ class PortConnection(WebSocketConnection):
                     self._flush()
                     # Closing a socket with unread bytes resets the connection.
                     with contextlib.suppress(OSError):
-                        self._connection.recv(_HANDSHAKE_BYTES)
+                        self._connection.recv(HEAD_BYTES)
             self.disconnect()
 
         if self._refused_for_s > 0:

@@ -8,20 +8,18 @@ A `MessageHandler` serves the messages.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from vlagents_ray.errors import Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.protocol.websocket_frames import (
     CONTROL_FRAMES,
@@ -33,46 +31,30 @@ from vlagents_ray.protocol.websocket_frames import (
 )
 from vlagents_ray.serve.access.api_keys import Caller
 from vlagents_ray.serve.endpoints.connection import (
-    BACKLOGGED,
     DECODING,
     POLICY_VIOLATION,
     THROTTLED,
     ConnectionOwner,
-    PolledConnection,
-    ReadBuffer,
     has_unread,
-    time_in_socket_s,
-    wait_delivered,
 )
-from vlagents_ray.serve.endpoints.send_buffer import SendBuffer
-from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission
+from vlagents_ray.serve.endpoints.message_connection import (
+    GOING_AWAY,
+    READ_BYTES,
+    MessageConnection,
+)
+from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED
 from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
-_READ_BYTES = 1024 * 1024  # maximum size of a read; room for a message with two or three raw images
-# Maximum number of frames that are read from a connection before others have their turn.
-_FRAMES_PER_READ = 16
-_DISCARD_BYTES = 64 * 1024  # maximum size of a read after the end
-# Maximum number of bytes that are discarded after the end, and maximum time, s, in which a client
-# must close its connection.
-_MOST_DISCARDED_BYTES = 8 * STREAM_BYTES
-_CLOSING_S = 5.0
 _FINISHING = "it ends after its answers"  # a further reason for not polling a connection
 _FINISHING_S = 0.01  # period at which it is checked whether all messages are answered
-# Maximum rate of discarding, of all connections together: above it, a client waits. At full speed,
-# 32 connections take a quarter of a core.
-_DISCARDED_BYTES_PER_S = 64 * 2**20
-_DISCARDING = "too many bytes are discarded"  # a further reason for not polling a connection
 _FRAGMENT_BYTES = 16 * 1024  # size below which a fragment of a message counts like a control frame
 # A client behind a proxy that has disappeared is found out by pings: the kernel's own probes reach
 # the proxy only.
 _PING_S = 20.0
-GOING_AWAY, _INVALID_DATA, _ABNORMAL, _TRY_AGAIN_LATER = 1001, 1007, 1006, 1013  # close codes
-
-read_buffer = ReadBuffer(_READ_BYTES)
-_discarding = TokenBucket(_DISCARDED_BYTES_PER_S, time.monotonic(), capacity=_DISCARD_BYTES)
+_INVALID_DATA, _ABNORMAL = 1007, 1006  # close codes
 
 
 class MessageHandler(ABC):
@@ -116,7 +98,7 @@ class MessageHandler(ABC):
         return False
 
 
-class WebSocketConnection(PolledConnection):
+class WebSocketConnection(MessageConnection):
     """One WebSocket, from its handshake to its end."""
 
     def __init__(
@@ -138,16 +120,11 @@ class WebSocketConnection(PolledConnection):
             idle_s: Maximum time that the connection may be silent, s.
             pings: Whether the client has to answer pings.
         """
-        super().__init__(owner, connection)
-        self._admission = admission
-        self._slow_s = slow_s
-        self._idle_s = idle_s
+        super().__init__(owner, connection, admission, slow_s=slow_s, idle_s=idle_s)
         self._pings = pings
-        self._is_rated = False  # whether its client's key may be over a rate
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
         self._handler: MessageHandler | None = None  # None before the handshake is accepted
 
-        self._arrived = 0.0  # arrival time of the bytes read last, s
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
         self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
@@ -160,27 +137,10 @@ class WebSocketConnection(PolledConnection):
         self._messages: deque[tuple[bytes | str, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of a partly received message
         self._is_partial = False  # whether a part of a message has been counted
-        self._arriving: ArrivingBytes | None = None  # bytes of a partly received message
-        self._message_count = 0  # number of messages received so far
 
-        self._out = SendBuffer(
-            connection, self._sending, STREAM_BYTES, lambda: self._call_soon(self.disconnect)
-        )
-        self._unanswered = 0  # number of unanswered messages
-        self._unanswered_bytes = 0  # size of the unanswered messages with their decoded images
-        self._paused = False  # whether too many messages are unanswered; guarded by the lock
-
-        self._ended_at = float("inf")  # time at which a close code was sent, s
         self._has_ended_sessions = False
         self._is_finishing = False  # whether it ends once all messages are answered
-        self._discarded = 0  # number of bytes that were discarded after the end
-
-        # Only `overdue` uses these.
-        self._count_before = 0  # number of messages at its last call
-        self._quiet_since = time.monotonic()  # time of the last message or answer, s
-        self._part_since = float("inf")  # arrival time of the current partial message, s
-        # Times of the last bytes, and of the last ping since then, s; 0 without one.
-        self._alive_at = time.monotonic()
+        # Time of the last ping since the last bytes, s; 0 without one. Only `overdue` uses it.
         self._pinged_at = 0.0
 
     def accepted(self, handler: MessageHandler) -> None:
@@ -201,11 +161,6 @@ class WebSocketConnection(PolledConnection):
                 self._flush()
             else:
                 self._out.send(frame_head(len(message)) + message)
-
-    @property
-    def unsent_bytes(self) -> int:
-        """Number of bytes that the client has not read yet, beyond what the kernel holds."""
-        return self._out.unsent_bytes
 
     def finish(self, reason: str, code: int) -> None:
         """Read no further messages, and end the connection once those that have arrived are
@@ -233,90 +188,21 @@ class WebSocketConnection(PolledConnection):
         else:
             self.end(reason, code)
 
-    def count_bytes(self) -> ArrivingBytes | None:
-        """Return a count of bytes that wait in this connection, as part of the memory in flight;
-        None without a replica.
-
-        The connection is ended if a complete message needs the memory.
-        """
-        if self._admission is None:
-            return None
-        caller = self.caller if isinstance(self.caller, Caller) else None
-        is_robot = caller is None or caller.priority != "simulation"
-        key = None if caller is None else caller.name
-        return ArrivingBytes(self._admission, key, is_robot, self._give_up)
-
-    def add_unanswered(self, size: int) -> None:
-        """Count a message of `size` bytes with its images as unanswered."""
-        with self._sending:
-            self._unanswered += 1
-            self._unanswered_bytes += size
-
-    def remove_unanswered(self, size: int) -> None:
-        """Count a message as answered, and read again if only such messages prevented that; may
-        be called on any thread.
-        """
-        with self._sending:
-            self._unanswered -= 1
-            self._unanswered_bytes -= size
-            may_resume = self._paused and not self._is_backlogged()
-            self._paused = self._paused and not may_resume
-        if may_resume:
-            self._call_soon(lambda: self._resume(BACKLOGGED))
-
     # Reading.
 
-    def _read(self) -> None:
-        frames = 0
-        while self._read_part() and frames < _FRAMES_PER_READ:
-            frames += 1
-
-    def _read_part(self) -> bool:
-        """Read a part of a frame; return whether more may be read, since a frame is complete."""
-        if self._is_rated and self._throttle():
-            return False
-
-        data: bytes | memoryview
-        is_closing = self._protocol.state in (State.CLOSING, State.CLOSED)
-        try:
-            size = _DISCARD_BYTES if is_closing else self._bytes_to_read()
-            data, control = read_buffer.receive(self._connection, size)
-            self._arrived = time.perf_counter() - time_in_socket_s(control)
-        except BlockingIOError:
-            return False
-        except OSError as error:
-            logger.info("%s client: %s", self._name, error)
-            data = b""
-
-        self._alive_at = time.monotonic()
-        if is_closing:
-            self._discard_bytes(len(data))
-            return False
-        return self._receive_bytes(data)
-
-    def _discard_bytes(self, count: int) -> None:
-        """Discard bytes that were read after the end: unread bytes would reset the connection
-        before the client reads the close code.
-
-        No bytes mean that the client has closed the connection.
-        """
-        self._discarded += count
-        if not count or self._discarded > _MOST_DISCARDED_BYTES:
-            self.disconnect()
-            return
-        wait_s = _discarding.take(time.monotonic(), count)
-        if wait_s > 0:
-            self._pause(_DISCARDING)
-            self._call_later(wait_s, lambda: self._resume(_DISCARDING))
-
     def _receive_bytes(self, data: bytes | memoryview) -> bool:
-        """Process received bytes, none of which means that the connection has ended; return as
-        `_read_part`.
-        """
         if self._frame_left:
             self._frame_left -= len(data)
         self._receive(data)
         return not self._frame_left and self._polled and not self._ended
+
+    @property
+    def _is_over(self) -> bool:
+        return self._protocol.state in (State.CLOSING, State.CLOSED)
+
+    @property
+    def _incomplete_bytes(self) -> int:
+        return self._received.size + self._fragments_bytes + len(self._frame_head)
 
     def _bytes_to_read(self) -> int:
         """Return how many bytes to read now: at most one frame.
@@ -334,7 +220,7 @@ class WebSocketConnection(PolledConnection):
                 return len(peeked) or 1
             self._frame_left = size - len(self._frame_head)
             self._frame_head = b""
-        return min(self._frame_left, _READ_BYTES)
+        return min(self._frame_left, READ_BYTES)
 
     def _receive(self, data: bytes | memoryview) -> None:
         """Process bytes of one frame; empty `data` means that the connection has ended."""
@@ -363,11 +249,7 @@ class WebSocketConnection(PolledConnection):
             self.disconnect()
             return
 
-        with self._sending:
-            paused = self._is_backlogged() and self._protocol.state is State.OPEN
-            self._paused = paused
-        if paused:
-            self._pause(BACKLOGGED)
+        self._pause_if_backlogged()
 
     def _receive_frame(self, frame: Frame) -> bool:
         """Queue the message that a frame completes; return False if the connection ends."""
@@ -405,17 +287,8 @@ class WebSocketConnection(PolledConnection):
         self._message_count += 1
         self._messages.append((message, self._arrived, self._partial))
         self._partial, self._is_partial = None, False
-        if self._arriving is not None:
-            self._arriving.release()
+        self._release_arriving()
         return True
-
-    def _charge_abuse(self) -> None:
-        """Charge a message to the key, as for a message that is refused, before the connection
-        ends.
-        """
-        if isinstance(self.caller, Caller):
-            with contextlib.suppress(VLAgentsError):
-                self.caller.admit()
 
     def _count_partial(self) -> None:
         """Count a partly received message for its key before the rest is read, and its bytes as
@@ -428,28 +301,16 @@ class WebSocketConnection(PolledConnection):
             if not self._is_partial:
                 self._partial = handler.begin()
                 self._is_partial = True
-            if self._arriving is None:
-                self._arriving = self.count_bytes()
-            if self._arriving is not None:
-                self._arriving.resize(self._received.size + self._fragments_bytes)
         except TooManyRequests:  # the rest stays unread until the key is under its rate
             self._throttle()
             if handler.refused_too_often:
                 self.end(REFUSED)
         except VLAgentsError as error:
-            self.end(
-                str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION
-            )
-
-    def _give_up(self) -> None:
-        """End the connection, as a complete message needs the memory; called on any thread."""
-        reason = "a complete message needs the memory"
-        self._call_soon(lambda: self.end(reason, _TRY_AGAIN_LATER))
+            self._end_for(error)
+        else:
+            self._count_incomplete()
 
     def _is_backlogged(self) -> bool:
-        """Return whether the client has too many unanswered messages or bytes; the caller holds
-        the lock.
-        """
         handler = self._handler
         return handler is not None and (
             self._unanswered >= handler.most_unanswered
@@ -496,54 +357,12 @@ class WebSocketConnection(PolledConnection):
             self._charge_abuse()
         self._partial = None
         self._fragments = []
-        if self._arriving is not None:
-            self._arriving.release()
         self._received.discard()
-        self._out.close()
-
-    def overdue(
-        self, now: float, refusal: Callable[[Caller], str | None]
-    ) -> tuple[str, int] | None:
-        """Return a reason and a close code if the connection is too slow or has to end; see
-        `PolledConnection`.
-
-        A connection that has been closed, and that its client leaves open, is cut off.
-
-        Time counts against the client only if the server has read all bytes that arrived: a slow
-        policy keeps the thread from reading.
-        """
-        if self._protocol.state in (State.CLOSING, State.CLOSED):
-            if now - self._ended_at > _CLOSING_S:
-                self._cut_off()
-            return None
-        cause = super().overdue(now, refusal)
-        if cause is not None:
-            return cause
-
-        if self._message_count != self._count_before or self._unanswered or not self._polled:
-            self._count_before = self._message_count
-            self._quiet_since = now
-            self._part_since = float("inf")
-        if not (self._received.size or self._fragments or self._frame_head):
-            self._part_since = float("inf")
-        elif self._part_since > now:
-            self._part_since = now
-
-        cause = self._slow_cause(now)
-        with self._sending:
-            if cause is not None and not self._ended and has_unread(self._connection):
-                self._quiet_since = self._alive_at = now
-                self._part_since = float("inf")
-                return None
-        return cause
+        super()._discard()
 
     def _slow_cause(self, now: float) -> tuple[str, int] | None:
-        """Return a reason and a close code if the client is too slow at `now`, s."""
-        if now - self._part_since > self._slow_s:
-            return f"a message took longer than {self._slow_s:g} s", POLICY_VIOLATION
-        if now - self._quiet_since > self._idle_s:
-            return "silent for too long", GOING_AWAY
-        return self._ping(now) if self._pings else None
+        cause = super()._slow_cause(now)
+        return self._ping(now) if cause is None and self._pings else cause
 
     def _ping(self, now: float) -> tuple[str, int] | None:
         """Ping a client that is silent at `now`, s; return a reason and a close code if it does
@@ -562,26 +381,9 @@ class WebSocketConnection(PolledConnection):
                     self._flush()
         return None
 
-    @property
-    def _is_closed_here(self) -> bool:
-        """Whether this side has sent a close code first."""
-        return self._ended_at != float("inf")
-
-    def silent_s(self, now: float) -> float:
-        """Return for how long the client has sent no message at `now`, s, of `time.monotonic`;
-        0 while messages are unanswered.
-        """
-        return now - self._quiet_since
-
     def end(self, reason: str, code: int = POLICY_VIOLATION) -> None:
-        """Send a close code and its reason after the answers; may be called on any thread.
-
-        Bytes that still arrive are discarded until the client closes the connection, at most for
-        `_CLOSING_S`, so that it can read the reason although it is still sending.
-        """
-        logger.info("%s: a WebSocket is closed: %s", self._name, reason)
-        self.announce_end(reason, code)
-        self._call_soon(self._end_sessions)
+        """Send a close code and its reason after the answers, see `MessageConnection.end`."""
+        super().end(reason, code)
         self._call_soon(lambda: self._resume(_FINISHING))
 
     def _send_close(self, code: int, reason: str) -> None:
@@ -589,18 +391,6 @@ class WebSocketConnection(PolledConnection):
             self._ended_at = time.monotonic()
             self._protocol.send_close(code, reason[:120])
             self._out.send(b"".join(self._protocol.data_to_send()), last=True)
-
-    def _cut_off(self) -> None:
-        """End both directions of the connection, so that the polling thread reads its end."""
-        with self._sending:
-            if not self._ended:
-                with contextlib.suppress(OSError):  # the client has already closed it
-                    self._connection.shutdown(socket.SHUT_RDWR)
-        self._call_soon(self.disconnect)
-
-    def wait_answered(self, until: float) -> None:
-        self._out.wait_sent(until)
-        wait_delivered(self._connection, until)
 
     def _flush(self) -> None:
         """Send the bytes that the protocol has produced; the caller holds the lock."""

@@ -1,0 +1,634 @@
+"""HTTP/1.1 at the replica's own port: `POST …/reset`, `…/act` and `…/close`, below its path.
+
+The policy thread reads the connections, like those of WebSockets, so a request passes through no
+proxy and no event loop. The decoders, the status codes and the documents of errors are those of the
+server's port (`http_messages`), and the access control is that of `AccessMiddleware`: each request
+needs a key if the server has keys, and otherwise a host and an origin of this server.
+
+One request of a connection is served at a time. The bytes of the next one stay in the socket until
+the answer is sent.
+"""
+
+from __future__ import annotations
+
+import http
+import socket
+import time
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, cast
+
+import httptools
+from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
+
+from vlagents_ray.errors import (
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    Unauthorized,
+    UnknownApp,
+    VLAgentsError,
+)
+from vlagents_ray.protocol.frames import Decoded
+from vlagents_ray.protocol.messages import PRIORITY_HEADER, REQUEST_ID_HEADER, Budget, Op
+from vlagents_ray.serve.access.api_keys import Caller
+from vlagents_ray.serve.endpoints import http_messages
+from vlagents_ray.serve.endpoints.connection import (
+    INTERNAL_ERROR,
+    LEAST_WAIT_S,
+    POLICY_VIOLATION,
+    SERVICE_RESTART,
+)
+from vlagents_ray.serve.endpoints.message_connection import (
+    READ_BYTES,
+    TRY_AGAIN_LATER,
+    MessageConnection,
+)
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import IncomingMessage
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+
+HEAD_BYTES = 16 * 1024  # maximum size of a request's head
+END_OF_HEAD = b"\r\n\r\n"
+_DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
+# Larger forms are read on another thread, since finding the end of each part takes time.
+_INLINE_FORM_BYTES = 2**20
+_MOST_REFUSED_S = 1.0  # maximum time for which the refusal of a first request is delayed
+_REFUSED = "its first request is refused"  # a further reason for not polling a connection
+_CONTINUE = b"HTTP/1.1 100 Continue\r\n\r\n"
+_TIMEOUT, _HEAD_TOO_LARGE, _NOT_ALLOWED = 408, 431, 405
+_NO_PATH = (
+    "no such path at a replica's own port, which has only reset, act and close; GET /docs of the "
+    "server's port lists the others"
+)
+# The errors with which a connection ends during a request, by the close code of a WebSocket.
+_ENDINGS: dict[int, type[VLAgentsError]] = {
+    POLICY_VIOLATION: Unauthorized,
+    TRY_AGAIN_LATER: Overloaded,
+    SERVICE_RESTART: PolicyUnavailable,
+    _TIMEOUT: MalformedMessage,
+}
+
+
+@dataclass(slots=True)
+class HttpHead:
+    """The head of a request, as httptools reports it."""
+
+    method: str = ""
+    path: str = ""
+    is_kept: bool = True  # whether the client wants to keep the connection
+    version: str = "1.1"
+    is_chunked: bool = False
+    fields: list[tuple[bytes, bytes]] = field(default_factory=list)
+    http: HttpRequest = field(init=False)  # the same for the decoders
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The headers by lower-case name."""
+        return http_messages.headers_of(self.http.scope)
+
+    @property
+    def length(self) -> int:
+        """The declared number of bytes of the body."""
+        return int(self.headers.get("content-length", "0"))
+
+    @property
+    def waits(self) -> bool:
+        """Whether the client sends the body after a "100 Continue" only."""
+        return self.version != "1.0" and self.headers.get("expect", "").lower() == "100-continue"
+
+
+class _Reading:
+    """The callbacks of httptools for one request."""
+
+    def __init__(self) -> None:
+        self.head = HttpHead()
+        self.body: list[bytes] = []  # parts of a chunked body
+        self.size = 0  # number of bytes in them
+        self.has_head = False  # whether the head is complete
+        self.is_complete = False
+        self.has_next = False  # whether bytes of another request followed
+        # The parser of a chunked body. It refers to this object, so it is removed after use.
+        self.parser: httptools.HttpRequestParser | None = None
+
+    def on_message_begin(self) -> None:
+        self.has_next = self.is_complete
+
+    def on_url(self, url: bytes) -> None:
+        if not self.has_next:
+            self.head.path += url.decode("latin-1")
+
+    def on_headers_complete(self) -> None:
+        self.has_head = True
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if not self.is_complete:
+            self.head.fields.append((name.lower(), value))
+
+    def on_body(self, data: bytes) -> None:
+        if not self.is_complete:
+            self.body.append(data)
+            self.size += len(data)
+
+    def on_message_complete(self) -> None:
+        self.is_complete = True
+
+
+def read_head(data: bytes) -> _Reading:
+    """Parse the head of a request.
+
+    Raises:
+        MalformedMessage: It is not HTTP, or a header is not UTF-8.
+    """
+    reading = _Reading()
+    parser = httptools.HttpRequestParser(reading)
+    try:
+        parser.feed_data(data)
+    except httptools.HttpParserUpgrade:  # the offer of another protocol may be ignored
+        pass
+    except httptools.HttpParserError as error:
+        raise MalformedMessage(f"expected a request of HTTP/1.1, got {data[:40]!r}: {error}") from (
+            error
+        )
+
+    if not reading.has_head:
+        raise MalformedMessage("expected a request of HTTP/1.1, got empty lines")
+    head = reading.head
+    for name, value in head.fields:
+        try:
+            name.decode(), value.decode()
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"header {name!r}: expected UTF-8, got {value[:40]!r}") from (
+                error
+            )
+    head.method = parser.get_method().decode()
+    head.version = parser.get_http_version()
+    head.is_kept = parser.should_keep_alive()
+    head.http = HttpRequest({"type": "http", "method": head.method, "headers": head.fields})
+    head.is_chunked = "transfer-encoding" in head.headers
+    head.path = _path_of(head.path)
+    if head.is_chunked:
+        reading.parser = parser
+    return reading
+
+
+@lru_cache(maxsize=64)  # a client sends the same few
+def _path_of(url: str) -> str:
+    """Return the path of a request's target, which may be a whole URL, without the query."""
+    try:
+        parts = httptools.parse_url(url.encode("latin-1"))
+    except httptools.HttpParserInvalidURLError:
+        return ""
+    return (parts.path or b"").decode("latin-1")
+
+
+def head_bytes(connection: socket.socket, received: bytes) -> int:
+    """Return how many bytes to read of a head of which `received` has been read: not beyond its
+    end, and at least one.
+
+    Raises:
+        BlockingIOError: The socket is empty.
+    """
+    peeked = connection.recv(HEAD_BYTES, socket.MSG_PEEK)
+    # The end of the head may have arrived in parts.
+    overlap = received[1 - len(END_OF_HEAD) :]
+    end = (overlap + peeked).find(END_OF_HEAD)
+    if end < 0:
+        return len(peeked) or 1
+    return end + len(END_OF_HEAD) - len(overlap)
+
+
+class HttpConnection(MessageConnection):
+    """One HTTP connection of the replica's own port.
+
+    It is not polled by `watch`, but takes the place of the connection that has read its first head.
+    """
+
+    late_code = _TIMEOUT
+
+    def __init__(self, server: WebSocketServer, connection: socket.socket) -> None:
+        limits = server.limits
+        super().__init__(
+            server,
+            connection,
+            server.engine.admission,
+            slow_s=server.slow_s,
+            idle_s=server.idle_s,
+            answer_bytes=limits.body_bytes,
+        )
+        self._server = server
+        self._engine = server.engine
+        self._limits = limits
+        self._key: str | None = None  # of the caller
+
+        self._head = b""  # received part of a head
+        self._reading: _Reading | None = None  # request whose body arrives
+        self._left = 0  # number of bytes of its body that have not arrived; -1: it has chunks
+        self._parts: list[bytes] = []  # received parts of its body
+        self._size = 0  # number of bytes in them
+        self._is_dropped = False  # whether the body is discarded, as the request is refused
+        self._answering: HttpHead | None = None  # request whose answer is awaited
+        self._request_id = ""  # of that request
+        self._sender: Sender | None = None  # of that request
+
+    # Reading.
+
+    @property
+    def _is_over(self) -> bool:
+        return self._is_closed_here
+
+    @property
+    def _incomplete_bytes(self) -> int:
+        return len(self._head) + self._size + (self._reading is not None)
+
+    def _is_backlogged(self) -> bool:
+        return self._unanswered > 0
+
+    def _read(self) -> None:
+        if self._unanswered and not self._is_over:
+            self._read_early()
+        else:
+            super()._read()
+
+    def _read_early(self) -> None:
+        """Leave bytes that arrive before an answer is sent in the socket, and notice the end of
+        the connection.
+        """
+        try:
+            is_open = bool(self._connection.recv(1, socket.MSG_PEEK))
+        except BlockingIOError:
+            return
+        except OSError:
+            is_open = False
+        if is_open:
+            self._pause_if_backlogged()
+        else:
+            self.disconnect()
+
+    def _bytes_to_read(self) -> int:
+        if self._reading is None:
+            return head_bytes(self._connection, self._head)
+        return READ_BYTES if self._left < 0 else min(self._left, READ_BYTES)
+
+    def _receive_bytes(self, data: bytes | memoryview) -> bool:
+        if not data:
+            self.disconnect()
+            return False
+        if self._reading is None:
+            self._receive_head(bytes(data))
+        else:
+            self._receive_body(data)
+        if (
+            self._incomplete_bytes
+            and self.caller is not None
+            and not (self._is_over or self._ended)
+        ):
+            self._count_incomplete()
+        return self._polled and not (self._ended or self._unanswered or self._is_over)
+
+    def _receive_head(self, data: bytes) -> None:
+        """Process bytes of a head."""
+        self._head += data
+        is_complete = self._head.endswith(END_OF_HEAD)
+        if is_complete or len(self._head) > HEAD_BYTES:
+            head, self._head = self._head, b""
+            self.begin(head if is_complete else b"")
+
+    def begin(self, head: bytes) -> None:
+        """Serve a request whose whole head has arrived; without bytes, refuse a head that is too
+        long.
+        """
+        try:
+            if not head:
+                raise MalformedMessage(f"head: over {HEAD_BYTES} bytes, the limit; send less")
+            reading = read_head(head)
+        except MalformedMessage as error:
+            status = 400 if head else _HEAD_TOO_LARGE
+            self._message_count += 1
+            self._charge_abuse()
+            self._answer_and_end(http_messages.problem_response(error, "", status))
+            return
+
+        self._request_id = http_messages.request_id(reading.head.http)
+        try:
+            self._admit(reading.head)
+        except VLAgentsError as error:
+            self._refuse_access(reading, error)
+            return
+        refusal = self._refusal_of(reading.head)
+        if refusal is None:
+            self._begin_body(reading)
+        else:
+            self._refuse(reading, refusal)
+
+    def _admit(self, head: HttpHead) -> None:
+        """Charge the request to its key, and count the connection for that key.
+
+        Raises:
+            VLAgentsError: The errors of `WebSocketServer.admit_request` and `count_connection`.
+        """
+        known = None if self.caller is None else (self.caller, self._key)
+        caller, key = self._server.admit_request(head.headers, known)
+        if caller is not self.caller:
+            self._server.count_connection(self, caller)
+            self.caller, self._key = caller, key
+            self._is_rated = isinstance(caller, Caller)
+        if isinstance(caller, Caller):
+            caller.admit()
+
+    def _refuse_access(self, reading: _Reading, error: VLAgentsError) -> None:
+        """Refuse a request whose client has no access, or has sent too many requests."""
+        response = http_messages.problem_response(error, self._request_id)
+        if isinstance(error, Unauthorized):
+            response.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
+
+        answer = partial(self._answer_and_end, response, reading.head)
+        if not isinstance(error, TooManyRequests):
+            answer()
+            return
+        if self.caller is not None:
+            self._refuse(reading, response)
+            return
+        # The delay bounds the rate of refusals.
+        self._pause(_REFUSED)
+
+        def refuse() -> None:
+            """Send the refusal."""
+            answer()
+            self._resume(_REFUSED)
+
+        self._call_later(min(error.retry_after_s, _MOST_REFUSED_S), refuse)
+
+    def _refusal_of(self, head: HttpHead) -> Response | None:
+        """Return the response to a request that is refused by its head; None if it is served."""
+        try:
+            if self._server.op_of(head.path) is None:
+                raise UnknownApp(_NO_PATH)
+            if head.method != "POST":
+                wrong = MalformedMessage("Method Not Allowed; send POST")
+                response = http_messages.problem_response(wrong, self._request_id, _NOT_ALLOWED)
+                response.headers["allow"] = "POST"
+                return response
+            http_messages.session_id(head.http)
+            http_messages.require_length(head.headers, self._limits)
+        except VLAgentsError as error:
+            return http_messages.problem_response(error, self._request_id)
+        return None
+
+    def _refuse(self, reading: _Reading, response: Response) -> None:
+        """Refuse a request, whose body is discarded if it is short; otherwise the connection
+        ends.
+        """
+        head = reading.head
+        is_known_path = self._server.op_of(head.path) is not None
+        is_short = not (head.is_chunked or head.waits or head.length > _DROPPED_BYTES)
+        if not (is_short and is_known_path):
+            self._message_count += 1
+            self._answer_and_end(response, head)
+            return
+        self._send_response(response, head)
+        if not self._is_closed_here:
+            self._is_dropped = True
+            self._begin_body(reading)
+
+    def _begin_body(self, reading: _Reading) -> None:
+        head = reading.head
+        self._reading = reading
+        self._left = -1 if head.is_chunked else head.length
+        if head.waits and self._left:
+            with self._sending:
+                if not self._ended:
+                    self._out.send(_CONTINUE)
+        if not self._left:
+            self._complete()
+
+    def _receive_body(self, data: bytes | memoryview) -> None:
+        """Process bytes of a body, which are at most its rest unless it is chunked."""
+        reading = self._reading
+        if reading is None:
+            return
+        if self._left < 0:
+            self._receive_chunks(reading, data)
+            return
+        self._left -= len(data)
+        if not self._is_dropped:
+            self._parts.append(bytes(data))
+            self._size += len(data)
+        if not self._left:
+            self._complete()
+
+    def _receive_chunks(self, reading: _Reading, data: bytes | memoryview) -> None:
+        if reading.parser is None:
+            return
+        try:
+            reading.parser.feed_data(data)
+        except httptools.HttpParserUpgrade:
+            pass
+        except httptools.HttpParserError as error:
+            if not reading.is_complete:
+                wrong = MalformedMessage(f"body: its chunks are malformed ({error})")
+                self._end_request(wrong)
+                return
+            reading.has_next = True
+        self._size = reading.size
+        limit = self._limits.body_bytes
+        if self._size > limit:
+            self._end_request(MessageTooLarge(f"body: over {limit} bytes, the limit"))
+        elif reading.is_complete:
+            # The next request has been read partly; its client sends it again.
+            reading.head.is_kept = reading.head.is_kept and not reading.has_next
+            self._parts = reading.body
+            self._complete()
+
+    def _end_request(self, error: VLAgentsError) -> None:
+        """Answer a request whose body cannot be read, and end the connection."""
+        reading, self._reading = self._reading, None
+        self._parts, self._size = [], 0
+        if reading is not None:
+            reading.parser = None
+        self._release_arriving()
+        response = http_messages.problem_response(error, self._request_id)
+        self._answer_and_end(response, None if reading is None else reading.head)
+
+    # Serving a request.
+
+    def _complete(self) -> None:
+        """Serve a request whose body has arrived."""
+        reading, parts = self._reading, self._parts
+        self._reading, self._parts, self._size, self._left = None, [], 0, 0
+        self._release_arriving()
+        self._message_count += 1
+        if reading is not None:
+            reading.parser = None
+        if reading is None or self._is_dropped:
+            self._is_dropped = False
+            return
+
+        head = self._answering = reading.head
+        op = cast(Op, self._server.op_of(head.path))
+        incoming = IncomingMessage("http", op)
+        body = parts[0] if len(parts) == 1 else b"".join(parts)
+        self.add_unanswered(len(body))
+        incoming.size = len(body)
+        try:
+            self._decode(op, head, incoming, body)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            self._fail(incoming, error)
+
+    def _decode(self, op: Op, head: HttpHead, incoming: IncomingMessage, data: bytes) -> None:
+        """Decode the requests of a body, and submit them."""
+        caller = self.caller
+        if caller is None:
+            raise VLAgentsError("internal error: a request without a caller")
+        sender = self._sender = Sender(
+            self._engine,
+            "http",
+            http_messages.session_id(head.http),
+            caller=caller,
+            connected=False,
+        )
+        priority = head.headers.get(PRIORITY_HEADER, "robot")
+        admission = sender.admission(self._limits, priority=priority)
+        name = self._request_id
+
+        is_form = http_messages.content_type_of(head.headers) == http_messages.FORM_TYPE
+        if is_form and len(data) > _INLINE_FORM_BYTES:
+
+            def read(budget: Budget) -> Decoded:
+                """Read a long form, on a thread for decoding."""
+                return http_messages.body_of(op, head.http, data, admission, name).read(budget)
+
+            body = http_messages.Body(read, is_long=True)
+        else:
+            body = http_messages.body_of(op, head.http, data, admission, name)
+
+        submit = partial(self._submit, incoming, sender, admission, self._arrived)
+        fail = partial(self._fail, incoming)
+        self.decode(body.read, admission, submit, fail, long=body.is_long)
+
+    def _submit(
+        self,
+        incoming: IncomingMessage,
+        sender: Sender,
+        admission: MessageAdmission,
+        arrived: float,
+        decoded: Decoded,
+    ) -> None:
+        """Send the requests to the engine; their deadlines count from the arrival of the body."""
+        incoming.decoded(decoded)
+        if decoded.requests:
+            self._request_id = decoded.requests[0].request_id
+        waited_s = time.perf_counter() - arrived
+        sender.send(
+            incoming,
+            decoded,
+            self,
+            admission=admission,
+            waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
+        )
+
+    def deliver(self, message: IncomingMessage) -> None:
+        """Send the answer of a request, and read on."""
+        self.send_answers(message, self._send_answer, self._engine.stats)
+        self.remove_unanswered(message.size)
+
+    def _fail(self, incoming: IncomingMessage, error: Exception) -> None:
+        """Answer a request that cannot be decoded."""
+        request_id = self._request_id
+        problem = http_messages.public_problem(error, incoming.kinds[0][0], request_id)
+        incoming.refuse(problem, request_id)
+        self.deliver(incoming)
+
+    def _send_answer(self, message: IncomingMessage) -> None:
+        head, self._sender = self._answering, None
+        if head is None:  # the connection has ended
+            return
+        try:
+            response = http_messages.response_to(message, head.headers)
+        except VLAgentsError as error:
+            response = http_messages.problem_response(error, self._request_id)
+        self._answering = None
+        # A replica that stops serves no further request over this connection.
+        is_kept = head.is_kept and not any(reply.draining for reply in message.replies)
+        if is_kept:
+            self._send_response(response, head)
+        else:
+            self._answer_and_end(response, head)
+
+    def _send_response(self, response: Response, head: HttpHead) -> None:
+        """Send a response after which the connection goes on; on any thread."""
+        if not head.is_kept:
+            self._answer_and_end(response, head)
+            return
+        data = _bytes_of(response, head, self._request_id, is_kept=True)
+        with self._sending:
+            if not (self._ended or self._is_closed_here):
+                self._out.send(data)
+
+    def _answer_and_end(self, response: Response, head: HttpHead | None = None) -> None:
+        """Send a response, and end the connection; on any thread."""
+        data = _bytes_of(response, head, self._request_id, is_kept=False)
+        with self._sending:
+            if not (self._ended or self._is_closed_here):
+                self._ended_at = time.monotonic()
+                self._out.send(data, last=True)
+
+    # The end.
+
+    def _end_sessions(self) -> None:
+        """Withdraw the request that no batch has taken; sessions of HTTP outlive a connection."""
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.release()
+
+    def _discard(self) -> None:
+        self._parts, self._reading = [], None
+        super()._discard()
+
+    def _send_close(self, code: int, reason: str) -> None:
+        """Answer the request that is incomplete or unanswered, and end the connection."""
+        if self._is_closed_here:
+            return
+        self._ended_at = time.monotonic()
+        head = self._answering or (self._reading and self._reading.head)
+        if head is None and not self._head:
+            self._out.send(b"", last=True)
+            return
+        self._answering = None
+        if code == INTERNAL_ERROR:
+            reason = "internal error; the server's log has the details"
+        error = _ENDINGS.get(code, VLAgentsError)(reason)
+        status = _TIMEOUT if code == _TIMEOUT else None
+        response = http_messages.problem_response(error, self._request_id, status)
+        self._out.send(_bytes_of(response, head, self._request_id, is_kept=False), last=True)
+
+
+def _bytes_of(
+    response: Response, head: HttpHead | None, request_id: str, *, is_kept: bool
+) -> bytes:
+    """Return a response as bytes; the request may have had no readable head."""
+    reason = http.HTTPStatus(response.status_code).phrase
+    lines = [
+        f"HTTP/1.1 {response.status_code} {reason}\r\ndate: {_date(int(time.time()))}".encode()
+    ]
+    lines += [name + b": " + value for name, value in response.raw_headers]
+    if request_id:
+        lines.append(f"{REQUEST_ID_HEADER}: {request_id}".encode())
+    if not is_kept:
+        lines.append(b"connection: close")
+    elif head is not None and head.version == "1.0":
+        lines.append(b"connection: keep-alive")
+    body = b"" if head is not None and head.method == "HEAD" else bytes(response.body)
+    return b"\r\n".join([*lines, b"", body])
+
+
+@lru_cache(maxsize=1)
+def _date(seconds: int) -> str:
+    return formatdate(seconds, usegmt=True)
