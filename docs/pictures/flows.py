@@ -47,11 +47,11 @@ FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[
         ("TCP", "one frame: JPEG, PNG or raw"),
     ),
     "http": (
-        "HTTP: any machine, through the proxy",
+        "HTTP: any machine, straight to the replica or through the proxy",
         [("RemoteAgent, or curl", "client/agent"), ("HTTP transport", "client/transports/http")],
         [("policy", "policies/"), ("batch queue", "serve/engine, serve/queue"),
-         ("HTTP endpoint", "serve/endpoints/http")],
-        ("HAProxy", "frame, form or JSON"),
+         ("HTTP endpoint", "serve/endpoints/http_connection")],
+        ("TCP", "one frame, form or JSON"),
     ),
 }  # fmt: skip
 

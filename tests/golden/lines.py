@@ -26,6 +26,7 @@ _HANDSHAKE = (
     "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
 )
 _FRAME_KINDS = {0x81: "text", 0x82: "binary", 0x88: "close"}
+_REQUEST_ID = re.compile(rb"x-request-id: .*\r\n")
 _LENGTH = re.compile(rb"\r\ncontent-length: (\d+)\r\n", re.IGNORECASE)
 
 
@@ -97,6 +98,21 @@ class HttpLine(TcpLine):
 
     def _next(self) -> Got:
         return "response", masked(self._read_response())
+
+
+class OwnHttpLine(HttpLine):
+    """The same requests at a replica's own port, below its unguessable path."""
+
+    def __init__(self, port: int, path: str) -> None:
+        super().__init__(port)
+        self._path = path.encode()
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        super().send(re.sub(rb"^(\w+) /v1(?=/)", rb"\1 " + self._path, data, count=1), more)
+
+    def _next(self) -> Got:
+        # At the server's port, the code before the application adds the id of the request.
+        return "response", _REQUEST_ID.sub(b"", masked(self._read_response()))
 
 
 class RpycLine(TcpLine):

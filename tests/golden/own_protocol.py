@@ -14,6 +14,7 @@ from golden import JPEG_FILE, png
 from tests.golden.scenarios import (
     EVERYWHERE,
     FRAMES,
+    HTTP,
     LOCAL,
     STREAMS,
     TOGETHER,
@@ -147,12 +148,13 @@ def episodes() -> Iterator[Trace]:
     )
     yield from scenario(
         "an episode begins again",
-        ("handle", "http"),
+        ("handle", *HTTP),
         asks(reset(history=pixels, step=2**60), act()),
     )
     yield from scenario(
         "a replica that drains",
-        TOGETHER,
+        # After an answer of a replica that drains, its own port ends a connection of HTTP.
+        [endpoint for endpoint in TOGETHER if endpoint != HTTP[1]],
         begin,
         asks(act()),
         server("drains"),
@@ -173,7 +175,13 @@ def episodes() -> Iterator[Trace]:
     name, later = "a deadline that is over", asks(act(deadline_ms=1e6), who="b")
     yield from scenario(name, TOGETHER[1:4], *held, gets("b"), server("acts on"), gets("a"), later)
     yield from scenario(
-        name, (STREAMS[0], *LOCAL[:1]), *held, server("acts on"), gets("a"), gets("b"), later
+        name,
+        (STREAMS[0], HTTP[1], *LOCAL[:1]),
+        *held,
+        server("acts on"),
+        gets("a"),
+        gets("b"),
+        later,
     )
     yield from scenario(
         "the order of answers",
@@ -330,7 +338,7 @@ def of_http() -> Iterator[Trace]:
     )
     yield from scenario(
         "an episode in forms",
-        ("http",),
+        HTTP,
         begin,
         asks(
             post("act", whole),
@@ -362,7 +370,7 @@ def of_http() -> Iterator[Trace]:
     refused = asks(
         *(post("act", body) for body in bodies), post("act", {}, content_encoding="gzip")
     )
-    yield from scenario("documents and forms that are refused", ("http",), begin, refused)
+    yield from scenario("documents and forms that are refused", HTTP, begin, refused)
     headers = [
         {"session": "a b"},
         {"x_request_id": "a b"},
@@ -374,7 +382,7 @@ def of_http() -> Iterator[Trace]:
         post("act", encode_requests([reset()]), kind=frame), post("act", b"VLA", kind=frame)
     )
     refused = asks(*(post("act", whole, **header) for header in headers))
-    yield from scenario("headers and frames that are refused", ("http",), begin, refused, frames)
+    yield from scenario("headers and frames that are refused", HTTP, begin, refused, frames)
     pages = asks((http("GET", "/healthz"),), (http("GET", "/v1/metadata"),))
     others = asks((http("GET", "/v1/nothing"),), (http("GET", "/v1/act"),))
     yield from scenario("other paths", ("http",), pages, others)

@@ -32,6 +32,7 @@ from tests.golden.lines import (
     GrpcLine,
     HttpLine,
     Line,
+    OwnHttpLine,
     RpycLine,
     StrangerLine,
     UnixLine,
@@ -80,6 +81,7 @@ _GATEWAYS = {"gr00t": ZmqLine, "lerobot": GrpcLine, "vlagents": RpycLine}
 # The end of an endpoint's name if a connection records the handshake and the heads of frames too.
 EACH_BYTE = ", each byte"
 _EACH_BYTE_OF_GATEWAY = {"gr00t": ZmtpLine}
+OWN_HTTP = "own port, http"
 STRANGER = "stranger"  # the name of a line that sends no whole message begins with it
 
 
@@ -225,11 +227,13 @@ class Server:
             self._start()
             return self._handle(self.engines[number], name)
 
-        if endpoint == "own port":
-            own = self._open_own(endpoint)
+        if endpoint in ("own port", OWN_HTTP):
+            own = self._open_own("own port")
             port, path = own.address.port, own.path
         else:
             port, path = self._http(number), endpoint
+        if endpoint == OWN_HTTP:
+            return OwnHttpLine(port, path)
         if endpoint == "http":
             return HttpLine(port)
         return WholeWebSocketLine(port, path) if each_byte else WebSocketLine(port, path)

@@ -13,7 +13,8 @@ from vlagents_ray.protocol.shm_layout import ShmWriter
 STREAMS = ("own port", "/v1/stream")
 FRAMES = (*STREAMS, "handle")
 LOCAL = ("shared memory", "plasma")
-EVERYWHERE = (*FRAMES, "http", *LOCAL)
+HTTP = ("http", "own port, http")
+EVERYWHERE = (*FRAMES, *HTTP, *LOCAL)
 TOGETHER = EVERYWHERE[:-1]  # plasma reads what shared memory does
 
 ScenarioMessage = Request | list[Request] | bytes | tuple[bytes, ...]
@@ -91,7 +92,7 @@ def _encoder(endpoint: str, who: str) -> Callable[[ScenarioMessage], tuple[bytes
             return message
         requests = [message] if isinstance(message, Request) else message
         frame = requests if isinstance(requests, bytes) else encode_requests(requests)
-        if endpoint == "http":
+        if endpoint in HTTP:
             op = "act" if isinstance(requests, bytes) else requests[0].op
             return (http("POST", f"/v1/{op}", frame, CONTENT_TYPE, who, accept=CONTENT_TYPE),)
         if endpoint not in LOCAL:

@@ -132,6 +132,7 @@ TABLE = [
         for behaviour in flood.BEHAVIOURS
         if behaviour not in OF_HAPROXY
     ),
+    *((flood.OWN_HTTP, behaviour) for behaviour in flood.HTTP_BEHAVIOURS),
     *(("shared memory", behaviour) for behaviour in flood.NEAR),
     *((flood.PLASMA, behaviour) for behaviour in flood.NEAR_PLASMA),
     *(
@@ -204,6 +205,7 @@ def robots(
             **dict.fromkeys([*flood.WAYS, flood.PLASMA], act),
             **dict.fromkeys(flood.PAGES, show),
             **dict.fromkeys(flood.HTTP, act_over_http),
+            flood.OWN_HTTP: act,
             "gr00t": of_gr00t.ping,
             "vlagents": name,
             "lerobot": lambda: ready(b"", timeout=60),
@@ -248,6 +250,7 @@ HTTP_TABLE = [
     )
     for way in flood.HTTP
     for name in flood.HTTP_BEHAVIOURS
+    if way != flood.OWN_HTTP
 ]
 
 
@@ -279,9 +282,10 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
         where = page
     call()
     memory, sockets = resources(where["pid"])
-    name = (
-        "replica" if way in (*flood.WAYS, flood.PLASMA) else "HAProxy" if way in flood.HTTP else way
-    )
+    if way in (*flood.WAYS, flood.PLASMA, flood.OWN_HTTP):
+        name = "replica"
+    else:
+        name = "HAProxy" if way in flood.HTTP else way
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do

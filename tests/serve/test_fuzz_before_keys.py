@@ -21,7 +21,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -40,7 +40,7 @@ from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
-from vlagents_ray.protocol.messages import LocalAddress, Request
+from vlagents_ray.protocol.messages import OPS, LocalAddress, Request
 from vlagents_ray_dialects.messages import rpyc
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 from vlagents_ray_dialects.messages.rpyc import Handler
@@ -57,7 +57,7 @@ RESET = encode_requests(
 )
 ACT = encode_requests([Request("act", Obs({"front": PICTURE}), session="robot-1")])
 FORM = b'--b\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--b--'
-Sequence = list[bytes]
+Segments = list[bytes]
 
 
 @dataclass
@@ -68,12 +68,12 @@ class Target:
 
     name: str
     way: str
-    pieces: Callable[[KeyedReplica, random.Random], Sequence]
-    send: Callable[[KeyedReplica, random.Random, Sequence], str]
+    pieces: Callable[[KeyedReplica, random.Random], Segments]
+    send: Callable[[KeyedReplica, random.Random, Segments], str]
     said: Counter[str] = field(default_factory=Counter)
 
 
-def sequence(target: Target, replica: KeyedReplica, choose: random.Random) -> Sequence:
+def sequence(target: Target, replica: KeyedReplica, choose: random.Random) -> Segments:
     """Right pieces and nearly right ones in an order that may be wrong, cut into segments."""
     pieces = target.pieces(replica, choose)
     if choose.random() < 0.3:
@@ -116,7 +116,7 @@ def frame(payload: bytes, opcode: int = 2) -> bytes:
     return bytes([0x80 | opcode, 0x80 | 126]) + len(payload).to_bytes(2, "big") + bytes(4) + payload
 
 
-def frames(choose: random.Random) -> Sequence:
+def frames(choose: random.Random) -> Segments:
     some = [
         RESET,
         ACT,
@@ -130,20 +130,26 @@ def frames(choose: random.Random) -> Sequence:
     ]
 
 
-def at_own_port(replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_own_port(replica: KeyedReplica, choose: random.Random) -> Segments:
     path = choose.choice(
         (replica.own.path, replica.own.path, "/", "/v1/stream", replica.own.path[:-1])
     )
-    return [handshake(choose, path), *frames(choose)]
+    if choose.random() < 0.5:
+        return [handshake(choose, path), *frames(choose)]
+    return posts(choose, [f"{replica.own.path}/{op}" for op in OPS] + ["/v1/act"])
 
 
-def at_http(_replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_http(_replica: KeyedReplica, choose: random.Random) -> Segments:
     if choose.random() < 0.4:
         path = choose.choice(("/v1/stream", "/", "/openpi", "/roboarena", "/vla-eval", "/nope"))
         return [handshake(choose, path), *frames(choose)]
-    path = choose.choice(
-        ("/v1/reset", "/v1/act", "/v1/close", "/act", "/docs", "/v1/metadata", "/healthz/")
-    )
+    paths = ("/v1/reset", "/v1/act", "/v1/close", "/act", "/docs", "/v1/metadata", "/healthz/")
+    return posts(choose, paths)
+
+
+def posts(choose: random.Random, paths: Sequence[str]) -> Segments:
+    """Requests over HTTP."""
+    path = choose.choice(paths)
     kind, content = choose.choice(
         (
             ("application/json", b'{"instruction": "move to the human"}'),
@@ -170,13 +176,13 @@ def at_http(_replica: KeyedReplica, choose: random.Random) -> Sequence:
     return [head.encode() + headers(choose) + b"\r\n", content] * choose.randint(1, 2)
 
 
-def at_shm(_replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_shm(_replica: KeyedReplica, choose: random.Random) -> Segments:
     key = (choose.choice(KEYS) or "-").encode()
     message = LocalAddress.REQUEST.pack(0, choose.choice((0, LocalAddress.COMPACT)), len(RESET))
     return [key, message, message + RESET[:200]]
 
 
-def at_gr00t(_replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_gr00t(_replica: KeyedReplica, choose: random.Random) -> Segments:
     observation = {
         "video": {"ego": PICTURE[None, None]},
         "language": {"task": [["move to the human"]]},
@@ -191,7 +197,7 @@ def at_gr00t(_replica: KeyedReplica, choose: random.Random) -> Sequence:
     return [msgpack.packb(said, default=gr00t_encode)]
 
 
-def at_zmq(replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_zmq(replica: KeyedReplica, choose: random.Random) -> Segments:
     """Below its messages: ZMTP's own greeting, handshake and frames."""
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
     ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00\x00"
@@ -200,7 +206,7 @@ def at_zmq(replica: KeyedReplica, choose: random.Random) -> Sequence:
     return [greeting, b"\x04" + bytes([len(ready)]) + ready, b"\x01\x00", long]
 
 
-def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Sequence:
+def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Segments:
     """Its protocol has no key: all that comes before a client's first whole observation."""
     getroot = request(1, Handler.GETROOT, (TUPLE, ()))
     getattr_ = request(2, Handler.GETATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "act"))))
@@ -226,8 +232,8 @@ def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Sequence:
 
 def over_tcp(
     port: Callable[[KeyedReplica], int], *, hangs_up: bool = True
-) -> Callable[[KeyedReplica, random.Random, Sequence], str]:
-    def send(replica: KeyedReplica, choose: random.Random, segments: Sequence) -> str:
+) -> Callable[[KeyedReplica, random.Random, Segments], str]:
+    def send(replica: KeyedReplica, choose: random.Random, segments: Segments) -> str:
         """Until the server hangs up, which it does once it has read all of it; ZMQ may wait for
         more.
         """
@@ -256,7 +262,7 @@ def over_tcp(
     return send
 
 
-def over_unix(replica: KeyedReplica, choose: random.Random, segments: Sequence) -> str:
+def over_unix(replica: KeyedReplica, choose: random.Random, segments: Segments) -> str:
     said = 0
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ANSWER_S)
@@ -280,7 +286,7 @@ def over_unix(replica: KeyedReplica, choose: random.Random, segments: Sequence) 
 _OF_THREAD = threading.local()
 
 
-def over_zmq(replica: KeyedReplica, _choose: random.Random, segments: Sequence) -> str:
+def over_zmq(replica: KeyedReplica, _choose: random.Random, segments: Segments) -> str:
     """One message, in as many parts as there are segments; a connection is closed after 64
     without a key.
     """

@@ -308,13 +308,16 @@ Way = Callable[[Visitor, str], str]
 
 
 def over_http(method: str, path: str, **options: Any) -> Way:
-    """A request of HTTP. `session`: a session has been reset with the key while it was right."""
+    """A request of HTTP. `session`: a session has been reset with the key while it was right; `own`:
+    it goes to the replica's own port.
+    """
 
     def attempt(visitor: Visitor, _when: str) -> str:
         def ask(method: str, path: str, document: dict[str, Any] | None, token: str | None) -> int:
-            connection = http.client.HTTPConnection(
-                "127.0.0.1", visitor.replica.port, timeout=ANSWER_S
-            )
+            port, own = visitor.replica.port, visitor.replica.own
+            if options.get("own"):
+                port, path = own.address.port, own.path + path.removeprefix("/v1")
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=ANSWER_S)
             headers = (
                 {"x-session-id": "robot-1", "content-type": "application/json"}
                 if path != "/act"
@@ -677,6 +680,8 @@ WAYS: dict[str, Way] = {
         "watch", over_websocket("/v1/live", _watch, _read_seen)
     ),
     "own port": over_websocket("own", _stream_message, _read_reply),
+    "own port, HTTP reset": over_http("POST", "/v1/reset", document=_reset, own=True),
+    "own port, HTTP act": over_http("POST", "/v1/act", document=_act, session=True, own=True),
     "own port, another path": over_websocket("own/x", _stream_message, _read_reply),
     "shared memory": over_shm,
     "GR00T's gateway, replica on its host": over_gr00t(True),

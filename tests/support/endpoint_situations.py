@@ -24,7 +24,17 @@ from golden import png
 
 from tests.golden.own_protocol import PIXELS, act, asked, reset, seen
 from tests.golden.replica import EACH_BYTE, KEY
-from tests.golden.scenarios import ScenarioMessage, Send, Steps, asks, gets, http, scenario, server
+from tests.golden.scenarios import (
+    HTTP,
+    ScenarioMessage,
+    Send,
+    Steps,
+    asks,
+    gets,
+    http,
+    scenario,
+    server,
+)
 from tests.golden.traces import Step, Trace, differences, read, write
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Request
@@ -171,6 +181,7 @@ NOT_APPLICABLE: dict[str, dict[str, str]] = {
         "metadata": "its clients read the metadata by the replica's method `attach`, under Ray",
         "wrong key": "only processes of the cluster have a handle",
     },
+    "own_port_http": {"metadata": "its clients read the metadata at the server's port"},
     "http_frame": {},
     "http_form": {},
     "http_json": {},
@@ -310,7 +321,9 @@ Body = Callable[[Request], tuple[str, bytes]]
 """Returns the content type and the body of a request over HTTP."""
 
 
-def _http(name: str, body: Body, wrong: Sequence[Request], **settings: Any) -> Endpoint:
+def _http(
+    name: str, body: Body, wrong: Sequence[Request], line: str = HTTP[0], **settings: Any
+) -> Endpoint:
     def say(who: str, request: Request, **headers: str) -> tuple[bytes]:
         kind, data = body(request)
         if kind == CONTENT_TYPE:
@@ -327,8 +340,9 @@ def _http(name: str, body: Body, wrong: Sequence[Request], **settings: Any) -> E
     half_body = len(body(act())[1]) // 2
     garbage = http("POST", "/v1/act", b"garbage", body(act())[0], "a")
     get = [(http("GET", path),) for path in ("/v1/metadata", "/healthz")]
+    stopped = [asks(say("a", act())), finishes()] if line == HTTP[0] else [gets("a"), finishes()]
     situations = _episode_steps(
-        say, connect, polled=False, wrong=wrong, unknown=UNKNOWN_SESSIONS[:1]
+        say, connect, polled=line != HTTP[0], wrong=wrong, unknown=UNKNOWN_SESSIONS[:1]
     ) | {
         "metadata": [asks(*get), finishes()],
         "wrong key": [
@@ -346,10 +360,12 @@ def _http(name: str, body: Body, wrong: Sequence[Request], **settings: Any) -> E
         ],
         "stop of the server": [
             [asks(say("a", reset()), say("a", act())), server("stops")],
-            [asks(say("a", act())), finishes()],
+            stopped,
         ],
     }
-    return Endpoint(name, "http", situations, NOT_APPLICABLE[name], settings)
+    reasons = NOT_APPLICABLE[name]
+    applicable = {key: steps for key, steps in situations.items() if key not in reasons}
+    return Endpoint(name, line, applicable, reasons, settings)
 
 
 def _frame_body(request: Request) -> tuple[str, bytes]:
@@ -388,6 +404,7 @@ CORE = (
     _websocket("own_port", "own port", "{path}", polled=True),
     _websocket("v1_stream", "/v1/stream", "/v1/stream", polled=False),
     _handle("serve_handle"),
+    _http("own_port_http", _frame_body, OTHER_SHAPES, HTTP[1]),
     _http("http_frame", _frame_body, OTHER_SHAPES),
     _http("http_form", _form_body, OTHER_SHAPES),
     # A document has no images.

@@ -590,6 +590,9 @@ HTTP = {
     "HAProxy, POST /v1/act": ("/v1/act", CONTENT_TYPE),
     "HAProxy, POST /act": ("/act", "application/json"),
 }
+# Requests at the replica's own port, whose unguessable path takes the place of `_OWN_PATH`.
+OWN_HTTP, _OWN_PATH = "own port, HTTP", "/own"
+HTTP[OWN_HTTP] = (f"{_OWN_PATH}/act", CONTENT_TYPE)
 
 
 def _request(way: str, key: str, *fields: str) -> bytes:
@@ -665,14 +668,19 @@ HTTP_BEHAVIOURS = {
 
 
 def misbehave_over_http(way: str, name: str, where: Where, end: float) -> None:
-    """Behave in that way over one connection to HAProxy, until it ends the connection, or until
-    the `end`.
+    """Behave in that way over one connection to HAProxy, or to the replica's own port, until it
+    ends the connection, or until the `end`.
     """
     behaviour, key = HTTP_BEHAVIOURS[name], key_of(way)
-    with socket.create_connection(("127.0.0.1", where["proxied"]), timeout=5) as connection:
+    port, path = where["own"] if way == OWN_HTTP else (where["proxied"], _OWN_PATH)
+
+    def at_port(data: bytes) -> bytes:
+        return data.replace(f"POST {_OWN_PATH}/".encode(), f"POST {path}/".encode())
+
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
         connection.settimeout(max(0.01, end - time.monotonic()))
-        connection.sendall(behaviour.once(way, key))
-        repeated = behaviour.repeated(way, key)
+        connection.sendall(at_port(behaviour.once(way, key)))
+        repeated = at_port(behaviour.repeated(way, key))
         if repeated:
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while time.monotonic() < end:

@@ -183,12 +183,14 @@ class LocalAddress:
 
 @dataclass(frozen=True, slots=True)
 class StreamAddress:
-    """The replica's own port for WebSockets, on the host of the server's URL. It is `stream` in the
-    metadata.
+    """The replica's own port for WebSockets and HTTP, on the host of the server's URL. It is
+    `stream` in the metadata.
     """
 
     port: int
-    path: str  # unguessable: known only to clients that may read the metadata
+    # Path of a WebSocket, below which are those of HTTP. It is unguessable: known only to clients
+    # that may read the metadata.
+    path: str
 
     def __post_init__(self) -> None:
         if not 0 < self.port < 2**16:

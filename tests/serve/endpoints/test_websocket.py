@@ -25,7 +25,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_requests, encode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints import websocket_connection
+from vlagents_ray.serve.endpoints import message_connection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -146,7 +146,7 @@ def test_many_small_fragments_end_their_connection(endpoint: WebSocketServer) ->
 def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(websocket_connection, "_CLOSING_S", 1e9 if floods else 0.2)
+    monkeypatch.setattr(message_connection, "_CLOSING_S", 1e9 if floods else 0.2)
     endpoint.limits = MessageLimits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")

@@ -25,6 +25,8 @@ _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 SPIN_S = 150e-6  # s to poll for an answer before sleeping
+# s to wait for a replica's own port: a firewall may drop the packets
+DIRECT_S = 1.0
 FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is polled for
 
 

@@ -1,4 +1,9 @@
-"""The HTTP transport: `POST /v1/<op>` with binary frames on a persistent connection."""
+"""The HTTP transport: POST requests with binary frames on a persistent connection.
+
+They go to the replica's own port, which is in the metadata. If that port cannot be reached (because
+of a firewall, a tunnel of one port, or TLS, which ends at the proxy), the client uses
+`POST /v1/<op>` on the server's port, which is slower.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +27,15 @@ from vlagents_ray.client.credentials import (
 )
 from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.client.transports.base import (
+    DIRECT_S,
+    FAST_S,
+    SPIN_S,
     CodecChoice,
     ConnectReport,
+    await_answer,
     connection_lost,
     first_timeout_s,
+    left_s,
     no_answer,
 )
 from vlagents_ray.errors import (
@@ -48,6 +58,8 @@ from vlagents_ray.protocol.messages import (
     SESSION_HEADER,
     Reply,
     Request,
+    StreamAddress,
+    read_address,
 )
 
 _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
@@ -71,7 +83,9 @@ class HttpTransport:
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
-        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self._link = _Link(self._url, credentials)
+        self._direct: _Link | None = None  # to the own port of the replica that answered
+        self._unreachable = False  # whether this client cannot reach the replicas' own ports
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata once it answers. This retries while it is not ready."""
@@ -82,16 +96,16 @@ class HttpTransport:
         pause_s, attempt_s = 0.05, first_timeout_s(timeout_s)
 
         while True:
-            left_s = deadline - time.monotonic()
+            remaining_s = deadline - time.monotonic()
             try:
-                return self._metadata(max(0.1, min(left_s, attempt_s)))
+                return self._metadata(max(0.1, min(remaining_s, attempt_s)))
             except (PolicyUnavailable, DeadlineExceeded) as error:
                 # If the replica hangs, another session id selects another one.
                 if isinstance(error, DeadlineExceeded):
                     self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
                 if isinstance(error, ConnectionLost):
                     require_plain(self._url, attempt_s)
-                if pause_s > left_s:
+                if pause_s > remaining_s:
                     raise PolicyUnavailable(
                         f"{url}: not ready within {round(timeout_s, 1):g} s ({error})"
                     ) from error
@@ -99,7 +113,7 @@ class HttpTransport:
                 report.failed(error)
             except UnknownApp as error:
                 unknown_since = unknown_since or time.monotonic()
-                if time.monotonic() - unknown_since > _UNKNOWN_APP_S or pause_s > left_s:
+                if time.monotonic() - unknown_since > _UNKNOWN_APP_S or pause_s > remaining_s:
                     raise
                 report.failed(error)
 
@@ -119,6 +133,7 @@ class HttpTransport:
                 f"{self._url.geturl()}: expected a vlagents_ray server, got another one "
                 f"({str(metadata)[:80]}); check the URL"
             )
+        self._set_direct(read_address(StreamAddress, metadata.get("stream")))
         return metadata
 
     def get(
@@ -130,7 +145,7 @@ class HttpTransport:
         method: str = "GET",
     ) -> dict[str, Any]:
         """Return the JSON document with which the server answers a request without a body."""
-        status, kind, body = self._exchange(method, path, None, headers or {}, timeout_s)
+        status, kind, body = self._link.exchange(method, path, None, headers or {}, timeout_s)
         if status != 200:
             raise refusal(status, kind, body)
         document = _json(body)
@@ -152,61 +167,126 @@ class HttpTransport:
             "accept": CONTENT_TYPE,
         }
         frame = encode_requests(requests, self._codec.codec_for(requests[0].obs))
-        path = f"/v1/{requests[0].op}"
-
-        status, kind, body = self._exchange("POST", path, frame, headers, timeout_s)
+        deadline = time.monotonic() + timeout_s
+        op = requests[0].op
+        answer = self._call_direct(op, frame, headers, deadline)
+        if answer is None:
+            answer = self._link.exchange("POST", f"/v1/{op}", frame, headers, left_s(deadline))
+        status, kind, body = answer
         if status == 200:
             return decode_replies(body)
         error = refusal(status, kind, body)
         return [Reply(request.request_id, error=error) for request in requests]
 
-    def close(self) -> None:
-        """Close the connection; the next one may reach another replica."""
-        if self._connection is not None:
-            connection, _ = self._connection
-            connection.close()
-            self._connection = None
+    def _set_direct(self, address: StreamAddress | None) -> None:
+        """Use the own port of the replica that answered, from the next call on."""
+        if self._direct is not None:
+            self._direct.close()
+            self._direct = None
+        # The port is not encrypted.
+        if address is None or self._url.scheme != "http" or self._unreachable:
+            return
+        host = self._url.hostname or ""
+        name = f"[{host}]" if ":" in host else host
+        url = self._url._replace(netloc=f"{name}:{address.port}", path=address.path)
+        self._direct = _Link(url, self._credentials)
 
-    def _exchange(
+    def _call_direct(
+        self, op: str, frame: bytes, headers: dict[str, str], deadline: float
+    ) -> tuple[int, str, bytes] | None:
+        """Send a request to the replica's own port; return None if it was not executed there, so
+        that it may be sent to the server's port.
+        """
+        link = self._direct
+        if link is None:
+            return None
+        try:
+            link.open(min(left_s(deadline), DIRECT_S))
+        except NoReplica as error:
+            # A firewall drops the packets: do not try again.
+            self._unreachable = isinstance(error.__cause__, TimeoutError)
+            self._set_direct(None)
+            return None
+
+        answer = link.exchange("POST", f"/{op}", frame, headers, left_s(deadline))
+        status, kind, body = answer
+        if status in (404, 503):
+            error_type = type(refusal(status, kind, body))
+            # Another server has the port, or the replica takes no further connection.
+            if error_type in (UnknownApp, PolicyUnavailable, NoReplica):
+                self._set_direct(None)
+                return None
+        return answer
+
+    def close(self) -> None:
+        """Close the connections; the next one may reach another replica."""
+        self._link.close()
+        if self._direct is not None:
+            self._direct.close()
+
+
+class _Link:
+    """A persistent connection to one address."""
+
+    def __init__(self, url: SplitResult, credentials: Credentials) -> None:
+        self.url = url
+        self._credentials = credentials
+        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self._poller = select.poll()  # polls the connection
+        self._answers_fast = True  # whether the last answer was immediate
+
+    def exchange(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
     ) -> tuple[int, str, bytes]:
-        """Send a request; return the status, content type and body of the answer."""
+        """Send a request; return the status, content type and body of the answer.
+
+        Raises:
+            NoReplica: Nothing was sent, as the address cannot be reached.
+            ConnectionLost: The connection broke.
+            DeadlineExceeded: There was no answer in time.
+        """
         begun = time.monotonic()
-        connection, deadline_socket = self._open(timeout_s)
+        connection, deadline_socket = self.open(timeout_s)
         deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
         try:
             connection.request(
-                method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers
+                method, self.url.path.rstrip("/") + path, body, headers | self._credentials.headers
             )
+            self._await_answer(connection.sock, begun + timeout_s)
             answer = connection.getresponse()
 
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
             if len(content) > DEFAULT_LIMITS.body_bytes:
                 self.close()
                 raise MessageTooLarge(
-                    f"{self._url.geturl()}: expected the answer of a policy server, got more than "
+                    f"{self.url.geturl()}: expected the answer of a policy server, got more than "
                     f"{DEFAULT_LIMITS.body_bytes} bytes; check the URL"
                 )
             return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:
             self.close()
-            raise no_answer(self._url.geturl(), timeout_s) from error
+            raise no_answer(self.url.geturl(), timeout_s) from error
         except ssl.SSLError as error:
             # With TLS 1.3, the server checks the client's certificate only now.
             self.close()
-            raise tls_failure(self._url.geturl(), error) from error
+            raise tls_failure(self.url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
             self.close()
             reason = f"{type(error).__name__}: {error}"
-            raise connection_lost(self._url.geturl(), reason) from error
+            raise connection_lost(self.url.geturl(), reason) from error
 
-    def _open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
+    def open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
+        """Return the connection, and connect if it is closed.
+
+        Raises:
+            NoReplica: The address cannot be reached.
+        """
         if self._connection is not None and _closed_by_peer(self._connection[0].sock):
             self.close()
 
         if self._connection is None:
-            host, port = self._url.hostname or "", self._url.port
-            context = self._credentials.context(self._url.geturl())
+            host, port = self.url.hostname or "", self.url.port
+            context = self._credentials.context(self.url.geturl())
             if context is None:
                 connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
             else:
@@ -216,12 +296,29 @@ class HttpTransport:
             try:
                 connection.connect()
             except ssl.SSLError as error:
-                raise tls_failure(self._url.geturl(), error) from error
+                raise tls_failure(self.url.geturl(), error) from error
             except OSError as error:
-                raise no_replica(self._url.geturl(), error) from error
+                raise no_replica(self.url.geturl(), error) from error
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._poller = select.poll()
+            self._poller.register(connection.sock, select.POLLIN)
             self._connection = connection, DeadlineSocket.install(connection)
         return self._connection
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._connection is not None:
+            connection, _ = self._connection
+            connection.close()
+            self._connection = None
+
+    def _await_answer(self, sock: socket.socket, deadline: float) -> None:
+        """Wait for the first byte of an answer, and poll for it at first if the last one was
+        immediate.
+        """
+        begun = time.perf_counter()
+        await_answer(self._poller, sock, begun + (SPIN_S if self._answers_fast else 0.0), deadline)
+        self._answers_fast = time.perf_counter() - begun < FAST_S
 
 
 def no_replica(url: str, error: Exception) -> NoReplica:

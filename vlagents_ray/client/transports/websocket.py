@@ -33,6 +33,7 @@ from vlagents_ray.client.credentials import (
     tls_failure,
 )
 from vlagents_ray.client.transports.base import (
+    DIRECT_S,
     FAST_S,
     SPIN_S,
     CodecChoice,
@@ -68,7 +69,6 @@ logger = logging.getLogger(__name__)
 # restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
-_DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the packets
 _READ_BYTES = 256 * 1024
 # The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
 _MAX_PIECES = 64
@@ -380,7 +380,7 @@ class WebSocketTransport:
         if self._address is None or self._unreachable:
             return None
         try:
-            limit_s = min(timeout_s, _DIRECT_S)
+            limit_s = min(timeout_s, DIRECT_S)
             return Stream(
                 self._base,
                 self._address.port,

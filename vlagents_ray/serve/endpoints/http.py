@@ -51,6 +51,7 @@ def build_http_app(
     limits: messages.MessageLimits,
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
     more: Sequence[BaseRoute] = (),
+    direct: messages.StreamAddress | None = None,
 ) -> Starlette:
     """Build the ASGI application of a replica.
 
@@ -62,8 +63,10 @@ def build_http_app(
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         more: The routes of dialects and of parts, see `vlagents_ray.serve.dialects` and
             `vlagents_ray.serve.replica.part`.
+        direct: The replica's own port, which answers to reset and act name; None if clients of this
+            application may not use it.
     """
-    server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
+    server = _HttpEndpoint(engine, metadata, limits, machine_metadata, direct)
 
     app = Starlette(
         routes=[
@@ -90,6 +93,7 @@ class _HttpEndpoint:
     metadata: Callable[[], dict[str, Any]]
     limits: messages.MessageLimits
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None
+    direct: messages.StreamAddress | None
 
     async def health(self, http: HttpRequest) -> Response:
         """Reply whether the policy is ready, or its step of loading, and nothing else: this path
@@ -158,6 +162,8 @@ class _HttpEndpoint:
 
                 await sender.ask(incoming, decoded, admission)
                 response = http_messages.response_to(incoming, headers)
+                if self.direct is not None and op != "close":
+                    http_messages.add_link(response, self.direct, op, headers)
                 stats.record(incoming)
             except ClientDisconnect:
                 stats.record_failure(incoming, "disconnected")

@@ -60,6 +60,10 @@ END_OF_HEAD = b"\r\n\r\n"
 _DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
 # Larger forms are read on another thread, since finding the end of each part takes time.
 _INLINE_FORM_BYTES = 2**20
+# Maximum number of bytes of a body with chunks that are read at once, as each chunk costs as much
+# as a kilobyte; and a number of chunks above which a body has to have larger ones.
+_CHUNKED_BYTES = 16 * 1024
+_CHUNK_BYTES, _CHUNKS = 1024, 256
 _MOST_REFUSED_S = 1.0  # maximum time for which the refusal of a first request is delayed
 _REFUSED = "its first request is refused"  # a further reason for not polling a connection
 _CONTINUE = b"HTTP/1.1 100 Continue\r\n\r\n"
@@ -110,8 +114,8 @@ class _Reading:
 
     def __init__(self) -> None:
         self.head = HttpHead()
-        self.body: list[bytes] = []  # parts of a chunked body
-        self.size = 0  # number of bytes in them
+        self.body = bytearray()  # received part of a chunked body
+        self.chunks = 0  # number of its chunks
         self.has_head = False  # whether the head is complete
         self.is_complete = False
         self.has_next = False  # whether bytes of another request followed
@@ -134,8 +138,10 @@ class _Reading:
 
     def on_body(self, data: bytes) -> None:
         if not self.is_complete:
-            self.body.append(data)
-            self.size += len(data)
+            self.body += data
+
+    def on_chunk_header(self) -> None:
+        self.chunks += 1
 
     def on_message_complete(self) -> None:
         self.is_complete = True
@@ -275,7 +281,7 @@ class HttpConnection(MessageConnection):
     def _bytes_to_read(self) -> int:
         if self._reading is None:
             return head_bytes(self._connection, self._head)
-        return READ_BYTES if self._left < 0 else min(self._left, READ_BYTES)
+        return _CHUNKED_BYTES if self._left < 0 else min(self._left, READ_BYTES)
 
     def _receive_bytes(self, data: bytes | memoryview) -> bool:
         if not data:
@@ -296,10 +302,10 @@ class HttpConnection(MessageConnection):
     def _receive_head(self, data: bytes) -> None:
         """Process bytes of a head."""
         self._head += data
-        is_complete = self._head.endswith(END_OF_HEAD)
-        if is_complete or len(self._head) > HEAD_BYTES:
+        is_too_long = len(self._head) > HEAD_BYTES
+        if is_too_long or self._head.endswith(END_OF_HEAD):
             head, self._head = self._head, b""
-            self.begin(head if is_complete else b"")
+            self.begin(b"" if is_too_long else head)
 
     def begin(self, head: bytes) -> None:
         """Serve a request whose whole head has arrived; without bytes, refuse a head that is too
@@ -437,14 +443,21 @@ class HttpConnection(MessageConnection):
                 self._end_request(wrong)
                 return
             reading.has_next = True
-        self._size = reading.size
+        self._size = len(reading.body)
         limit = self._limits.body_bytes
         if self._size > limit:
             self._end_request(MessageTooLarge(f"body: over {limit} bytes, the limit"))
+        elif reading.chunks > _CHUNKS + self._size // _CHUNK_BYTES:
+            self._end_request(
+                MalformedMessage(
+                    f"body: expected chunks of {_CHUNK_BYTES} bytes and more, got "
+                    f"{reading.chunks} chunks with {self._size} bytes; send a content-length"
+                )
+            )
         elif reading.is_complete:
             # The next request has been read partly; its client sends it again.
             reading.head.is_kept = reading.head.is_kept and not reading.has_next
-            self._parts = reading.body
+            self._parts = [bytes(reading.body)]
             self._complete()
 
     def _end_request(self, error: VLAgentsError) -> None:

@@ -8,6 +8,7 @@ import base64
 import hashlib
 import logging
 import math
+import re
 import sys
 import uuid
 from collections.abc import Callable, Mapping, Sequence
@@ -47,6 +48,7 @@ from vlagents_ray.protocol.messages import (
     MessageLimits,
     Op,
     Request,
+    StreamAddress,
     is_name,
 )
 from vlagents_ray.serve.endpoints import answers
@@ -59,6 +61,8 @@ logger = logging.getLogger(__name__)
 LONG_BYTES = 512 * 1024
 FORM_TYPE = "multipart/form-data"
 _POLICY_VIOLATION = 1008  # WebSocket close code
+# A host name or an address, before the port in a `host` header.
+_HOST = re.compile(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]")
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
 
@@ -442,6 +446,18 @@ def response_to(message: IncomingMessage, headers: Mapping[str, str]) -> Respons
     step_header = {} if step is None else {STEP_HEADER: str(step)}
     document = answers.as_document(message)
     return Response(document, headers=step_header, media_type="application/json")
+
+
+def add_link(response: Response, direct: StreamAddress, op: Op, headers: Mapping[str, str]) -> None:
+    """Add a header with the address of the same operation at the replica's own port.
+
+    The reference has no scheme, so that a client behind an outer proxy with TLS does not send its
+    key in plain text (RFC 8288, RFC 3986, 4.2). There is no header if the request names no host.
+    """
+    host = _HOST.match(headers.get("host", ""))
+    if host is not None:
+        address = f"//{host[0]}:{direct.port}{direct.path}/{op}"
+        response.headers["link"] = f'<{address}>; rel="alternate"'
 
 
 def public_problem(error: Exception, operation: str, request_id: str) -> VLAgentsError:

@@ -244,13 +244,13 @@ class PortConnection(WebSocketConnection):
             self.disconnect()
             return False
         self._head += data
-        is_complete = self._head.endswith(END_OF_HEAD)
-        if not is_complete and len(self._head) <= HEAD_BYTES:
+        is_too_long = len(self._head) > HEAD_BYTES
+        if not (is_too_long or self._head.endswith(END_OF_HEAD)):
             return False
 
         head, self._head = self._head, b""
-        if not is_complete or not _HANDSHAKE.search(head):
-            self._server.serve_http(self, self._connection, head if is_complete else b"")
+        if is_too_long or not _HANDSHAKE.search(head):
+            self._server.serve_http(self, self._connection, b"" if is_too_long else head)
         elif not self._accept_handshake(head):
             self._refuse_handshake()
         return False

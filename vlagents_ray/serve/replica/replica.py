@@ -21,7 +21,13 @@ from vlagents_ray.client.transports.serve_handle import ClientApi
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import GPU_SHARE, VISIBLE
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, MessageLimits, boot_id
+from vlagents_ray.protocol.messages import (
+    PROTOCOL_VERSION,
+    SERVERS_MACHINE,
+    MessageLimits,
+    StreamAddress,
+    boot_id,
+)
 from vlagents_ray.ray_tools.private import gpus_here, http_options, replica_is_ending
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
@@ -242,7 +248,12 @@ class PolicyReplica(ClientApi, SiblingApi):
             *self._parts.routes(),
         ]
         inside = build_http_app(
-            self._engine, self.metadata, self._limits, self._metadata_for_machine, more
+            self._engine,
+            self.metadata,
+            self._limits,
+            self._metadata_for_machine,
+            more,
+            self._direct_address(),
         )
         access = AccessMiddleware(
             inside,
@@ -259,6 +270,13 @@ class PolicyReplica(ClientApi, SiblingApi):
         direct = DirectRequests(access)
         set_for_this_replica(direct)
         return direct
+
+    def _direct_address(self) -> StreamAddress | None:
+        """Return the address of this replica's own port for clients of the server's port; None if
+        the server's port is encrypted, since the own one is not.
+        """
+        is_encrypted = http_options().ssl_certfile is not None
+        return None if self._stream is None or is_encrypted else self._stream.address
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""

@@ -1,0 +1,442 @@
+"""HTTP at a replica's own port: what is special there. tests/golden has the bytes of requests and
+answers, which are those of the server's port.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from asgi_server import served
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.http import HttpTransport
+from vlagents_ray.images import jpeg_png
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits, Request, StreamAddress
+from vlagents_ray.serve import periodic
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.settings import EngineSettings
+
+ANSWER_S = 20.0
+SLOW_S = 0.4
+
+
+class Acts(list[int]):
+    """Of all sessions together."""
+
+
+class Policy(Agent):
+    """Counts its acts, and waits in them if it is told to."""
+
+    def __init__(self) -> None:
+        self.acts = Acts()
+        self.acting, self.may_act = threading.Event(), threading.Event()
+        self.may_act.set()
+
+    def shared_objects(self) -> list[object]:
+        return [self.acts, self.acting, self.may_act]
+
+    def act(self, obs: Obs) -> Act:
+        self.acting.set()
+        self.may_act.wait(ANSWER_S)
+        self.acts.append(1)
+        return Act(np.zeros(2, np.float32))
+
+
+@dataclass
+class Replica:
+    engine: Engine
+    policy: Policy
+    own: WebSocketServer
+    known: ChangingKeys
+
+    def request(self, op: str = "act", body: bytes = b"{}", *headers: str, **more: Any) -> bytes:
+        """A request in JSON, to a path of the replica's own port by default."""
+        path = more.get("path", f"{self.own.path}/{op}")
+        lines = [
+            f"{more.get('method', 'POST')} {path} HTTP/{more.get('version', '1.1')}",
+            "Host: 127.0.0.1",
+            "x-session-id: robot-1",
+            "content-type: application/json",
+            *headers,
+        ]
+        if more.get("length", True):
+            lines.append(f"content-length: {len(body)}")
+        return "\r\n".join([*lines, "", ""]).encode() + body
+
+    def connect(self) -> Client:
+        return Client(self.own.address.port)
+
+
+class Client:
+    """A connection that reads one answer after the other."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
+        self._file = self.socket.makefile("rb")
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self.socket.close()
+
+    def ask(self, *parts: bytes) -> tuple[int, dict[str, str], bytes]:
+        for part in parts:
+            self.socket.sendall(part)
+        return self.answer()
+
+    def answer(self, *, has_body: bool = True) -> tuple[int, dict[str, str], bytes]:
+        """Return the status, the headers and the body of the next answer."""
+        status = int(self._file.readline().split()[1])
+        lines = iter(self._file.readline, b"\r\n")
+        pairs = [line.decode().strip().split(": ", 1) for line in lines]
+        headers = {name.lower(): value for name, value in pairs}
+        body = self._file.read(int(headers["content-length"])) if has_body else b""
+        return status, headers, body
+
+    def is_ended(self) -> bool:
+        """Return whether the server ends the connection, within a while."""
+        with contextlib.suppress(ConnectionError):
+            return self._file.read(1) == b""
+        return True
+
+
+def code_of(body: bytes) -> str:
+    code: str = json.loads(body)["code"]
+    return code
+
+
+@contextlib.contextmanager
+def replica(*, keyed: bool = False, slow_s: float = 60.0, **limits: int) -> Iterator[Replica]:
+    policy, known = Policy(), ChangingKeys()
+    engine = Engine(policy, EngineSettings(session_limit=4))
+    admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
+    own = WebSocketServer(
+        engine, MessageLimits(**limits), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=60.0
+    )
+    own.open()
+    engine.start()
+    try:
+        yield Replica(engine, policy, own, known)
+    finally:
+        policy.may_act.set()
+        engine.close()
+        own.close()
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    monkeypatch.setattr(periodic.each_half_second, "_period_s", 0.02)
+
+
+@pytest.fixture
+def served_replica() -> Iterator[Replica]:
+    with replica() as one:
+        yield one
+
+
+def test_a_connection_serves_one_request_after_the_other(served_replica: Replica) -> None:
+    with served_replica.connect() as client:
+        for op in ("reset", "act", "act", "close"):
+            status, headers, body = client.ask(served_replica.request(op))
+            assert (status, headers["content-type"]) == (200, "application/json"), body
+            assert headers["x-request-id"]
+            assert "connection" not in headers
+        assert len(served_replica.own._clients) == 1
+    wait_for(lambda: not served_replica.own._clients)
+
+
+def test_requests_that_are_sent_ahead_are_answered_in_order(served_replica: Replica) -> None:
+    ids = [f"x-request-id: ahead-{number}" for number in range(40)]
+    requests = [served_replica.request("reset")]
+    requests += [served_replica.request("act", b"{}", name) for name in ids]
+    with served_replica.connect() as client:
+        client.socket.sendall(b"".join(requests))
+        answers = [client.answer() for _ in requests]
+    assert [headers["x-request-id"] for _, headers, _ in answers[1:]] == [
+        name.partition(": ")[2] for name in ids
+    ]
+    assert {status for status, _, _ in answers} == {200}
+
+
+@pytest.mark.parametrize(
+    "chunks", [[b"{}"], [b"{", b"}"], [b'{"info": {"a": "', b"b" * 99, b'"}}']]
+)
+def test_a_body_may_have_chunks(served_replica: Replica, chunks: list[bytes]) -> None:
+    framed = [f"{len(chunk):x}\r\n".encode() + chunk + b"\r\n" for chunk in chunks]
+    head = served_replica.request("reset", b"", "transfer-encoding: chunked", length=False)
+    with served_replica.connect() as client:
+        for _ in range(2):
+            status, _, body = client.ask(head, *framed, b"0\r\n\r\n")
+            assert status == 200, body
+
+
+def test_many_small_chunks_end_their_connection(served_replica: Replica) -> None:
+    head = served_replica.request("reset", b"", "transfer-encoding: chunked", length=False)
+    with served_replica.connect() as client:
+        status, headers, body = client.ask(head + b"1\r\nx\r\n" * 2000)
+        assert (status, code_of(body), headers["connection"]) == (400, "malformed", "close")
+        assert client.is_ended()
+
+
+def test_a_body_is_sent_after_100_continue(served_replica: Replica) -> None:
+    head = served_replica.request("reset", b"{}", "Expect: 100-continue")[:-2]
+    with served_replica.connect() as client:
+        client.socket.sendall(head)
+        assert client.answer(has_body=False)[0] == 100
+        assert client.ask(b"{}")[0] == 200
+
+
+def test_a_large_form_is_read_on_another_thread(served_replica: Replica) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (700, 700, 3), np.uint8)
+    head = '--edge\r\nContent-Disposition: form-data; name="{}"{}\r\n\r\n'
+    form = b"".join(
+        [
+            head.format("obs", "").encode() + b"{}\r\n",
+            head.format("cameras.front", '; filename="x"').encode(),
+            jpeg_png.encode_png(pixels) + b"\r\n--edge--\r\n",
+        ]
+    )
+    assert len(form) > 2**20
+    request = served_replica.request("reset", form).replace(
+        b"application/json", b"multipart/form-data; boundary=edge"
+    )
+    with served_replica.connect() as client:
+        status, _, body = client.ask(request)
+        assert status == 200, body
+        assert client.ask(served_replica.request("close"))[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "code", "is_kept"),
+    [
+        ({"method": "GET"}, 405, "malformed", True),
+        ({"method": "PUT"}, 405, "malformed", True),
+        ({"path": "/v1/act"}, 404, "unknown_app", False),
+        ({"path": "/"}, 404, "unknown_app", False),
+        ({"path": "{own}"}, 404, "unknown_app", False),
+        ({"path": "{own}/observe"}, 404, "unknown_app", False),
+        ({"path": "{own}/act?a=b"}, 404, "unknown_session", True),
+        ({"path": "http://127.0.0.1{own}/act"}, 404, "unknown_session", True),
+        ({"version": "1.0"}, 404, "unknown_session", False),
+        ({"header": "connection: close"}, 404, "unknown_session", False),
+        ({"header": "upgrade: h2c\r\nconnection: upgrade"}, 404, "unknown_session", True),
+        ({"header": "content-length: 2"}, 400, "malformed", False),
+        ({"header": "transfer-encoding: chunked"}, 400, "malformed", False),
+        ({"header": "a: " + "b" * 20_000}, 431, "malformed", False),
+        ({"header": "host: evil.example"}, 403, "forbidden", False),
+        ({"header": "origin: http://evil.example"}, 403, "forbidden", False),
+        ({"body": b"x" * 2_000_000}, 413, "too_large", False),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_other_requests_have_the_answers_of_the_servers_port(
+    changes: dict[str, Any], status: int, code: str, is_kept: bool
+) -> None:
+    with replica(body_bytes=1_000_000) as one, one.connect() as client:
+        more = {**changes}
+        header, body = more.pop("header", "a: b"), more.pop("body", b"{}")
+        if "path" in more:
+            more["path"] = more["path"].replace("{own}", one.own.path)
+        got, headers, content = client.ask(one.request("act", body, header, **more))
+        assert (got, headers["content-type"]) == (status, "application/problem+json"), content
+        assert code_of(content) == code
+        assert (headers.get("connection") != "close") == is_kept
+        if status == 405:
+            assert headers["allow"] == "POST"
+        if is_kept:
+            assert client.ask(one.request("reset"))[0] == 200
+        else:
+            assert client.is_ended()
+
+
+def test_the_answer_to_head_has_no_body(served_replica: Replica) -> None:
+    with served_replica.connect() as client:
+        client.socket.sendall(served_replica.request("act", b"", method="HEAD"))
+        assert client.answer(has_body=False)[0] == 405
+        assert client.ask(served_replica.request("reset"))[0] == 200
+
+
+def test_http_1_0_may_keep_its_connection(served_replica: Replica) -> None:
+    request = served_replica.request("reset", b"{}", "connection: keep-alive", version="1.0")
+    with served_replica.connect() as client:
+        for _ in range(2):
+            status, headers, _ = client.ask(request)
+            assert (status, headers["connection"]) == (200, "keep-alive")
+
+
+@pytest.mark.parametrize("sent", [b"", b"POST ", "half a body"], ids=str)
+def test_a_request_that_does_not_arrive_is_answered_408(
+    sent: bytes | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with replica(slow_s=SLOW_S) as one, one.connect() as client:
+        assert client.ask(one.request("reset"))[0] == 200
+        part = one.request("act", b"{}")[:-1] if isinstance(sent, str) else sent
+        begun = time.monotonic()
+        client.socket.sendall(part)
+        if not part:  # an idle connection is no request
+            time.sleep(2 * SLOW_S)
+            assert client.ask(one.request("act"))[0] == 200
+            return
+        status, headers, body = client.answer()
+        assert time.monotonic() - begun >= SLOW_S
+        assert (status, code_of(body), headers["connection"]) == (408, "malformed", "close")
+        assert client.is_ended()
+
+
+def test_a_request_whose_client_has_left_is_not_acted_on(served_replica: Replica) -> None:
+    policy = served_replica.policy
+    with served_replica.connect() as busy, served_replica.connect() as leaver:
+        assert busy.ask(served_replica.request("reset"))[0] == 200
+        other = served_replica.request("reset").replace(b"robot-1", b"robot-2")
+        assert leaver.ask(other)[0] == 200
+        policy.may_act.clear()
+        busy.socket.sendall(served_replica.request("act"))
+        assert policy.acting.wait(ANSWER_S)
+        leaver.socket.sendall(other.replace(b"/reset ", b"/act "))
+        time.sleep(0.1)
+        leaver.__exit__()
+        time.sleep(0.3)
+        policy.may_act.set()
+        assert busy.answer()[0] == 200
+        assert busy.ask(served_replica.request("act"))[0] == 200
+    assert len(policy.acts) == 2
+
+
+def test_connections_count_for_the_limit_of_sessions(served_replica: Replica) -> None:
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(served_replica.connect()) for _ in range(5)]
+        answers = [client.ask(served_replica.request("reset")) for client in clients]
+        assert [status for status, _, _ in answers] == [200] * 4 + [503]
+        assert clients[-1].is_ended()
+
+
+def test_a_key_is_checked_with_each_request() -> None:
+    with replica(keyed=True) as one, one.connect() as client:
+        one.known.add("arm")
+        shown = "authorization: Bearer vlr_arm"
+        assert client.ask(one.request("reset", b"{}", shown))[0] == 200
+        status, headers, body = client.ask(one.request("act"))
+        assert (status, code_of(body)) == (401, "unauthorized")
+        assert headers["www-authenticate"].startswith("Bearer")
+        assert client.is_ended()
+    wait_for(lambda: not one.own._clients)
+
+
+def test_a_connection_ends_with_its_key() -> None:
+    with replica(keyed=True) as one, one.connect() as client:
+        one.known.add("arm")
+        assert client.ask(one.request("reset", b"{}", "authorization: Bearer vlr_arm"))[0] == 200
+        one.known.add("arm", revoked=True)
+        assert client.is_ended()
+
+
+def test_a_key_over_its_rate_is_answered_429_and_keeps_its_connection() -> None:
+    with replica(keyed=True) as one, one.connect() as client:
+        one.known.add("arm", rate=2)
+        request = one.request("reset", b"{}", "authorization: Bearer vlr_arm")
+        statuses = []
+        while 429 not in statuses:
+            status, headers, _ = client.ask(request)
+            statuses.append(status)
+            assert len(statuses) < 50
+        assert headers["retry-after"]
+        assert set(statuses[:-1]) == {200}
+        wait_for(lambda: client.ask(request)[0] == 200)
+
+
+def test_a_replica_that_drains_ends_the_connection_after_the_answer(
+    served_replica: Replica,
+) -> None:
+    with served_replica.connect() as client:
+        assert client.ask(served_replica.request("reset"))[0] == 200
+        served_replica.engine.drain_list.drain()
+        status, headers, _ = client.ask(served_replica.request("act"))
+        assert (status, headers["connection"]) == (200, "close")
+        assert client.is_ended()
+
+
+@contextlib.contextmanager
+def at_both_ports(one: Replica, address: StreamAddress | None) -> Iterator[str]:
+    """The URL of the server's port of a replica, which names that address of its own one."""
+    metadata = {
+        "protocol": PROTOCOL_VERSION,
+        "contract": None,
+        "local": None,
+        "stream": address and {"port": address.port, "path": address.path},
+    }
+    inside = build_http_app(one.engine, lambda: metadata, one.own.limits, direct=address)
+    with served(AccessMiddleware(inside, None, "app")) as port:
+        yield f"http://127.0.0.1:{port}"
+
+
+def test_answers_at_the_servers_port_name_the_own_port(served_replica: Replica) -> None:
+    with at_both_ports(served_replica, served_replica.own.address) as url:
+        port = int(url.rpartition(":")[2])
+        with Client(port) as client:
+            _, headers, _ = client.ask(served_replica.request("reset", path="/v1/reset"))
+            link = re.fullmatch(
+                r'<//127\.0\.0\.1:(\d+)(/.*)/reset>; rel="alternate"', headers["link"]
+            )
+            assert link is not None
+            assert (int(link[1]), link[2]) == (
+                served_replica.own.address.port,
+                served_replica.own.path,
+            )
+            _, headers, _ = client.ask(served_replica.request("close", path="/v1/close"))
+            assert "link" not in headers
+        # The session is the same at both.
+        with Client(port) as client:
+            assert client.ask(served_replica.request("reset", path="/v1/reset"))[0] == 200
+        with served_replica.connect() as client:
+            assert client.ask(served_replica.request("act"))[0] == 200
+
+
+def test_the_client_uses_the_own_port_and_the_servers_port_if_that_is_gone(
+    served_replica: Replica,
+) -> None:
+    with at_both_ports(served_replica, served_replica.own.address) as url:
+        with RemoteAgent(url, transport="http") as agent:
+            agent.reset(Obs(), "push")
+            agent.act(Obs())
+            assert len(served_replica.own._clients) == 1
+            served_replica.own._listener.close()
+            served_replica.own.close_overdue()
+            for client in list(served_replica.own._clients):
+                client.end("the test ends it")
+            wait_for(lambda: not served_replica.own._clients)
+            agent.act(Obs())
+        assert len(served_replica.policy.acts) == 2
+
+
+def test_the_client_uses_the_servers_port_if_another_server_has_the_own_one(
+    served_replica: Replica,
+) -> None:
+    wrong = StreamAddress(served_replica.own.address.port, "/v1/stream/of-another-server")
+    with at_both_ports(served_replica, wrong) as url:
+        transport = HttpTransport(url, CodecChoice("raw"))
+        transport.connect(ANSWER_S)
+        [reply] = transport.call([Request("reset", Obs())], ANSWER_S)
+        assert reply.error is None
+        transport.close()
