@@ -384,16 +384,24 @@ class WebSocketClient(LeavingClient):
 
 class HttpClient(LeavingClient):
     def __init__(
-        self, server: StoppableServer, path: str, document: Callable[[int], bytes], kind: str
+        self,
+        server: StoppableServer,
+        path: str,
+        document: Callable[[int], bytes],
+        kind: str,
+        at_own_port: bool = False,
     ) -> None:
         super().__init__(server)
-        self._path, self._document = path, document
+        port, base = server.port, "/v1"
+        if at_own_port:
+            port, base = server.own.address.port, server.own.address.path
+        self._path, self._document = path.replace("/v1", base), document
         self._headers = {"x-session-id": "robot-1", "content-type": kind}
-        self._connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=BOUND_S)
+        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=BOUND_S)
         server.stack.callback(self._connection.close)
         if path == "/v1/act":
             reset = encode_requests([Request("reset", Obs({"front": image(2)}))])
-            self._connection.request("POST", "/v1/reset", reset, self._headers)
+            self._connection.request("POST", f"{base}/reset", reset, self._headers)
             assert self._connection.getresponse().read()
         self.send(2)
         assert self.answer() == ACTED
@@ -642,6 +650,13 @@ CLIENTS: dict[str, Connect] = {
         path="/v1/act",
         document=partial(_frame, "act"),
         kind="application/x-vlagents-frame",
+    ),
+    "POST at the own port": partial(
+        HttpClient,
+        path="/v1/act",
+        document=partial(_frame, "act"),
+        kind="application/x-vlagents-frame",
+        at_own_port=True,
     ),
     "POST /act": partial(
         HttpClient,

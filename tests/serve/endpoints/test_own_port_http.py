@@ -305,25 +305,6 @@ def test_a_request_that_does_not_arrive_is_answered_408(
         assert client.is_ended()
 
 
-def test_a_request_whose_client_has_left_is_not_acted_on(served_replica: Replica) -> None:
-    policy = served_replica.policy
-    with served_replica.connect() as busy, served_replica.connect() as leaver:
-        assert busy.ask(served_replica.request("reset"))[0] == 200
-        other = served_replica.request("reset").replace(b"robot-1", b"robot-2")
-        assert leaver.ask(other)[0] == 200
-        policy.may_act.clear()
-        busy.socket.sendall(served_replica.request("act"))
-        assert policy.acting.wait(ANSWER_S)
-        leaver.socket.sendall(other.replace(b"/reset ", b"/act "))
-        time.sleep(0.1)
-        leaver.__exit__()
-        time.sleep(0.3)
-        policy.may_act.set()
-        assert busy.answer()[0] == 200
-        assert busy.ask(served_replica.request("act"))[0] == 200
-    assert len(policy.acts) == 2
-
-
 def test_connections_count_for_the_limit_of_sessions(served_replica: Replica) -> None:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(served_replica.connect()) for _ in range(5)]
@@ -440,3 +421,40 @@ def test_the_client_uses_the_servers_port_if_another_server_has_the_own_one(
         [reply] = transport.call([Request("reset", Obs())], ANSWER_S)
         assert reply.error is None
         transport.close()
+
+
+def test_a_session_at_the_own_port_continues_without_the_servers_port(
+    served_replica: Replica,
+) -> None:
+    with contextlib.ExitStack() as stack:
+        url = stack.enter_context(at_both_ports(served_replica, served_replica.own.address))
+        with RemoteAgent(url, transport="http") as agent:
+            agent.reset(Obs(), "push")
+            stack.close()
+            agent.act(Obs())
+
+
+@pytest.mark.parametrize(
+    "answer", [b"220 mail\r\n", b"HTTP/1.1 501 No\r\ncontent-length: 0\r\n\r\n"]
+)
+def test_the_client_uses_the_servers_port_if_a_strange_server_has_the_own_one(
+    served_replica: Replica, answer: bytes
+) -> None:
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+
+        def serve() -> None:
+            """Answer each connection in the same way, until the listener is closed."""
+            with contextlib.suppress(OSError):
+                while True:
+                    with listener.accept()[0] as connection:
+                        connection.recv(65536)
+                        connection.sendall(answer)
+
+        threading.Thread(target=serve, daemon=True).start()
+        strange = StreamAddress(listener.getsockname()[1], served_replica.own.path)
+        url = stack.enter_context(at_both_ports(served_replica, strange))
+        with RemoteAgent(url, transport="http", timeout_s=10) as agent:
+            agent.reset(Obs(), "push")
+            agent.act(Obs())
+        listener.shutdown(socket.SHUT_RDWR)

@@ -51,6 +51,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
+from vlagents_ray.protocol.json_messages import PROBLEM_TYPE
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     MACHINE_HEADER,
@@ -86,6 +87,7 @@ class HttpTransport:
         self._link = _Link(self._url, credentials)
         self._direct: _Link | None = None  # to the own port of the replica that answered
         self._unreachable = False  # whether this client cannot reach the replicas' own ports
+        self._has_answered = False  # whether an own port has answered
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata once it answers. This retries while it is not ready."""
@@ -208,15 +210,17 @@ class HttpTransport:
             self._set_direct(None)
             return None
 
-        answer = link.exchange("POST", f"/{op}", frame, headers, left_s(deadline))
-        status, kind, body = answer
-        if status in (404, 503):
-            error_type = type(refusal(status, kind, body))
-            # Another server has the port, or the replica takes no further connection.
-            if error_type in (UnknownApp, PolicyUnavailable, NoReplica):
-                self._set_direct(None)
-                return None
-        return answer
+        try:
+            answer = link.exchange("POST", f"/{op}", frame, headers, left_s(deadline))
+        except ConnectionLost:
+            # The port may belong to a server of another protocol.
+            self._unreachable = not self._has_answered
+            raise
+        if _is_executed(answer):
+            self._has_answered = True
+            return answer
+        self._set_direct(None)
+        return None
 
     def close(self) -> None:
         """Close the connections; the next one may reach another replica."""
@@ -319,6 +323,18 @@ class _Link:
         begun = time.perf_counter()
         await_answer(self._poller, sock, begun + (SPIN_S if self._answers_fast else 0.0), deadline)
         self._answers_fast = time.perf_counter() - begun < FAST_S
+
+
+def _is_executed(answer: tuple[int, str, bytes]) -> bool:
+    """Return whether a replica may have executed a request that got this answer at its own port.
+
+    Otherwise another server has the port, or the replica takes no further connection.
+    """
+    status, kind, _ = answer
+    if not kind.startswith((CONTENT_TYPE, PROBLEM_TYPE)):
+        return False
+    is_refused = status in (404, 503)
+    return not (is_refused and type(refusal(*answer)) in (UnknownApp, PolicyUnavailable))
 
 
 def no_replica(url: str, error: Exception) -> NoReplica:

@@ -14,10 +14,12 @@ from __future__ import annotations
 import http
 import socket
 import time
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import httptools
 from starlette.requests import Request as HttpRequest
@@ -35,13 +37,14 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import PRIORITY_HEADER, REQUEST_ID_HEADER, Budget, Op
-from vlagents_ray.serve.access.api_keys import Caller
+from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.connection import (
     INTERNAL_ERROR,
     LEAST_WAIT_S,
     POLICY_VIOLATION,
     SERVICE_RESTART,
+    PolledServer,
 )
 from vlagents_ray.serve.endpoints.message_connection import (
     READ_BYTES,
@@ -51,9 +54,6 @@ from vlagents_ray.serve.endpoints.message_connection import (
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import IncomingMessage
-
-if TYPE_CHECKING:
-    from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 
 HEAD_BYTES = 16 * 1024  # maximum size of a request's head
 END_OF_HEAD = b"\r\n\r\n"
@@ -211,6 +211,44 @@ def head_bytes(connection: socket.socket, received: bytes) -> int:
     return end + len(END_OF_HEAD) - len(overlap)
 
 
+class HttpServer(PolledServer[MessageConnection]):
+    """A server at whose port HTTP connections arrive."""
+
+    slow_s: float  # maximum time that a request may take to arrive, s
+    idle_s: float  # maximum time that a connection may be silent, s
+
+    @abstractmethod
+    def admit_request(
+        self, headers: Mapping[str, str], known: tuple[Identity, str | None] | None = None
+    ) -> tuple[Identity, str | None]:
+        """Return the owner of the key in the headers, and that key.
+
+        Args:
+            known: The result for the connection's last request, to be returned if the key is the
+                same. The caller then checks whether the key is still valid.
+
+        Raises:
+            Unauthorized: The key is missing, unknown, revoked or expired.
+            Forbidden: The key is for other applications, or the page is another site's.
+        """
+
+    @abstractmethod
+    def count_connection(self, client: MessageConnection, caller: Identity) -> None:
+        """Count the connection for its caller, and no longer as one whose caller is unknown.
+
+        Raises:
+            TooManyRequests: The key has as many connections as it may hold sessions, or is over its
+                rate.
+            PolicyUnavailable: The replica has as many connections as it may hold sessions.
+        """
+
+    @abstractmethod
+    def op_of(self, path: str) -> Op | None:
+        """Return the operation that a path names, below the unguessable path of this server; None
+        for any other path.
+        """
+
+
 class HttpConnection(MessageConnection):
     """One HTTP connection of the replica's own port.
 
@@ -219,7 +257,7 @@ class HttpConnection(MessageConnection):
 
     late_code = _TIMEOUT
 
-    def __init__(self, server: WebSocketServer, connection: socket.socket) -> None:
+    def __init__(self, server: HttpServer, connection: socket.socket) -> None:
         limits = server.limits
         super().__init__(
             server,
@@ -301,11 +339,19 @@ class HttpConnection(MessageConnection):
 
     def _receive_head(self, data: bytes) -> None:
         """Process bytes of a head."""
+        if not self._head:
+            self._request_id = ""
         self._head += data
         is_too_long = len(self._head) > HEAD_BYTES
         if is_too_long or self._head.endswith(END_OF_HEAD):
             head, self._head = self._head, b""
             self.begin(b"" if is_too_long else head)
+
+    def take_over(self, head: bytes) -> None:
+        """Serve the first request, whose head another object has read, as `begin` does; an
+        unexpected error ends this connection.
+        """
+        self._run(partial(self.begin, head))
 
     def begin(self, head: bytes) -> None:
         """Serve a request whose whole head has arrived; without bytes, refuse a head that is too
@@ -338,7 +384,7 @@ class HttpConnection(MessageConnection):
         """Charge the request to its key, and count the connection for that key.
 
         Raises:
-            VLAgentsError: The errors of `WebSocketServer.admit_request` and `count_connection`.
+            VLAgentsError: The errors of `HttpServer.admit_request` and `count_connection`.
         """
         known = None if self.caller is None else (self.caller, self._key)
         caller, key = self._server.admit_request(head.headers, known)
@@ -610,7 +656,9 @@ class HttpConnection(MessageConnection):
         if self._is_closed_here:
             return
         self._ended_at = time.monotonic()
-        head = self._answering or (self._reading and self._reading.head)
+        head = self._answering
+        if head is None and self._reading is not None:
+            head = self._reading.head
         if head is None and not self._head:
             self._out.send(b"", last=True)
             return

@@ -38,7 +38,6 @@ from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     Admit,
-    PolledServer,
     enable_timestamps,
     has_unread,
 )
@@ -46,6 +45,7 @@ from vlagents_ray.serve.endpoints.http_connection import (
     END_OF_HEAD,
     HEAD_BYTES,
     HttpConnection,
+    HttpServer,
     head_bytes,
 )
 from vlagents_ray.serve.endpoints.message_connection import MessageConnection
@@ -72,7 +72,7 @@ _KEEPALIVE = (
 )
 
 
-class WebSocketServer(PolledServer[MessageConnection]):
+class WebSocketServer(HttpServer):
     """Accepts WebSockets and HTTP connections at a port of the replica."""
 
     name: ClassVar[str] = "websocket"
@@ -136,16 +136,6 @@ class WebSocketServer(PolledServer[MessageConnection]):
     def admit_request(
         self, headers: Mapping[str, str], known: tuple[Identity, str | None] | None = None
     ) -> tuple[Identity, str | None]:
-        """Return the owner of the key in the headers, and that key.
-
-        Args:
-            known: The result for the connection's last request, to be returned if the key is the
-                same. The caller then checks whether the key is still valid.
-
-        Raises:
-            Unauthorized: The key is missing, unknown, revoked or expired.
-            Forbidden: The key is for other applications, or the page is another site's.
-        """
         if isinstance(self.admit, NoKey):
             require_own_page(headers, self._hosts)
             return self.admit, None
@@ -155,13 +145,6 @@ class WebSocketServer(PolledServer[MessageConnection]):
         return self.admit(token), token
 
     def count_connection(self, client: MessageConnection, caller: Identity) -> None:
-        """Count the connection for its caller, and no longer as one whose caller is unknown.
-
-        Raises:
-            TooManyRequests: The key has as many connections as it may hold sessions, or is over its
-                rate.
-            PolicyUnavailable: The replica has as many connections as it may hold sessions.
-        """
         connections = len(self._clients) - len(self._handshaking)
         if client in self._handshaking and connections >= self.engine.sessions.limit:
             raise PolicyUnavailable(
@@ -170,15 +153,12 @@ class WebSocketServer(PolledServer[MessageConnection]):
         if isinstance(caller, Caller):
             caller.require_unthrottled()
             caller.hold()
-            caller.note("let in by", self.name)
+            caller.note("let in by", "http" if isinstance(client, HttpConnection) else self.name)
         if isinstance(client.caller, Caller):
             client.caller.hold(-1)
         self._handshaking.pop(client, None)
 
     def op_of(self, path: str) -> messages.Op | None:
-        """Return the operation that a path of HTTP names, below the unguessable path of this
-        server; None for any other path.
-        """
         base, _, name = path.rpartition("/")
         is_known = secrets.compare_digest(base.encode(), self.path.encode())
         return next((op for op in messages.OPS if is_known and op == name), None)
@@ -190,7 +170,7 @@ class WebSocketServer(PolledServer[MessageConnection]):
         successor = HttpConnection(self, connection)
         client.replace_by(successor)
         self._handshaking[successor] = None
-        successor.begin(head)
+        successor.take_over(head)
 
     def remove(self, client: MessageConnection) -> None:
         """Remove a connection, possibly during its handshake."""
