@@ -252,7 +252,7 @@ class HttpServer(PolledServer[MessageConnection]):
 class HttpConnection(MessageConnection):
     """One HTTP connection of the replica's own port.
 
-    It is not polled by `watch`, but takes the place of the connection that has read its first head.
+    It takes the place of the connection that has read its first head.
     """
 
     late_code = _TIMEOUT

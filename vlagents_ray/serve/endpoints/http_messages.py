@@ -14,7 +14,7 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request as HttpRequest
@@ -97,8 +97,15 @@ async def read_requests(
 
 def body_of(op: Op, http: HttpRequest, data: bytes, admission: MessageAdmission, name: str) -> Body:
     """Return a body whose bytes have all arrived, as `receive_body` does."""
+    content_type = content_type_of(headers_of(http.scope))
+    if content_type != FORM_TYPE and (op != "close" or content_type):
+        _require_uncompressed(http)
+        if data:
+            admission.receive(len(data))
+        return _body(op, http, admission.limits, name, *_decoder(op, content_type, data))
 
     async def receive() -> Message:
+        """Return the whole body."""
         return {"type": "http.request", "body": data, "more_body": False}
 
     receiving = receive_body(op, HttpRequest(http.scope, receive), admission, name)
@@ -117,30 +124,42 @@ async def receive_body(op: Op, http: HttpRequest, admission: MessageAdmission, n
     `read_requests`.
     """
     headers = headers_of(http.scope)
-    limits = admission.limits
     content_type = content_type_of(headers)
-    require_length(headers, limits)
+    require_length(headers, admission.limits)
 
-    read: Callable[[Budget], Request | Decoded]
-    is_long = False
     if content_type == FORM_TYPE:
         document, files = await _receive_form(http, admission)
-        read = partial(request_from_parts, op, document, files)
+        read: _Decoder = partial(request_from_parts, op, document, files)
         is_long = len(document) > LONG_BYTES
     elif op == "close" and not content_type:
-        read = _bare_close
+        read, is_long = _bare_close, False
     else:
-        body = await read_body(http, admission)
-        if content_type == CONTENT_TYPE:
-            read = partial(decode_requests, body)
-        elif content_type == "application/json":
-            read = partial(request_from_parts, op, body, {})
-            is_long = len(body) > LONG_BYTES
-        else:
-            raise MalformedMessage(
-                f"content-type: got {content_type or 'none'!r}, want multipart/form-data, "
-                f"application/json or {CONTENT_TYPE}"
-            )
+        read, is_long = _decoder(op, content_type, await read_body(http, admission))
+    return _body(op, http, admission.limits, name, read, is_long)
+
+
+_Decoder: TypeAlias = Callable[[Budget], Request | Decoded]
+
+
+def _decoder(op: Op, content_type: str, data: bytes) -> tuple[_Decoder, bool]:
+    """Return the decoder of a body that is no form, and whether that is long."""
+    if data.startswith(_GZIP):
+        raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
+    if content_type == CONTENT_TYPE:
+        return partial(decode_requests, data), False
+    if content_type == "application/json":
+        return partial(request_from_parts, op, data, {}), len(data) > LONG_BYTES
+    raise MalformedMessage(
+        f"content-type: got {content_type or 'none'!r}, want multipart/form-data, "
+        f"application/json or {CONTENT_TYPE}"
+    )
+
+
+def _body(
+    op: Op, http: HttpRequest, limits: MessageLimits, name: str, read: _Decoder, is_long: bool
+) -> Body:
+    """Return a body whose requests also have what the headers say."""
+    headers = headers_of(http.scope)
 
     def read_with_headers(budget: Budget) -> Decoded:
         """Decode the requests, and add to them what the headers say."""
