@@ -31,7 +31,7 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.access.key_store import new_key, revoke
-from vlagents_ray.serve.endpoints import access_middleware
+from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -224,7 +224,7 @@ def test_a_connection_without_a_right_key_gets_few_answers(
             answer = connection.getresponse()
             answer.read()
             assert answer.status in (401, 403)
-    assert time.monotonic() - begun >= 4 * access_middleware._REFUSAL_S
+    assert time.monotonic() - begun >= 4 * http_messages.REFUSAL_S
 
 
 @pytest.mark.parametrize("transport", ["http", "websocket", "auto"])

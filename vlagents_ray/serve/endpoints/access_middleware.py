@@ -40,6 +40,8 @@ from vlagents_ray.serve.endpoints.asgi_websocket import (
 from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
 from vlagents_ray.serve.endpoints.forwarded_websocket import ForwardedWebSocket, cancel_again
 from vlagents_ray.serve.endpoints.http_messages import (
+    DROPPED_BYTES,
+    REFUSAL_S,
     headers_of,
     problem_response,
     valid_request_id,
@@ -53,11 +55,6 @@ logger = logging.getLogger(__name__)
 _HEALTH = "/healthz"
 
 _TICK_S = 0.5  # period at which the time limit of an upload is checked
-_DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
-# Time before a caller without a right key is answered, s. Without it, eight connections that send
-# nothing but wrong keys double the time of a robot's act on two cores, and the bodies of their
-# requests take all of the bandwidth; a person with a wrong key does not notice it.
-_REFUSAL_S = 0.05
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _TIMEOUT = 408
 
@@ -187,12 +184,12 @@ async def _refuse(
     error: VLAgentsError, request_id: str, scope: Scope, receive: Receive, send: Send
 ) -> None:
     if isinstance(error, (Unauthorized, Forbidden)):
-        await asyncio.sleep(_REFUSAL_S)
+        await asyncio.sleep(REFUSAL_S)
 
     answer = problem_response(error, request_id)
     if isinstance(error, Unauthorized):
         answer.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
-    if scope["type"] == "http" and _has_body(scope, _DROPPED_BYTES):
+    if scope["type"] == "http" and _has_body(scope, DROPPED_BYTES):
         answer.headers["connection"] = "close"  # the body is not read, not even to discard it
 
     if scope["type"] == "websocket":

@@ -26,6 +26,7 @@ from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
 
 from vlagents_ray.errors import (
+    Forbidden,
     MalformedMessage,
     MessageTooLarge,
     Overloaded,
@@ -57,7 +58,6 @@ from vlagents_ray.serve.requests import IncomingMessage
 
 HEAD_BYTES = 16 * 1024  # maximum size of a request's head
 END_OF_HEAD = b"\r\n\r\n"
-_DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
 # Larger forms are read on another thread, since finding the end of each part takes time.
 _INLINE_FORM_BYTES = 2**20
 # Maximum number of bytes of a body with chunks that are read at once, as each chunk costs as much
@@ -65,7 +65,7 @@ _INLINE_FORM_BYTES = 2**20
 _CHUNKED_BYTES = 16 * 1024
 _CHUNK_BYTES, _CHUNKS = 1024, 256
 _MOST_REFUSED_S = 1.0  # maximum time for which the refusal of a first request is delayed
-_REFUSED = "its first request is refused"  # a further reason for not polling a connection
+_REFUSED = "its request is refused"  # a further reason for not polling a connection
 _CONTINUE = b"HTTP/1.1 100 Continue\r\n\r\n"
 _TIMEOUT, _HEAD_TOO_LARGE, _NOT_ALLOWED = 408, 431, 405
 _NO_PATH = (
@@ -402,11 +402,15 @@ class HttpConnection(MessageConnection):
             response.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
 
         answer = partial(self._answer_and_end, response, reading.head)
-        if not isinstance(error, TooManyRequests):
+        if isinstance(error, TooManyRequests):
+            if self.caller is not None:
+                self._refuse(reading, response)
+                return
+            wait_s = min(error.retry_after_s, _MOST_REFUSED_S)
+        elif isinstance(error, Unauthorized | Forbidden):
+            wait_s = http_messages.REFUSAL_S
+        else:
             answer()
-            return
-        if self.caller is not None:
-            self._refuse(reading, response)
             return
         # The delay bounds the rate of refusals.
         self._pause(_REFUSED)
@@ -416,7 +420,7 @@ class HttpConnection(MessageConnection):
             answer()
             self._resume(_REFUSED)
 
-        self._call_later(min(error.retry_after_s, _MOST_REFUSED_S), refuse)
+        self._call_later(wait_s, refuse)
 
     def _refusal_of(self, head: HttpHead) -> Response | None:
         """Return the response to a request that is refused by its head; None if it is served."""
@@ -440,7 +444,7 @@ class HttpConnection(MessageConnection):
         """
         head = reading.head
         is_known_path = self._server.op_of(head.path) is not None
-        is_short = not (head.is_chunked or head.waits or head.length > _DROPPED_BYTES)
+        is_short = not (head.is_chunked or head.waits or head.length > http_messages.DROPPED_BYTES)
         if not (is_short and is_known_path):
             self._message_count += 1
             self._answer_and_end(response, head)

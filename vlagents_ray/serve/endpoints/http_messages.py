@@ -59,6 +59,11 @@ logger = logging.getLogger(__name__)
 
 # Longer JSON or msgpack is decoded on another thread, to keep the event loop responsive.
 LONG_BYTES = 512 * 1024
+DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
+# Time before a caller without a right key is answered, s. Without it, eight connections that send
+# nothing but wrong keys double the time of a robot's act on two cores, and the bodies of their
+# requests take all of the bandwidth; a person with a wrong key does not notice it.
+REFUSAL_S = 0.05
 FORM_TYPE = "multipart/form-data"
 _POLICY_VIOLATION = 1008  # WebSocket close code
 # A host name or an address, before the port in a `host` header.
