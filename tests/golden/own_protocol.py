@@ -173,10 +173,10 @@ def episodes() -> Iterator[Trace]:
     held = [begin, asks(reset(), who="b"), Send("a", asked("wait")), server("is acting")]
     held.append(Send("b", act(deadline_ms=0.001)))  # over before any server gets to it
     name, later = "a deadline that is over", asks(act(deadline_ms=1e6), who="b")
-    yield from scenario(name, TOGETHER[1:4], *held, gets("b"), server("acts on"), gets("a"), later)
+    yield from scenario(name, TOGETHER[2:4], *held, gets("b"), server("acts on"), gets("a"), later)
     yield from scenario(
         name,
-        (STREAMS[0], HTTP[1], *LOCAL[:1]),
+        (*STREAMS, HTTP[1], *LOCAL[:1]),
         *held,
         server("acts on"),
         gets("a"),

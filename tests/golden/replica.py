@@ -125,7 +125,7 @@ class Policy(Agent):
         asked = obs.info.get("asked", self.instruction)
         if asked == "wait":
             self.gate.acting.set()
-            self.gate.opened.wait(20)
+            assert self.gate.opened.wait(20), "the policy was not let on"
         if asked == "fail":
             fail()
         self.observe(obs)

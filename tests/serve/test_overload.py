@@ -841,6 +841,7 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     with pytest.raises(TooManyRequests):
         caller.admit()
     assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
+    replica.known.change(visitor.name, rate=None)
     client.close()
     # What they hold is read, which takes memory.
     wait_for(lambda: visitor.name not in replica.known.keys._connections)

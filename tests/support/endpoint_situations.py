@@ -206,8 +206,7 @@ def _episode_steps(
 ) -> dict[str, list[Steps]]:
     """The situations that every endpoint of our own protocol has.
 
-    `polled` is whether the thread of the policy reads the connections, so that a message waits
-    while the policy acts.
+    `polled` is whether the policy's thread alone answers what is late: when it is free again.
     """
 
     def asked_by(who: str, *requests: Request) -> list[Steps]:
@@ -235,7 +234,7 @@ def _episode_steps(
     }
 
 
-def _websocket(name: str, line: str, path: str, *, polled: bool) -> Endpoint:
+def _websocket(name: str, line: str, path: str) -> Endpoint:
     def say(_who: str, request: Request) -> tuple[bytes]:
         return (websocket_frame(encode_requests([request])),)
 
@@ -244,7 +243,7 @@ def _websocket(name: str, line: str, path: str, *, polled: bool) -> Endpoint:
 
     frame = say("a", act())[0]
     half = (frame[: len(frame) // 2],)
-    situations = _episode_steps(say, connect, polled=polled) | {
+    situations = _episode_steps(say, connect, polled=True) | {
         "wrong key": [
             [connect("a", WRONG_KEY), finishes()],
             [connect("b"), finishes("b")],
@@ -401,8 +400,8 @@ def _form_body(request: Request) -> tuple[str, bytes]:
 CORE = (
     _unix("shared_memory", "shared memory"),
     _unix("plasma", "plasma"),
-    _websocket("own_port", "own port", "{path}", polled=True),
-    _websocket("v1_stream", "/v1/stream", "/v1/stream", polled=False),
+    _websocket("own_port", "own port", "{path}"),
+    _websocket("v1_stream", "/v1/stream", "/v1/stream"),
     _handle("serve_handle"),
     _http("own_port_http", _frame_body, OTHER_SHAPES, HTTP[1]),
     _http("http_frame", _frame_body, OTHER_SHAPES),

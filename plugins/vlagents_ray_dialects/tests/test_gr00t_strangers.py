@@ -196,12 +196,18 @@ def test_a_stranger_with_the_identity_of_a_client_stays_a_stranger(gateway: Gate
             assert gateway.clients == 1
 
 
-def test_a_connection_whose_messages_have_no_key_is_closed_after_some(gateway: Gateway) -> None:
+def test_a_connection_whose_messages_have_no_key_is_closed_after_some(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of which each is a pause of all that the connection may send."""
+    monkeypatch.setattr(gr00t, "_REFUSAL_S", 0.02)
     with gateway.connect() as peer:
         monitor = peer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        begun = time.monotonic()
         for _ in range(gr00t._REFUSALS):
             peer.send_multipart([b"", WRONG])
         assert monitor.poll(20_000)
+        assert time.monotonic() - begun > 0.02 * (gr00t._REFUSALS - 1)
         peer.disable_monitor()
         monitor.close()
 
