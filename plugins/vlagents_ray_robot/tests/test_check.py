@@ -173,14 +173,16 @@ def test_limits_of_another_number_of_joints_are_an_error() -> None:
     with closing(simulated_arm("franka", cameras=())) as arm:
         robot = FaultyArm(arm)
         robot.joint_limits = np.zeros((6, 2))
-        with pytest.raises(ConfigError, match=r"joint_limits: got \(6, 2\), want \(7, 2\)"):
+        with pytest.raises(
+            ConfigError, match=r"joint_limits: expected shape \(7, 2\).*got \(6, 2\)"
+        ):
             checked(arm, robot)
 
 
 def test_check_robot_raises_every_finding() -> None:
     with closing(simulated_arm("franka")) as arm:
         assert check_robot(arm, clock=arm.clock).ok
-        with pytest.raises(ContractViolation, match="clock: got a time stamp"):
+        with pytest.raises(ContractViolation, match=r"clock: expected .*got a time stamp"):
             check_robot(ClockStep(arm), clock=arm.clock)
 
 

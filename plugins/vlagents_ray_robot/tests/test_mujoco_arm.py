@@ -53,7 +53,7 @@ def test_a_stop_ends_a_motion_and_forgets_commands() -> None:
         arm.clock.sleep(1.0)
         assert 0.05 < stopped[0] - start[0] < 0.3
         assert np.abs(arm.joints() - stopped).max() < 0.02
-        with pytest.raises(InvalidAction, match=r"got \(7,\), want \(8,\)"):
+        with pytest.raises(InvalidAction, match=r"expected shape \(8,\), got \(7,\)"):
             arm.apply(np.zeros(7))
 
 
@@ -78,11 +78,11 @@ def test_a_joint_without_limits_has_those_of_two_turns(tmp_path: Path) -> None:
 def test_a_wrong_model_is_an_error_with_its_cure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ConfigError, match="want a file that exists"):
+    with pytest.raises(ConfigError, match="which does not exist"):
         MujocoArm("missing.xml")
     torque = tmp_path / "torque.xml"
     torque.write_text(MOTOR.format('<motor joint="a"/>'))
-    with pytest.raises(ConfigError, match="no position controller"):
+    with pytest.raises(ConfigError, match="expected a position controller"):
         MujocoArm(torque)
     with pytest.raises(ConfigError, match="did you mean 'so101'"):
         MujocoArm("so1o1")

@@ -138,7 +138,9 @@ class Finding:
     when: str  # "before any motion", or the motion at which it was found
 
     def __str__(self) -> str:
-        return f"{self.check}: got {self.got}, want {self.want}; {self.cure} (found {self.when})"
+        return (
+            f"{self.check}: expected {self.want}, got {self.got}; {self.cure} (found {self.when})"
+        )
 
 
 @dataclass
@@ -1008,8 +1010,8 @@ class _Layout:
         limits = np.asarray(getattr(robot, "joint_limits", unlimited))
         if limits.shape != (len(joints), 2):
             raise ConfigError(
-                f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for "
-                "each"
+                f"joint_limits: expected shape ({len(joints)}, 2), a low and a high for each "
+                f"joint, got {limits.shape}"
             )
 
         spec = (contract.state or {}).get(joint_parts[0]) or StateSpec()

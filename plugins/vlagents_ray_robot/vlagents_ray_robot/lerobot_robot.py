@@ -105,8 +105,8 @@ class LeRobotRobot:
         not_positions = [name for name in self._robot.action_features if not name.endswith(".pos")]
         if not_positions:
             raise ConfigError(
-                f"lerobot:{robot_type}: got actions {not_positions}, want positions of joints, "
-                "NAME.pos"
+                f"lerobot:{robot_type}: expected positions of joints (NAME.pos) as actions, got "
+                f"{not_positions}"
             )
 
         self._robot.connect(calibrate=False)
@@ -188,7 +188,8 @@ class LeRobotRobot:
         """Send the goal positions."""
         if np.shape(action) != (len(self._keys),):
             raise InvalidAction(
-                f"action: got {np.shape(action)}, want ({len(self._keys)},): {self._keys}"
+                f"action: expected shape ({len(self._keys)},), for {self._keys}, got "
+                f"{np.shape(action)}"
             )
         self._goal = np.array(action, np.float32)
         self._robot.send_action(dict(zip(self._keys, map(float, action), strict=True)))

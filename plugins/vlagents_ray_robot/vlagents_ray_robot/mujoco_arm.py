@@ -221,7 +221,7 @@ class MujocoArm:
         action = np.asarray(action, np.float64)
         if action.shape != (len(self._flat),):
             raise InvalidAction(
-                f"action: got {action.shape}, want ({len(self._flat)},); see the contract"
+                f"action: expected shape ({len(self._flat)},), got {action.shape}; see the contract"
             )
 
         self._advance()
@@ -342,8 +342,8 @@ class MujocoArm:
             joint_drives = [drive for drive in drives if not drive.gripper]
             if not joint_drives:
                 raise ConfigError(
-                    f"{arm_model.menagerie}: got an arm without joints that move, want the file of "
-                    "an arm"
+                    f"{arm_model.menagerie}: expected joints that move, got none; name the file "
+                    "of an arm"
                 )
             # The hand is the body that the arm's last joint moves.
             last_joint = int(self.model.actuator_trnid[joint_drives[-1].actuators[0], 0])
@@ -445,8 +445,8 @@ class MujocoArm:
             name = self.model.actuator(index).name or joint
             if self.model.actuator_biasprm[index, 1] == 0:
                 raise ConfigError(
-                    f"{arm_model.menagerie}: actuator {name!r} has no position controller, "
-                    "want one each"
+                    f"{arm_model.menagerie}: actuator {name!r}: expected a position controller, "
+                    "got none; give each actuator one"
                 )
 
             low, high = map(float, self.model.actuator_ctrlrange[index])
@@ -497,9 +497,9 @@ def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
         menagerie_names = menagerie.names()
         if arm_model.menagerie not in menagerie_names:
             raise ConfigError(
-                f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, "
-                "or the path of an MJCF or URDF file"
-                f"{did_you_mean(model, [*ARMS, *menagerie_names])}"
+                f"arm: expected one of {list(ARMS)}, a model of the MuJoCo Menagerie, or the path "
+                "of an MJCF or URDF file, got "
+                f"{model!r}{did_you_mean(model, [*ARMS, *menagerie_names])}"
             )
 
         robot = menagerie.get(arm_model.menagerie)
@@ -515,7 +515,9 @@ def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
             ) from error
 
     if not file.is_file():
-        raise ConfigError(f"arm: got {model!r}, want a file that exists")
+        raise ConfigError(
+            f"arm: expected a file, got {model!r}, which does not exist; check the path"
+        )
     if file.suffix != ".urdf":
         return mujoco.MjSpec.from_file(str(file))
 

@@ -115,17 +115,17 @@ class AxesLeader:
         spec = None if contract is None else contract.action
         if spec is None or spec.dim is None or spec.relative is None:
             raise ConfigError(
-                f"teleoperation: got {spec} as the contract's action, want `dim`, and `delta` "
-                "(whether actions are relative): state them in the policy's contract; with noop, "
-                "serve it with `--set delta=false`"
+                "teleoperation: expected an action with `dim` and `delta` (whether it is "
+                f"relative) in the contract, got {spec}; set both in the policy's contract, or "
+                "serve noop with `--set delta=false`"
             )
 
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
             step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
-                f"step: got {step}, want the change of a number at a tick, above 0; the contract "
-                "has no bounds of relative actions to compute it from"
+                f"step: expected the change of a number at a tick, above 0, got {step}; set it, "
+                "as the contract has no bounds of relative actions to compute it from"
             )
 
         self._spec = spec
@@ -261,7 +261,8 @@ class Keyboard(AxesDevice):
         used_twice = sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE})
         if used_twice:
             raise ConfigError(
-                f"keyboard: {used_twice} move the robot, so they cannot do something else"
+                f"keyboard: expected keys that move nothing, got {used_twice}, which move the "
+                "robot; choose others"
             )
 
         self._terminal = Terminal(terminal)

@@ -356,7 +356,7 @@ def decoded(frame: str | bytes) -> dict[str, Any]:
     try:
         message = json.loads(frame)
     except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"rosbridge: got {frame[:40]!r}, want JSON ({error})") from error
+        raise MalformedMessage(f"rosbridge: expected JSON, got {frame[:40]!r} ({error})") from error
     if not isinstance(message, dict) or not isinstance(message.get("op"), str):
-        raise MalformedMessage(f"rosbridge: got {shown(message)}, want an object with `op`")
+        raise MalformedMessage(f"rosbridge: expected an object with `op`, got {shown(message)}")
     return message

@@ -47,8 +47,7 @@ def field(message: Any, path: str) -> Any:
             message = message[name] if isinstance(message, Mapping) else getattr(message, name)
         except (KeyError, AttributeError) as error:
             raise MalformedMessage(
-                f"message: got one without {path!r}, want a field of this name; is the topic's "
-                "type right?"
+                f"message: expected a field {path!r}, got none; check the topic's type"
             ) from error
     return message
 
@@ -80,8 +79,8 @@ def image(message: Any) -> np.ndarray:
     encoding = field(message, "encoding")
     if not isinstance(encoding, str) or encoding not in _PIXEL:
         raise InvalidObservation(
-            f"image: got the encoding {shown(encoding)}, want one of {list(_PIXEL)}; "
-            f"have the camera's driver publish rgb8, and take no topic of depth for a camera"
+            f"image: expected an encoding of {list(_PIXEL)}, got {shown(encoding)}; have the "
+            "camera's driver publish rgb8, and take no topic of depth for a camera"
         )
 
     height = _whole("height", field(message, "height"))
@@ -90,16 +89,19 @@ def image(message: Any) -> np.ndarray:
     data = _bytes("image", field(message, "data"))
     if not (height > 0 and width > 0):
         raise MalformedMessage(
-            f"image: got {height} rows of {width} pixels, want some; is the camera on?"
+            f"image: expected pixels, got {height} rows of {width}; check whether the camera is on"
         )
     if height * width > MAX_PIXELS:
-        raise MessageTooLarge(f"image: got {height} x {width} pixels, want at most {MAX_PIXELS}")
+        raise MessageTooLarge(
+            f"image: expected at most {MAX_PIXELS} pixels, got {height} x {width}; let the "
+            "camera's driver publish smaller images"
+        )
 
     row_bytes = width * _PIXEL[encoding]
     if step < row_bytes or len(data) < step * height:
         raise MalformedMessage(
-            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {row_bytes} or "
-            f"more for {width} pixels of {encoding}"
+            f"image: expected {height} rows of {row_bytes} bytes or more, for {width} pixels of "
+            f"{encoding}, got {len(data)} bytes in rows of {step}"
         )
 
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :row_bytes]
@@ -137,14 +139,14 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
     is_sequence = isinstance(received_names, Sequence)
     if not is_sequence or not all(isinstance(name, str) for name in received_names):
         raise MalformedMessage(
-            f"name: got {shown(received_names)}, want a list of names; is the topic's type right?"
+            f"name: expected a list of names, got {shown(received_names)}; check the topic's type"
         )
 
     numbers = _numbers(values, field(message, values))
     if len(numbers) != len(received_names):
         raise MalformedMessage(
-            f"joint state: got {len(numbers)} numbers in {values!r} for {len(received_names)} "
-            "names, want as many"
+            f"joint state: expected {len(received_names)} numbers in {values!r}, as there are "
+            f"names, got {len(numbers)}"
         )
 
     index_of = {name: i for i, name in enumerate(received_names)}
@@ -182,8 +184,8 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
         raise MalformedMessage(
-            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the "
-            "field unset?"
+            f"pose: expected a quaternion of unit length, got {quaternion.tolist()}; check "
+            "whether its sender sets the field"
         )
 
     quaternion = quaternion / length
@@ -263,7 +265,7 @@ def _whole(name: str, value: Any) -> int:
     """Return the whole number in a field."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise MalformedMessage(
-            f"{name}: got {value!r}, want a whole number; is the topic's type right?"
+            f"{name}: expected a whole number, got {value!r}; check the topic's type"
         )
     return value
 
@@ -278,7 +280,8 @@ def _bytes(name: str, value: Any) -> bytes | memoryview:
         return bytes(value) if isinstance(value, (list, tuple)) else memoryview(value).cast("B")
     except (binascii.Error, TypeError, ValueError) as error:
         raise MalformedMessage(
-            f"{name}: got data that are no bytes ({error}), want an array of uint8"
+            f"{name}: expected an array of uint8, got data that are no bytes ({error}); check the "
+            "topic's type"
         ) from error
 
 
@@ -287,9 +290,11 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     try:
         array = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
     except (TypeError, ValueError) as error:
-        raise MalformedMessage(f"{name}: got {shown(values)}, want an array of numbers") from error
+        raise MalformedMessage(
+            f"{name}: expected an array of numbers, got {shown(values)}; check the topic's type"
+        ) from error
     if array.ndim != 1:
-        raise MalformedMessage(f"{name}: got an array of shape {array.shape}, want (D,)")
+        raise MalformedMessage(f"{name}: expected shape (D,), got {array.shape}")
     return array
 
 
@@ -301,6 +306,6 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
         numbers = values.astype(np.float32)
     if not np.isfinite(numbers).all():
         raise MalformedMessage(
-            f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?"
+            f"{name}: expected finite numbers, got {values.tolist()}; check the sensor"
         )
     return numbers

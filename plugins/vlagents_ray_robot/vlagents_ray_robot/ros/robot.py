@@ -201,7 +201,9 @@ def settings_from(document: Any, where: str) -> RosSettings:
 
     nodes = top.get("actions") or []
     if not isinstance(nodes, list):
-        raise ConfigError(f"{where}: actions: got {type(nodes).__name__}, want a list of topics")
+        raise ConfigError(
+            f"{where}: actions: expected a list of topics, got {type(nodes).__name__}"
+        )
     actions = []
     for i, node in enumerate(nodes):
         actions.append(_settings(ActionTopic, node, f"{where}: actions[{i}]"))
@@ -238,13 +240,14 @@ def _check_sensors(settings: RosSettings, where: str) -> None:
     for name, topic, _ in sensors:
         if type_of_topic.setdefault(topic.topic, topic.type) != topic.type:
             raise ConfigError(
-                f"{where}: {name}: got {topic.topic} as {topic.type}, and elsewhere as "
-                f"{type_of_topic[topic.topic]}"
+                f"{where}: {name}: expected {topic.topic} as {type_of_topic[topic.topic]}, as "
+                f"elsewhere in the file, got {topic.type}; give it one type"
             )
 
     if not settings.sensors:
         raise ConfigError(
-            f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped"
+            f"{where}: expected a camera, state or gripper, by whose age the robot is stopped, "
+            "got none; add one"
         )
     for name, topic, _ in sensors:
         _require_above_zero(f"{where}: {name}: max_age_s", topic.max_age_s)
@@ -255,15 +258,17 @@ def _check_sensors(settings: RosSettings, where: str) -> None:
         return
     if gripper.open is None or gripper.closed is None or gripper.open == gripper.closed:
         raise ConfigError(
-            f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives "
-            "them"
+            f"{where}: gripper: expected two different numbers, got open={gripper.open} and "
+            f"closed={gripper.closed}; set `open` and `closed` as the topic gives them"
         )
 
 
 def _check_actions(settings: RosSettings, where: str) -> None:
     """Raise `ConfigError` if a setting of a topic for actions is wrong."""
     if not settings.actions:
-        raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
+        raise ConfigError(
+            f"{where}: actions: expected the topics that command the robot, got none; add them"
+        )
     for i, command in enumerate(settings.actions):
         _check_command(command, settings, f"{where}: actions[{i}]")
 
@@ -276,8 +281,8 @@ def _check_link(settings: RosSettings, where: str) -> None:
     _require_one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
         raise ConfigError(
-            f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as "
-            "'ws://arm-pc:9090'"
+            f"{where}: link: expected 'ros2', or a rosbridge as 'ws://arm-pc:9090', got "
+            f"{settings.link!r}"
         )
 
 
@@ -289,19 +294,21 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
     for name in command.fields:
         _require_one_of(f"{where}: fields", name, TWIST)
     if command.dim < 1:
-        wants = (
-            "numbers, how many it takes" if command.type == ARRAY else "names, those of the joints"
+        needed = (
+            "`numbers`, how many it takes"
+            if command.type == ARRAY
+            else "`names`, those of the joints"
         )
-        raise ConfigError(f"{where}: got a {command.type} without numbers, want {wants}")
+        raise ConfigError(f"{where}: expected {needed}, got none for a {command.type}; add them")
     if command.type == TRAJECTORY and not command.reach_s > 0:
-        raise ConfigError(f"{where}: reach_s: got {command.reach_s}, want above 0")
+        raise ConfigError(f"{where}: reach_s: expected a number above 0, got {command.reach_s}")
 
     if not command.stop and command.type != TWIST_TYPE:
         raise ConfigError(
-            f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers "
-            "are velocities or deltas, a part of the state with the measured pose where they are "
-            f"targets, or {NOTHING!r} where the controller stays at its last target and that is "
-            "right"
+            f"{where}: stop: expected the value that stops {command.topic}, got none; set "
+            f"{ZEROS!r} where numbers are velocities or deltas, a part of the state with the "
+            f"measured pose where they are targets, or {NOTHING!r} where the controller stays at "
+            "its last target and that is right"
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
         _require_one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
@@ -330,14 +337,15 @@ def _settings(cls: type[Any], node: Any, where: str) -> Any:
     for name in arguments.keys() & {"names", "fields"}:
         value = arguments[name]
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise ConfigError(f"{where}: {name}: got {value!r}, want a list of names")
+            raise ConfigError(f"{where}: {name}: expected a list of names, got {value!r}")
         arguments[name] = tuple(value)
 
     grippers = arguments.get("grippers")
     if grippers is not None:
         if not isinstance(grippers, list) or not all(type(number) is int for number in grippers):
             raise ConfigError(
-                f"{where}: grippers: got {grippers!r}, want a list of numbers from 0, such as [2]"
+                f"{where}: grippers: expected a list of numbers from 0, such as [2], got "
+                f"{grippers!r}"
             )
         arguments["grippers"] = tuple(grippers)
 
@@ -349,7 +357,7 @@ def _mapping(node: Any, where: str) -> Mapping[str, Any]:
     """Return a node of the file; raise `ConfigError` if it is not a mapping."""
     if not isinstance(node, Mapping):
         raise ConfigError(
-            f"{where}: got {type(node).__name__}, want keys with values; see docs/ros.md"
+            f"{where}: expected keys with values, got {type(node).__name__}; see docs/ros.md"
         )
     return node
 
@@ -357,13 +365,13 @@ def _mapping(node: Any, where: str) -> Mapping[str, Any]:
 def _require_one_of(setting: str, value: object, allowed: tuple[object, ...]) -> None:
     """Raise `ConfigError` if the value of a setting is not allowed."""
     if value not in allowed:
-        raise ConfigError(f"{setting}: got {value!r}, want one of {list(allowed)}")
+        raise ConfigError(f"{setting}: expected one of {list(allowed)}, got {value!r}")
 
 
 def _require_above_zero(setting: str, value: float) -> None:
     """Raise `ConfigError` if the value of a setting is not above 0."""
     if not value > 0:
-        raise ConfigError(f"{setting}: got {value}, want above 0")
+        raise ConfigError(f"{setting}: expected a number above 0, got {value}")
 
 
 class TopicReader:
@@ -576,7 +584,8 @@ class RosRobot:
         """
         if action.shape != (self.settings.dim,):
             raise InvalidAction(
-                f"action: got {action.shape}, want ({self.settings.dim},), as the topics take"
+                f"action: expected shape ({self.settings.dim},), as the topics take, got "
+                f"{action.shape}"
             )
         first = 0
         for index, command in enumerate(self.settings.actions):
@@ -710,9 +719,9 @@ class RosRobot:
                 break
             if time.monotonic() > deadline:
                 raise ConfigError(
-                    f"{self.settings.link}: got no message of {missing} within "
-                    f"{self.settings.ready_s:g} s, want one of each; compare names and types with "
-                    "`ros2 topic list --show-types`"
+                    f"{self.settings.link}: expected a message of each topic within "
+                    f"{self.settings.ready_s:g} s, got none of {missing}; compare names and types "
+                    "with `ros2 topic list --show-types`"
                 )
             time.sleep(0.01)
 
@@ -721,16 +730,16 @@ class RosRobot:
             if not -SKEW_S <= ago_s <= reading.silent_s:
                 when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
                 raise ConfigError(
-                    f"{reading.topic}: got a message with the time stamp of {when}, want one of "
-                    "now; synchronize the clocks of both machines, or count from the arrival: "
-                    "`clock: arrival`"
+                    f"{reading.topic}: expected messages with the present time as their stamp, "
+                    f"got one of {when}; synchronize the clocks of both machines, or count from "
+                    "the arrival: `clock: arrival`"
                 )
 
         for command in self.settings.actions:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
                 raise ConfigError(
-                    f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} "
-                    f"numbers, want {command.dim}, as the topic takes; name a part of the state "
-                    "with these, in this order"
+                    f"{command.topic}: stop: expected {command.dim} numbers, as the topic takes, "
+                    f"got {command.stop!r} with {len(self._value(pose))}; name a part of the "
+                    "state with these, in this order"
                 )
