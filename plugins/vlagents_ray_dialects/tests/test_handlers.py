@@ -156,7 +156,7 @@ def test_a_request_of_openvla_without_an_instruction_is_refused(settings: Any) -
     with serving(Mirror(chunk=2), {"openvla": settings}) as (client, _):
         answer = client.post("/act", json=request)
     assert answer.status_code == 422
-    assert "instruction: got none, the policy needs one" in answer.text
+    assert "instruction: expected one, as the policy needs it, got none" in answer.text
 
 
 def test_a_dialect_that_is_off_is_not_there() -> None:

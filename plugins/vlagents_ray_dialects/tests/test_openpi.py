@@ -120,8 +120,8 @@ def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) ->
     for asked, said in (
         (batch((1, "task 1"), (2, None)), "instruction"),
         (wrong, "observation/wrist_image"),
-        (openpi.encode({"batch": []}), "want a list of one observation or more"),
-        (openpi.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
+        (openpi.encode({"batch": []}), "expected a list of one observation or more"),
+        (openpi.encode({"batch": np.zeros(3)}), "expected a list of one observation or more"),
         (openpi.encode({"batch": [1]}), "expected a map"),
         ("text", "binary"),
     ):

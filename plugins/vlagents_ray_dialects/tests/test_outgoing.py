@@ -39,7 +39,7 @@ def fitting(mapping: KeyMapping) -> Obs:
 
 def test_parts_whose_lengths_nothing_says_are_refused_before_anything_is_sent() -> None:
     with pytest.raises(
-        ConfigError, match=r"mapping.state.pose: got 2 parts without `stop`, want one at most"
+        ConfigError, match=r"mapping.state.pose: expected at most one part without `stop`, got 2"
     ):
         outgoing(state={"pose": ["a", "b"]})
 
@@ -104,7 +104,7 @@ def test_channels_go_first_where_the_mapping_says_so() -> None:
         (
             {"state": {"pose": {"key": "s", "start": 5000, "stop": 5003}}},
             ConfigError,
-            "want 0 to 4096",
+            "expected places from 0 to 4096",
         ),
     ],
 )
@@ -127,17 +127,21 @@ def test_arrays_by_name_become_columns() -> None:
 @pytest.mark.parametrize(
     ("action", "theirs", "said"),
     [
-        ({}, {"arm": np.ones((1, 2)), "hand": np.ones((1, 1))}, "say in mapping.action"),
+        ({}, {"arm": np.ones((1, 2)), "hand": np.ones((1, 1))}, "list in mapping.action"),
         ({"arm": {"stop": 2}}, {"hand": np.ones((1, 2))}, r"lacks \['arm'\]"),
-        ({"arm": {"stop": 3}}, {"arm": np.ones((1, 2))}, "got 2 columns, mapping.action says 3"),
+        (
+            {"arm": {"stop": 3}},
+            {"arm": np.ones((1, 2))},
+            "expected 3 columns, .* in mapping.action, got 2",
+        ),
         (
             {"a": {"stop": 1}, "b": {"start": 1}},
             {"a": np.ones((2, 1)), "b": np.ones((3, 1))},
             "number of rows",
         ),
         ({"a": {"start": 1}}, {"a": np.ones((2, 1))}, r"numbers at \[0\]"),
-        ({}, np.ones((1, 2, 3)), r"want \(D,\) or \(H, D\)"),
-        ({}, np.array(["text"]), r"want \(D,\) or \(H, D\)"),
+        ({}, np.ones((1, 2, 3)), r"expected \(D,\) or \(H, D\)"),
+        ({}, np.array(["text"]), r"expected \(D,\) or \(H, D\)"),
         ({}, None, "got NoneType"),
     ],
 )

@@ -218,8 +218,8 @@ class GR00TConnection(GatewayClient):
             if not flags.has_more:
                 if size > self._context.limits.body_bytes:
                     raise MessageTooLarge(
-                        f"gr00t: a message of {size} bytes, the limit is "
-                        f"{self._context.limits.body_bytes}"
+                        f"gr00t: expected a message of at most {self._context.limits.body_bytes} "
+                        f"bytes, got {size}"
                     )
                 return tuple(envelope), size, deadline
 
@@ -300,8 +300,8 @@ class GR00TConnection(GatewayClient):
             if envelope not in _ENVELOPES:
                 self._count_refusal()
                 raise MalformedMessage(
-                    f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; "
-                    "connect each client directly, without a ZeroMQ proxy"
+                    f"gr00t: expected an empty envelope or none, got one of {len(envelope)} "
+                    "parts; connect each client directly, without a ZeroMQ proxy"
                 )
 
             self._identify(payload)

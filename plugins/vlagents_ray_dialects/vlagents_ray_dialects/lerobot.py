@@ -126,8 +126,8 @@ class LeRobotConnection(GatewayClient):
         """
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
-                f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for "
-                f"{self._checkpoint!r}; start the client with that"
+                f"pretrained_name_or_path: expected {self._checkpoint!r}, for which this server "
+                f"acts, got {robot.checkpoint[:80]!r}; start the client with the first"
             )
         logger.info(
             "lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80]
@@ -150,7 +150,9 @@ class LeRobotConnection(GatewayClient):
             NotReset: The client has sent no policy instructions.
         """
         if self._robot is None:
-            raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+            raise NotReset(
+                "SendPolicyInstructions: expected one after Ready, got none; start the client again"
+            )
 
         admission.begin("act")
         observation = lerobot.read_observation(data, admission)
@@ -344,7 +346,7 @@ class LeRobotDialect(PortDialect):
         with self._request(context) as client:
             data = lerobot.read_data(message)
             if data is None:
-                raise MalformedMessage("policy instructions: got none")
+                raise MalformedMessage("policy instructions: expected them, got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
 
     def _observe(self, messages: Iterator[bytes], context: Any) -> None:
@@ -383,8 +385,8 @@ class LeRobotDialect(PortDialect):
         client = self._clients.get(context.peer())
         if client is None:
             raise NotReset(
-                "Ready: got none over this connection, or it was idle for too long; start the "
-                "client again"
+                "Ready: expected one over this connection, got none, or it was idle for too long; "
+                "start the client again"
             )
         return client.request()
 

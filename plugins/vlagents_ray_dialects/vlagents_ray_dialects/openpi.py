@@ -111,8 +111,8 @@ def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
     shapes = {chunk.shape for chunk in chunks}
     if len(shapes) > 1:
         raise VLAgentsError(
-            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send "
-            "each by itself"
+            "batch: expected chunks of one shape, as the reply is one array, got "
+            f"{sorted(shapes)}; send each observation by itself"
         )
     return np.stack(chunks)
 
@@ -163,7 +163,7 @@ class OpenPiDialect(MapDialect):
         if message.keys() != {"reset"}:
             return None
         if message["reset"] is not True:
-            raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
+            raise MalformedMessage(f"reset: expected true, got {shown(message['reset'])}")
         connection.end_episodes()
         return openpi.encode(message) if self.config.answer_reset else b""
 
@@ -174,7 +174,7 @@ class OpenPiDialect(MapDialect):
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
             raise MalformedMessage(
-                f"batch: got {shown(batch)}, want a list of one observation or more"
+                f"batch: expected a list of one observation or more, got {shown(batch)}"
             )
         return batch
 
@@ -224,7 +224,7 @@ class RoboArenaDialect(MapDialect):
         """End the episode at a reset or another `session_id`; return the reply to a reset."""
         endpoint = message.get("endpoint", "infer")
         if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
-            raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
+            raise MalformedMessage(f"endpoint: expected 'infer' or 'reset', got {shown(endpoint)}")
         if endpoint == "reset":
             connection.end_episodes()
             return "reset successful"

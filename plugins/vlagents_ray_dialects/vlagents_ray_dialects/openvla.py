@@ -68,7 +68,8 @@ class OpenVLADialect(HttpDialect):
         obs, instruction = super().read(theirs)
         if instruction is None and self.mapping.instruction is not None:
             raise InvalidObservation(
-                "instruction: got none, the policy needs one; send it with the observation"
+                "instruction: expected one, as the policy needs it, got none; send it with the "
+                "observation"
             )
         return obs, instruction
 

@@ -137,7 +137,7 @@ class VlaEvalDialect(base.RouteDialect):
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
             error = MalformedMessage(
-                f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}"
+                f"protocol_version: expected {vla_eval.PROTOCOL_VERSION}, got {shown(version, 20)}"
             )
             return _error(error, message.seq, uuid.uuid4().hex)
 

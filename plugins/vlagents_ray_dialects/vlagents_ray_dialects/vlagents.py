@@ -176,11 +176,11 @@ class VlagentsConnection:
         method, args = _called(call)
         if method in ("act", "reset"):
             if len(args) != 1 or not isinstance(args[0], (str, bytes)):
-                raise MalformedMessage(f"{method}: want one argument, text")
+                raise MalformedMessage(f"{method}: expected one argument, text, got {shown(args)}")
             return self._act(args[0]) if method == "act" else self._reset(args[0])
 
         if args:
-            raise MalformedMessage(f"{method}: want no arguments")
+            raise MalformedMessage(f"{method}: expected no arguments, got {shown(args)}")
         if method == "name":
             return self._dialect.config.name or self._context.app
         if method == "is_initialized":
@@ -202,7 +202,7 @@ class VlagentsConnection:
         if isinstance(columns, vlagents.RobotColumns):
             if len(request.robots) > 1:
                 raise InvalidInput(
-                    f"got the robots {list(request.robots)[:8]}; state their columns in "
+                    f"expected one robot, got {list(request.robots)[:8]}; list their columns in "
                     "dialects.vlagents.robots"
                 )
             columns = dict.fromkeys(request.robots, columns)
@@ -274,7 +274,7 @@ def _echo(call: RpycCall) -> str | bytes | None:
             return None
         case (str() | bytes() | None as value, *_):
             return value
-    raise MalformedMessage(f"ping: got {shown(call.args[0])}, want text")
+    raise MalformedMessage(f"ping: expected text, got {shown(call.args[0])}")
 
 
 def _number(args: tuple[Any, ...]) -> int:
@@ -299,9 +299,11 @@ def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
         ):
             pass
         case _:
-            raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
+            raise MalformedMessage(
+                f"rpyc: expected a call of one of {list(_METHODS)} of the root, got another"
+            )
     if any(options):
-        raise MalformedMessage(f"{name}: takes no arguments by name")
+        raise MalformedMessage(f"{name}: expected no arguments by name, got some")
     return name, args
 
 
@@ -345,8 +347,8 @@ class SharedMemory:
         """
         if not self._same_machine:
             raise InvalidObservation(
-                "shared memory: the client is not on the server's machine; leave "
-                "on_same_machine=False"
+                "shared memory: expected a client on the server's machine, got one on another; "
+                "leave on_same_machine=False"
             )
         descriptor = self._descriptor(name)
         if os.fstat(descriptor).st_size < size:  # checked before memory is allocated
@@ -376,7 +378,7 @@ class SharedMemory:
         match = _NAME.fullmatch(name)
         if match is None:
             raise InvalidObservation(
-                f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'"
+                f"shared memory: expected a name like 'psm_01234567', got {name[:40]!r}"
             )
 
         file_name = match[1]
@@ -418,7 +420,9 @@ class GripperArgs(BaseModel, extra="forbid"):
     def _two_values(self) -> GripperArgs:
         """Reject equal values."""
         if self.open is not None and self.open == self.closed:
-            raise ValueError(f"open and closed are both {self.open}; they must differ")
+            raise ValueError(
+                f"expected two different numbers, got {self.open} as open and as closed; change one"
+            )
         return self
 
 

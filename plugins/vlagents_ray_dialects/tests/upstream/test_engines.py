@@ -181,7 +181,9 @@ def test_vllm_omni_needs_its_external_and_its_wrist_camera(
     replayed: Callable[..., Upstream],
 ) -> None:
     mapping = SETTINGS["vllm_omni_websocket"]["mapping"] | {"cameras": {"wrist": DOTTED["wrist"]}}
-    with pytest.raises(ContractMismatch, match="needs 1 external ones, the mapping has 0"):
+    with pytest.raises(
+        ContractMismatch, match="expected 1 external ones, which the upstream needs, got 0"
+    ):
         replayed("vllm_omni_websocket", mapping=mapping).initialize()
 
 
@@ -191,13 +193,16 @@ CAMERAS = SETTINGS["flashrt_http"]["mapping"]["cameras"]
 @pytest.mark.parametrize(
     ("mapping", "said"),
     [
-        ({"instruction": "prompt"}, r"cameras: got \[\], want images/NAME for each"),
-        ({"cameras": {"front": "images"}, "instruction": "prompt"}, r"cameras: got \['front'\]"),
+        ({"instruction": "prompt"}, r"cameras: expected images/NAME for each.*got \[\]"),
+        (
+            {"cameras": {"front": "images"}, "instruction": "prompt"},
+            r"cameras: expected images/NAME for each.*got \['front'\]",
+        ),
         (
             {"cameras": CAMERAS | {"front": {"key": "images/f", "optional": True}}},
-            r"cameras: got \['front'\]",
+            r"cameras: expected images/NAME for each.*got \['front'\]",
         ),
-        ({"cameras": CAMERAS, "instruction": "task"}, "instruction: got 'task', want 'prompt'"),
+        ({"cameras": CAMERAS, "instruction": "task"}, "instruction: expected 'prompt', got 'task'"),
     ],
 )
 def test_flashrt_does_not_start_with_a_mapping_that_it_would_complete_itself(
@@ -217,7 +222,7 @@ def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
     agent = replayed("flashrt_http")
     agent.initialize()
     assert isinstance(error := act(agent, instruction, obs), InvalidObservation)
-    assert "want images of one shape and a prompt" in str(error)
+    assert "expected images of one shape and a prompt" in str(error)
 
 
 @pytest.mark.parametrize("name", ["sglang_websocket", "sglang_http"])
@@ -229,7 +234,8 @@ def test_a_camera_that_sglang_would_ignore_does_not_start(
     replayed(name, mapping=only_front).initialize()  # a robot without a camera at its wrist
     misspelt = mapping | {"cameras": {"front": mapping["cameras"]["front"].replace("rgb", "bgr")}}
     with pytest.raises(
-        ContractMismatch, match=r"reads \['base_0_rgb', 'left_wrist_0_rgb'\], the mapping gives"
+        ContractMismatch,
+        match=r"expected \['base_0_rgb', 'left_wrist_0_rgb'\], which the upstream reads, got",
     ):
         replayed(name, mapping=misspelt).initialize()
 
@@ -252,6 +258,6 @@ def test_an_error_over_http_states_the_status_and_the_place_of_the_text(
     agent.initialize()
     assert "it answered with HTTP 422, whose text the server's log has" in str(act(agent, "fail"))
     with pytest.raises(
-        PolicyUnavailable, match=r"HTTP 404, .*; want its metadata at /v1/actions/metadata"
+        PolicyUnavailable, match=r"HTTP 404, .*; expected its metadata at /v1/actions/metadata"
     ):
         replayed("flashrt_http", protocol="sglang", connect_timeout_s=0.2).initialize()

@@ -34,7 +34,7 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
     [
         ({"protocol": "grpc"}, "'openpi', 'openpi-batch'"),
         ({"urls": []}, "at least 1"),
-        ({"urls": ["http://box:1"]}, "want ws://HOST:PORT or wss://HOST:PORT for openpi"),
+        ({"urls": ["http://box:1"]}, "expected ws://HOST:PORT or wss://HOST:PORT for openpi"),
         ({"urls": ["ws://me:secret@box:1"]}, "name it in key_env"),
         ({"mapping": None}, "openpi has none of its own; give an object, or a preset"),
         ({"mapping": "openpi-libera"}, "openpi-libero"),
@@ -80,8 +80,12 @@ GR00T: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("mapping", "contract", "said"),
     [
-        ({"cameras": {"front": "video/ego"}}, {}, r"video: the upstream needs \['wrist'\]"),
-        ({"state": {}}, {}, r"state: the upstream needs \['arm'\]"),
+        (
+            {"cameras": {"front": "video/ego"}},
+            {},
+            r"video: expected \['wrist'\], which the upstream needs",
+        ),
+        ({"state": {}}, {}, r"state: expected \['arm'\], which the upstream needs"),
         ({"action": {"leg": {}}}, {}, r"mapping.action reads \['leg'\]"),
         ({"action": {}}, {}, "say in mapping.action which columns of ours each is"),
         ({}, {"chunk": 3}, "chunk: the upstream gives 4 rows, contract.chunk says 3"),

@@ -74,7 +74,7 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
     """
     if len(payload) > limits.body_bytes:
         raise MessageTooLarge(
-            f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}"
+            f"gr00t: expected a message of at most {limits.body_bytes} bytes, got {len(payload)}"
         )
 
     package = require("msgpack")
@@ -92,7 +92,9 @@ def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None
                 continue
             token = reader.unpack()
             if token is not None and not isinstance(token, str):
-                raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
+                raise MalformedMessage(
+                    f"gr00t: api_token: expected text, got {type(token).__name__}"
+                )
             return token
     except (package.exceptions.UnpackException, ValueError, TypeError) as error:
         if isinstance(error, MalformedMessage):
@@ -124,19 +126,19 @@ def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TReq
 
     document = msgpack.unpack(payload, limits, array, text=limits.text)
     if not isinstance(document, dict):
-        raise MalformedMessage(f"gr00t: got {type(document).__name__}, want a map")
+        raise MalformedMessage(f"gr00t: expected a map, got {type(document).__name__}")
 
     endpoint = document.get("endpoint", "get_action")
     data = document.get("data")
     token = document.get("api_token")
     if not isinstance(endpoint, str) or endpoint not in ENDPOINTS:
         raise MalformedMessage(
-            f"gr00t: unknown endpoint {shown(endpoint)}, want one of {list(ENDPOINTS)}"
+            f"gr00t: endpoint: expected one of {list(ENDPOINTS)}, got {shown(endpoint)}"
         )
     if data is not None and not isinstance(data, dict):
-        raise MalformedMessage(f"gr00t: data: got {type(data).__name__}, want a map")
+        raise MalformedMessage(f"gr00t: data: expected a map, got {type(data).__name__}")
     if token is not None and not isinstance(token, str):
-        raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
+        raise MalformedMessage(f"gr00t: api_token: expected text, got {type(token).__name__}")
     return GR00TRequest(endpoint, data or {}, packed)
 
 
@@ -163,7 +165,7 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
         first_arrays = list((groups["video"] | groups["state"]).items())[:8]
         shapes = {name: array.shape for name, array in first_arrays}
         raise InvalidObservation(
-            f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)"
+            f"observation: expected videos (B, T, H, W, 3) and states (B, T, D), got {shapes}"
         )
     batched = batch_axes == {1}
     if not batched:
@@ -174,13 +176,13 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     sizes = {array.shape[0] for array in arrays}
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
         raise InvalidObservation(
-            f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all"
+            f"observation: expected batches of one size, 1 to {_BATCH}, got {sorted(sizes)}"
         )
 
     number = sizes.pop()
     texts = _texts(by_modality.get("language"), number)
     if any(array.shape[1] == 0 for array in arrays):
-        raise InvalidObservation("observation: got no moment (T = 0), want one at least")
+        raise InvalidObservation("observation: expected at least one moment, got none (T = 0)")
 
     each = []
     for i in range(number):
@@ -311,11 +313,13 @@ def _arrays(group: Any, modality: str) -> dict[str, np.ndarray]:
     if group is None:
         return {}
     if not isinstance(group, dict):
-        raise InvalidObservation(f"{modality}: got {type(group).__name__}, want a map of arrays")
+        raise InvalidObservation(
+            f"{modality}: expected a map of arrays, got {type(group).__name__}"
+        )
     for name, array in group.items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray):
             raise InvalidObservation(
-                f"{modality}.{shown(name)}: got {type(array).__name__}, want an array"
+                f"{modality}.{shown(name)}: expected an array, got {type(array).__name__}"
             )
     return group
 
@@ -330,7 +334,7 @@ def _texts(language: Any, number: int) -> list[str | None]:
     if not isinstance(language, dict) or not language:
         return [None] * number
     if len(language) > 1:
-        raise InvalidObservation(f"language: got {shown(list(language))}, want one instruction")
+        raise InvalidObservation(f"language: expected one instruction, got {shown(list(language))}")
 
     [(key, value)] = language.items()
     texts = [value] * number if isinstance(value, str) else value
@@ -338,7 +342,8 @@ def _texts(language: Any, number: int) -> list[str | None]:
         texts = texts * number
     if not isinstance(texts, list) or len(texts) != number:
         raise InvalidObservation(
-            f"{shown(key)}: want {number} instructions, one for each observation"
+            f"{shown(key)}: expected {number} instructions, one for each observation, got "
+            f"{shown(texts)}"
         )
     return [_text(key, text) for text in texts]
 
@@ -348,7 +353,7 @@ def _text(key: Any, value: Any) -> str:
     while isinstance(value, list) and value:
         value = value[-1]
     if not isinstance(value, str):
-        raise InvalidObservation(f"{shown(key)}: got {type(value).__name__}, want text")
+        raise InvalidObservation(f"{shown(key)}: expected text, got {type(value).__name__}")
     return value
 
 
@@ -390,7 +395,9 @@ def read_npy(data: Any, limits: MessageLimits) -> Any:
     length = int.from_bytes(data[8:start], "little")
     header = _HEADER.fullmatch(data[start : start + length]) if length < 1000 else None
     if header is None:
-        raise MalformedMessage("gr00t: as_npy: want a plain array of numbers or text")
+        raise MalformedMessage(
+            "gr00t: as_npy: expected a plain array of numbers or text, got another"
+        )
 
     dtype, by_columns = header[1].decode(), header[2] == b"True"
     shape = [int(size) for size in header[3].replace(b" ", b"").split(b",") if size]
@@ -547,13 +554,13 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
     actions = reply[0] if isinstance(reply, list) and len(reply) == 2 else reply
     if not isinstance(actions, dict) or not actions:
         raise MalformedMessage(
-            f"gr00t: got {type(actions).__name__} for an action, want a map of arrays"
+            f"gr00t: action: expected a map of arrays, got {type(actions).__name__}"
         )
     for name, array in actions.items():
         is_array = isinstance(name, str) and isinstance(array, np.ndarray)
         if not is_array or array.ndim not in (2, 3) or len(array) != number:
             raise MalformedMessage(
-                f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)"
+                f"gr00t: action {shown(name)}: expected ({number}, H, D), got {described(array)}"
             )
 
     split: list[dict[str, np.ndarray]] = []
@@ -585,7 +592,7 @@ def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
         MalformedMessage: The reply is not a map of configurations.
     """
     if not isinstance(reply, dict):
-        raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
+        raise MalformedMessage(f"gr00t: modalities: expected a map, got {type(reply).__name__}")
 
     first_modalities = list(reply.items())[:_KEYS_AT_MOST]
     return {str(name): _modality(str(name), value) for name, value in first_modalities}
@@ -604,14 +611,16 @@ def _modality(name: str, value: Any) -> dict[str, list[Any]]:
     steps = config.get("delta_indices") if isinstance(config, dict) else None
     if not isinstance(keys, list) or not isinstance(steps, list):
         raise MalformedMessage(
-            f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices"
+            f"gr00t: modality {name[:40]!r}: expected lists modality_keys and delta_indices, got "
+            f"{shown(config)}"
         )
 
     are_texts = all(isinstance(key, str) for key in keys)
     are_integers = all(type(step) is int for step in steps)
     if not are_texts or not are_integers:
         raise MalformedMessage(
-            f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists"
+            f"gr00t: modality {name[:40]!r}: expected texts and whole numbers in its lists, got "
+            f"{shown(config)}"
         )
 
     if name != "language":

@@ -89,37 +89,38 @@ def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions
 
     if type(rows) is not int or rows < 1:
         raise MalformedMessage(
-            f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more"
+            f"actions_per_chunk: expected an integer of 1 or more, got {_shown(rows)}"
         )
     if not (isinstance(features, dict) and isinstance(renames, dict)):
         raise MalformedMessage(
-            f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts"
+            f"lerobot_features, rename_map: expected dicts, got {_shown(features)}, "
+            f"{_shown(renames)}"
         )
     if renames:
         raise InvalidObservation(
-            "rename_map: got names, want none; rename them in dialects.lerobot.mapping"
+            "rename_map: expected no names, got some; rename them in dialects.lerobot.mapping"
         )
 
     state: tuple[str, ...] = ()
     for name, feature in features.items():
         if not isinstance(feature, dict):
             raise MalformedMessage(
-                f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict"
+                f"lerobot_features: {name[:_SHOWN]!r}: expected a dict, got {_shown(feature)}"
             )
         dtype = _text(feature, "dtype")
         if name == STATE and dtype == "float32":
             state = _names(feature)
         elif not (name.startswith(IMAGES) and dtype in ("image", "video")):
             raise InvalidObservation(
-                f"lerobot_features: got {name[:_SHOWN]!r} of {dtype[:_SHOWN]!r}, want {STATE!r} of "
-                f"float32, and images {IMAGES + 'NAME'!r}"
+                f"lerobot_features: expected {STATE!r} of float32, and images "
+                f"{IMAGES + 'NAME'!r}, got {name[:_SHOWN]!r} of {dtype[:_SHOWN]!r}"
             )
 
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
     if len(cameras) > limits.cameras or len(state) > limits.state_values:
         raise MessageTooLarge(
-            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the "
-            f"limits are {limits.cameras} and {limits.state_values}"
+            f"lerobot_features: expected at most {limits.cameras} cameras and "
+            f"{limits.state_values} numbers of state, got {len(cameras)} and {len(state)}"
         )
     return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
 
@@ -139,21 +140,23 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
     timestamp, timestep, values, must_go = (fields[name] for name in _REQUESTS[OBSERVATION])
 
     if not is_number(timestamp) or not math.isfinite(timestamp):
-        raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
+        raise MalformedMessage(f"timestamp: expected a finite number, got {_shown(timestamp)}")
     if type(timestep) is not int or not 0 <= timestep < _STEPS:
-        raise MalformedMessage(f"timestep: got {_shown(timestep)}, want an integer in [0, 2**31)")
+        raise MalformedMessage(
+            f"timestep: expected an integer in [0, 2**31), got {_shown(timestep)}"
+        )
     if type(must_go) is not bool:
-        raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
+        raise MalformedMessage(f"must_go: expected a bool, got {_shown(must_go)}")
     if not isinstance(values, dict):
-        raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
+        raise MalformedMessage(f"observation: expected a dict, got {_shown(values)}")
 
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             budget.count(value.nbytes)
         elif not (isinstance(value, (str, bool)) or is_number(value)):
             raise MalformedMessage(
-                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or "
-                "numpy array"
+                f"observation: {name[:_SHOWN]!r}: expected a number, text or numpy array, got "
+                f"{_shown(value)}"
             )
     return RobotObservation(float(timestamp), timestep, values, must_go)
 
@@ -188,7 +191,9 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
             if isinstance(value, np.ndarray) and value.size == 1:
                 value = value.item()
             if not is_number(value):
-                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
+                raise InvalidObservation(
+                    f"{name[:_SHOWN]!r}: expected a number, got {_shown(value)}"
+                )
             numbers.append(value)
         with np.errstate(over="ignore"):  # too large numbers become infinite, as in LeRobot
             frame_values[STATE] = np.array(numbers, np.float64).astype(np.float32)
@@ -221,7 +226,7 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
     """
     if timestep + len(rows) > _STEPS:
         raise InvalidObservation(
-            f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions"
+            f"timestep: expected one that leaves numbers for {len(rows)} actions, got {timestep}"
         )
 
     opcodes = [
@@ -262,7 +267,7 @@ def _text(fields: Mapping[str, Any], name: str) -> str:
     """Return the text in a field."""
     value = fields.get(name)
     if not isinstance(value, str):
-        raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
+        raise MalformedMessage(f"{name}: expected text, got {_shown(value)}")
     return value
 
 
@@ -275,7 +280,9 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the numbers of a feature."""
     names = feature.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InvalidObservation(f"lerobot_features: {STATE!r}: want `names`, a list of texts")
+        raise InvalidObservation(
+            f"lerobot_features: {STATE!r}: expected `names`, a list of texts, got {_shown(names)}"
+        )
     return tuple(names)
 
 
@@ -322,7 +329,7 @@ def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
         return TransferState(number), data
     except ValueError as error:
         raise MalformedMessage(
-            f"observation: got transfer state {number}, want 1, 2 or 3"
+            f"observation: expected transfer state 1, 2 or 3, got {number}"
         ) from error
 
 

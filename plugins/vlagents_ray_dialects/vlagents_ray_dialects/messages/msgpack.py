@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.protocol.values import require_plain
@@ -42,7 +42,9 @@ def unpack(
         InvalidInput: The hook raised it.
     """
     if len(data) > limits.body_bytes:
-        raise MessageTooLarge(f"message: got {len(data)} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(
+            f"message: expected at most {limits.body_bytes} bytes, got {len(data)}"
+        )
 
     msgpack = require("msgpack")
     count = 0
@@ -105,7 +107,7 @@ def pack(value: Any, default: Callable[[Any], Any]) -> bytes:
 
 def _refuse(code: int, _data: bytes) -> Any:
     """Reject an extension type, which msgpack calls for each of them."""
-    raise MalformedMessage(f"message: got an extension type, {code}; want plain values and arrays")
+    raise MalformedMessage(f"message: expected plain values and arrays, got extension type {code}")
 
 
 # Arrays in the format of the package `msgpack_numpy`: maps with the key `nd`.
@@ -125,7 +127,7 @@ def read_packed(node: Mapping[Any, Any]) -> np.ndarray:
 
     dtype, shape, data = fields.get("type"), fields.get("shape"), fields.get("data")
     if not isinstance(data, bytes) or fields.get("kind") not in (None, "", b""):
-        raise MalformedMessage("array: nd: want bytes of a plain array")
+        raise MalformedMessage(f"array: nd: expected bytes of a plain array, got {shown(data)}")
 
     dtype = dtype.decode(errors="replace") if isinstance(dtype, bytes) else dtype
     if fields["nd"] is not True:  # a number instead of an array

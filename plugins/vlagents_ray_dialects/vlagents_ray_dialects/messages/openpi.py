@@ -34,7 +34,7 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str, Any
     """
     value = decode_any(data, limits)
     if not isinstance(value, dict):
-        raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
+        raise MalformedMessage(f"message: expected a map, got {type(value).__name__}")
     return value
 
 
@@ -59,7 +59,7 @@ def _array(node: dict[Any, Any], most: int) -> Any:
     if b"__npgeneric__" in node:
         value = node.get(b"data")
         if not isinstance(value, (bool, int, float)):
-            raise MalformedMessage(f"scalar: got {type(value).__name__}, want a number")
+            raise MalformedMessage(f"scalar: expected a number, got {type(value).__name__}")
         dtype = plain_dtype(node.get(b"dtype"))
         try:
             if dtype.kind in "iu" and not np.iinfo(dtype).min <= value <= np.iinfo(dtype).max:
@@ -77,9 +77,9 @@ def _texts(data: bytes, dtype: str, most: int) -> list[str]:
     length = dtype.removeprefix("<U")
     size = 4 * int(length) if length.isascii() and length.isdigit() and len(length) < 9 else 0
     if not size or len(data) % size:
-        raise MalformedMessage(f"array: got {len(data)} bytes, want texts of {dtype[:20]!r}")
+        raise MalformedMessage(f"array: expected texts of {dtype[:20]!r}, got {len(data)} bytes")
     if len(data) // size > most:
-        raise MessageTooLarge(f"array: got {len(data) // size} texts, want {most} more at most")
+        raise MessageTooLarge(f"array: expected at most {most} more texts, got {len(data) // size}")
 
     texts = []
     try:
@@ -104,7 +104,9 @@ def _node(value: Any) -> Any:
         return value.item()
     if isinstance(value, Mapping):
         return dict(value)
-    raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
+    raise TypeError(
+        f"cannot send {type(value).__name__}; expected plain values and arrays of numbers"
+    )
 
 
 # Mappings of openpi's example clients, and of RoboArena's.

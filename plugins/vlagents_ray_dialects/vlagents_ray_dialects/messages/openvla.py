@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, MessageLimits
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, libero_state
@@ -34,13 +34,15 @@ def decode(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> tuple[dict[st
         MessageTooLarge: The body exceeds a limit.
     """
     if len(body) > limits.body_bytes:
-        raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(f"body: expected at most {limits.body_bytes} bytes, got {len(body)}")
 
     payload = _load(body, limits)
     is_encoded_twice = "encoded" in payload
     if is_encoded_twice:
         if len(payload) != 1 or not isinstance(payload["encoded"], str):
-            raise MalformedMessage("body: want 'encoded' alone, and text in it")
+            raise MalformedMessage(
+                f"body: expected 'encoded' alone, and text in it, got {shown(payload)}"
+            )
         payload = _load(payload["encoded"].encode("utf-8", "replace"), limits)
     return payload, is_encoded_twice
 
@@ -62,7 +64,7 @@ def _load(text: bytes, limits: MessageLimits) -> dict[str, Any]:
     """Return the object in a JSON text."""
     payload = json_numpy.loads(text, limits)
     if not isinstance(payload, dict):
-        raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
+        raise MalformedMessage(f"body: expected an object, got {type(payload).__name__}")
     return payload
 
 
@@ -89,7 +91,7 @@ def decode_action(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> np.nda
         value = json_numpy.rows(value)
     if not isinstance(value, np.ndarray):
         raise MalformedMessage(
-            f"action: got {type(value).__name__}, want an array, or a list of rows"
+            f"action: expected an array, or a list of rows, got {type(value).__name__}"
         )
     return value
 

@@ -46,7 +46,8 @@ class Outgoing:
             open_ended = sum(state_key.stop is None for state_key in state_keys)
             if open_ended > 1:
                 raise ConfigError(
-                    f"mapping.state.{name}: got {open_ended} parts without `stop`, want one at most"
+                    f"mapping.state.{name}: expected at most one part without `stop`, got "
+                    f"{open_ended}; add `stop` to the others"
                 )
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
@@ -106,8 +107,8 @@ class Outgoing:
             if len(arrays) == 1:
                 return next(iter(arrays.values()))
             raise InvalidAction(
-                f"action: got {sorted(arrays)[:16]}, want one array; say in mapping.action which "
-                "columns each is"
+                f"action: expected one array, got {sorted(arrays)[:16]}; list in mapping.action "
+                "the columns of each"
             )
 
         absent = [name for name in ranges if name not in arrays]
@@ -117,7 +118,7 @@ class Outgoing:
             )
         if len({arrays[name].shape[:-1] for name in ranges}) != 1:
             shapes = {name: arrays[name].shape for name in ranges}
-            raise InvalidAction(f"action: got {shapes}, want the same number of rows in all")
+            raise InvalidAction(f"action: expected the same number of rows in all, got {shapes}")
 
         pieces = []
         for name, columns in ranges.items():
@@ -125,8 +126,8 @@ class Outgoing:
             width = arrays[name].shape[-1]
             if stop is not None and width != stop - start:
                 raise InvalidAction(
-                    f"action {name!r}: got {width} columns, mapping.action says "
-                    f"{stop - start}, {start} to {stop}; change it"
+                    f"action {name!r}: expected {stop - start} columns, {start} to {stop} in "
+                    f"mapping.action, got {width}; change it"
                 )
             pieces.append((start, arrays[name]))
         return _joined("action", pieces, InvalidAction)
@@ -307,7 +308,8 @@ def _joined(
     end = max(start + piece.shape[-1] for start, piece in pieces)
     if min(start for start, _ in pieces) < 0 or end > _MOST:
         raise ConfigError(
-            f"mapping: {key!r}: got places up to {end}, want 0 to {_MOST}, counted from the front"
+            f"mapping: {key!r}: expected places from 0 to {_MOST}, counted from the front, got "
+            f"some up to {end}"
         )
 
     whole = np.empty((*pieces[0][1].shape[:-1], end), np.float32)
@@ -326,6 +328,6 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     """Return an array of actions as float32; raise `InvalidAction` if it is none."""
     is_numeric = isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
     if not is_numeric or not 0 < value.ndim <= 2:
-        raise InvalidAction(f"{name!r}: got {described(value)}, want (D,) or (H, D) numbers")
+        raise InvalidAction(f"{name!r}: expected (D,) or (H, D) numbers, got {described(value)}")
     actions: np.ndarray = value.astype(np.float32)
     return actions

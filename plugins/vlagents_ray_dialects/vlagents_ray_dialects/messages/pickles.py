@@ -106,7 +106,7 @@ def fields_of(value: Any, class_name: Name) -> dict[str, Any]:
     """
     if not isinstance(value, Record) or value.name != class_name or value.fields is None:
         raise MalformedMessage(
-            f"pickle: got {_described(value)}, want a {class_name.name} with its fields"
+            f"pickle: expected a {class_name.name} with its fields, got {_described(value)}"
         )
     return value.fields
 
@@ -138,7 +138,7 @@ class _StackMachine:
         """Execute all opcodes, and return the object that remains on the stack."""
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
             raise MalformedMessage(
-                f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}"
+                f"pickle: expected one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}, got another"
             )
 
         opcode = self.take(1)[0]
@@ -178,7 +178,7 @@ class _StackMachine:
         """Push the text in the next `length` bytes."""
         if length > self._limits.text:
             raise MessageTooLarge(
-                f"pickle: a text of {length} bytes, the limit is {self._limits.text}"
+                f"pickle: expected a text of at most {self._limits.text} bytes, got {length}"
             )
         try:
             self.push(str(self.take(length), "utf-8"))
@@ -189,7 +189,9 @@ class _StackMachine:
         """Push a long integer."""
         length = self.take(1)[0]
         if length > _INTEGER:
-            raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
+            raise MessageTooLarge(
+                f"pickle: expected an integer of at most {_INTEGER} bytes, got {length}"
+            )
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 
     def mark(self) -> None:
@@ -231,7 +233,7 @@ class _StackMachine:
         """Add keys and values, which alternate in `entries`, to the dict below them."""
         keys = [entry.value for entry in entries[::2]]
         if len(entries) % 2 or not all(type(key) is str for key in keys):
-            raise MalformedMessage("pickle: want a dict with texts as keys")
+            raise MalformedMessage("pickle: expected a dict with texts as keys, got other keys")
         values = [_finished(entry.value) for entry in entries[1::2]]
         self._into(dict, entries).update(zip(keys, values, strict=True))
 
@@ -263,7 +265,7 @@ class _StackMachine:
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
             raise MalformedMessage(
-                f"pickle: got a call of {_described(name)}, want a numpy array of numbers"
+                f"pickle: expected a numpy array of numbers, got a call of {_described(name)}"
             )
         self.push(read(arguments))
 
@@ -272,7 +274,7 @@ class _StackMachine:
         arguments, name = self.pop(), self.pop()
         if arguments != () or not isinstance(name, Name) or name not in self._records:
             raise MalformedMessage(
-                f"pickle: got an object of {_described(name)}, want one of LeRobot's messages"
+                f"pickle: expected one of LeRobot's messages, got an object of {_described(name)}"
             )
         self.push(Record(name))
 
@@ -285,7 +287,8 @@ class _StackMachine:
             if state.value.keys() != set(fields):
                 field_names = shown(list(state.value))
                 raise MalformedMessage(
-                    f"pickle: {target.name.name}: got the fields {field_names}, want {list(fields)}"
+                    f"pickle: {target.name.name}: expected {list(fields)}, got the fields "
+                    f"{field_names}"
                 )
             target.fields = state.value
             self._stack[-1] = _StackValue(target, state.depth + 1)
@@ -317,7 +320,7 @@ class _StackMachine:
         container = self._entry()
         if type(container.value) is not container_type:
             raise MalformedMessage(
-                f"pickle: got {_described(container.value)}, want a {container_type.__name__}"
+                f"pickle: expected a {container_type.__name__}, got {_described(container.value)}"
             )
         items = container.items + sum(entry.items for entry in entries)
         self.push(container.value, max(container.depth, _above(entries)), items)
@@ -427,7 +430,7 @@ def _dtype(arguments: tuple[Any, ...]) -> Reduced:
     match arguments:
         case (str(code), bool() | int(), bool() | int()):
             return Reduced(lambda state: _ordered_dtype(code, state))
-    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers")
+    raise MalformedMessage("pickle: numpy.dtype: expected the type of plain numbers, got another")
 
 
 def _ordered_dtype(code: str, state: Any) -> _Dtype:
@@ -436,7 +439,8 @@ def _ordered_dtype(code: str, state: Any) -> _Dtype:
         case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
             return _Dtype(order + code)
     raise MalformedMessage(
-        "pickle: numpy.dtype: want the type of plain numbers in little-endian order"
+        "pickle: numpy.dtype: expected the type of plain numbers in little-endian order, got "
+        "another"
     )
 
 
@@ -447,7 +451,7 @@ def _array(arguments: tuple[Any, ...]) -> Reduced:
     match arguments:
         case (Name("numpy", "ndarray"), (int(0),), memoryview() as code) if bytes(code[:2]) == b"b":
             return Reduced(_content)
-    raise MalformedMessage("pickle: numpy: want a plain array")
+    raise MalformedMessage("pickle: numpy: expected a plain array, got another")
 
 
 def _content(state: Any) -> np.ndarray:
@@ -456,7 +460,8 @@ def _content(state: Any) -> np.ndarray:
         case (int(1), tuple(shape), _Dtype() as dtype, bool(by_columns), memoryview() as data):
             return _ordered(data, dtype, shape, by_columns)
     raise MalformedMessage(
-        "pickle: numpy: want the shape, the type of numbers and the data of an array"
+        "pickle: numpy: expected the shape, the type of numbers and the data of an array, got "
+        "others"
     )
 
 
@@ -466,7 +471,7 @@ def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
         case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
             return Reduced(value=_ordered(data, dtype, shape, order == "F"))
     raise MalformedMessage(
-        "pickle: numpy: want an array by rows; send numpy.ascontiguousarray of it"
+        "pickle: numpy: expected an array by rows; send numpy.ascontiguousarray of it"
     )
 
 
@@ -476,7 +481,7 @@ def _scalar(arguments: tuple[Any, ...]) -> int | float:
         case (_Dtype() as dtype, memoryview() as data):
             number: int | float = read_array(data, str(dtype), ()).item()
             return number
-    raise MalformedMessage("pickle: numpy: want a plain number")
+    raise MalformedMessage("pickle: numpy: expected a plain number, got another")
 
 
 def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:

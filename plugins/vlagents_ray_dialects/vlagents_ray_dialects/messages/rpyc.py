@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 
 HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
 END = b"\n"
@@ -78,7 +78,7 @@ def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
     """
     length, compressed = HEADER.unpack(header)
     if length > limit:
-        raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
+        raise MessageTooLarge(f"rpyc: expected a message of at most {limit} bytes, got {length}")
     if compressed > 1 or length == 0:
         raise MalformedMessage("rpyc: not a frame")
     return length + len(END), bool(compressed)
@@ -106,14 +106,14 @@ def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall
     if message_type in (_REPLY, _EXCEPTION):
         return None
     if message_type != _REQUEST:
-        raise MalformedMessage(f"rpyc: got a message of kind {message_type}, want a request")
+        raise MalformedMessage(f"rpyc: expected a request, got a message of kind {message_type}")
 
     content = read_brine(message[1:])
     if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
-        raise MalformedMessage("rpyc: want (sequence number, request)")
+        raise MalformedMessage(f"rpyc: expected (sequence number, request), got {shown(content)}")
     sequence, request = content
     if not (isinstance(request, tuple) and len(request) == 2 and _is_int(request[0])):
-        raise MalformedMessage("rpyc: want (handler, arguments)")
+        raise MalformedMessage(f"rpyc: expected (handler, arguments), got {shown(request)}")
 
     try:
         handler = Handler(request[0])
@@ -124,7 +124,7 @@ def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall
     except MalformedMessage as error:
         raise Refused(sequence, str(error)) from error
     if not isinstance(args, tuple):
-        raise Refused(sequence, "rpyc: want a tuple of arguments")
+        raise Refused(sequence, f"rpyc: expected a tuple of arguments, got {shown(args)}")
     return RpycCall(sequence, handler, args)
 
 
@@ -196,7 +196,7 @@ def read_reply(
         return None
     content = read_brine(message[1:])
     if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
-        raise MalformedMessage("rpyc: want (sequence number, reply)")
+        raise MalformedMessage(f"rpyc: expected (sequence number, reply), got {shown(content)}")
     return content[0], message[0] == _REPLY, content[1]
 
 
@@ -230,7 +230,7 @@ def _frame(message_type: int, content: tuple[Any, ...]) -> bytes:
 def _unbox(boxed: Any) -> Any:
     """Return the value in a box, or the reference."""
     if not (isinstance(boxed, tuple) and len(boxed) == 2):
-        raise MalformedMessage("rpyc: want (label, value)")
+        raise MalformedMessage(f"rpyc: expected (label, value), got {shown(boxed)}")
     label, value = boxed
     if label == VALUE:
         return value
@@ -349,7 +349,7 @@ class _BrineReader:
         if tag in _INTS:
             return self._integer(self._length(_INTS[tag]))
         raise MalformedMessage(
-            f"brine: got a value of kind {tag:#04x}, want text, numbers or tuples"
+            f"brine: expected text, numbers or tuples, got a value of kind {tag:#04x}"
         )
 
     def _text(self, depth: int) -> str:
@@ -365,7 +365,9 @@ class _BrineReader:
     def _tuple(self, length: int, depth: int) -> tuple[Any, ...]:
         """Return a tuple of this many values."""
         if length > _ITEMS:
-            raise MessageTooLarge(f"brine: a tuple of {length} values, the limit is {_ITEMS}")
+            raise MessageTooLarge(
+                f"brine: expected a tuple of at most {_ITEMS} values, got {length}"
+            )
         return tuple(self._value(depth + 1) for _ in range(length))
 
     def _integer(self, length: int) -> int:

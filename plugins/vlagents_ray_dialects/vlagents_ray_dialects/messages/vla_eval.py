@@ -65,15 +65,17 @@ def decode(data: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> VlaEvalMessag
 
     raw = unpack(data, limits, array)
     if not isinstance(raw, dict) or not raw.keys() >= {"type", "payload", "seq"}:
-        raise MalformedMessage("message: want a map with type, payload and seq")
+        raise MalformedMessage(
+            f"message: expected a map with type, payload and seq, got {shown(raw)}"
+        )
 
     kind, payload, seq = raw["type"], raw["payload"], raw["seq"]
     if not isinstance(kind, str) or kind not in get_args(Kind):
-        raise MalformedMessage(f"type: got {shown(kind)}, want one of {list(get_args(Kind))}")
+        raise MalformedMessage(f"type: expected one of {list(get_args(Kind))}, got {shown(kind)}")
     if not isinstance(payload, dict):
-        raise MalformedMessage(f"payload: got {type(payload).__name__}, want a map")
+        raise MalformedMessage(f"payload: expected a map, got {type(payload).__name__}")
     if type(seq) is not int or not 0 <= seq < 2**63:
-        raise MalformedMessage(f"seq: got {shown(seq)}, want a whole number")
+        raise MalformedMessage(f"seq: expected a whole number, got {shown(seq)}")
     return VlaEvalMessage(kind, payload, seq)  # type: ignore[arg-type]  # the kind was checked above
 
 
@@ -132,7 +134,7 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
         return read_array(data, node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]  # it checks
     if form not in ("png", "jpeg") or not isinstance(data, bytes):
         raise MalformedMessage(
-            f"image: got format {shown(form, 20)}, want raw, png or jpeg, and bytes"
+            f"image: expected the format raw, png or jpeg, and bytes, got {shown(form, 20)}"
         )
     return _File(data)
 
@@ -148,7 +150,9 @@ def _node(value: Any) -> Any:
         }
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
-    raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
+    raise TypeError(
+        f"cannot send {type(value).__name__}; expected plain values and arrays of numbers"
+    )
 
 
 # The mapping of vla-eval's benchmarks.

@@ -134,13 +134,18 @@ def read_reset(
     budget.begin("reset")
     document = json_numpy.loads(text, budget.limits, _LEVELS)
     if not (isinstance(document, list) and len(document) == 3):
-        raise MalformedMessage("reset: want [observation, instruction, options]")
+        raise MalformedMessage(
+            f"reset: expected [observation, instruction, options], got {shown(document)}"
+        )
 
     request = _read(document[0], budget, segments)
     kwargs = _mapping(document[2], "reset: options")
     no_options = kwargs.keys() & _NO_OPTIONS
     if no_options:
-        raise MalformedMessage(f"reset: got the options {sorted(no_options)}, which are no options")
+        raise MalformedMessage(
+            f"reset: expected options of the policy, got {sorted(no_options)}, which the server "
+            "sets"
+        )
 
     instruction = _instruction(document[1], budget.limits)
     return ObservationRequest(request.obs, instruction, request.robots), kwargs
@@ -187,17 +192,17 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
     _require_known(top, _TOP_3, "observation")
     robots = _mapping(top["obs"], "observation.obs")
     if not robots:
-        raise InvalidObservation("observation.obs: got no robot, want one or more")
+        raise InvalidObservation("observation.obs: expected one robot or more, got none")
     if len(robots) > limits.cameras:
         raise MessageTooLarge(
-            f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}"
+            f"observation.obs: expected at most {limits.cameras} robots, got {len(robots)}"
         )
 
     # The cameras of all robots are counted before the first image is decoded.
     views = [robot.get("cameras") for robot in robots.values() if isinstance(robot, dict)]
     cameras = sum(len(view) for view in views if isinstance(view, dict))
     if cameras > limits.cameras:
-        raise MessageTooLarge(f"cameras: got {cameras}, the limit is {limits.cameras}")
+        raise MessageTooLarge(f"cameras: expected at most {limits.cameras}, got {cameras}")
 
     obs = Obs()
     for name, fields in robots.items():
@@ -231,7 +236,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
     limits = budget.limits
     cameras = _mapping(robot.get("cameras") or {}, "cameras")
     if len(cameras) > limits.cameras:
-        raise MessageTooLarge(f"cameras: got {len(cameras)}, the limit is {limits.cameras}")
+        raise MessageTooLarge(f"cameras: expected at most {limits.cameras}, got {len(cameras)}")
 
     image_format = robot.get("camera_data_type", RAW)
     obs = Obs()
@@ -250,7 +255,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
             gripper = gripper.item()
         if not is_number(gripper):
             raise InvalidObservation(
-                f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open"
+                f"gripper: expected a number in [0, 1] where 1 = open, got {shown(gripper)}"
             )
         if prefix:
             obs.state[f"{prefix}gripper"] = np.array([gripper], np.float32)
@@ -264,10 +269,10 @@ def _vector(value: Any, name: str, limits: MessageLimits) -> np.ndarray:
     if isinstance(value, list) and all(map(is_number, value)):
         value = np.asarray(value, np.float32)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        raise InvalidObservation(f"{name}: got {type(value).__name__}, want (D,) float32")
+        raise InvalidObservation(f"{name}: expected (D,) float32, got {type(value).__name__}")
     if value.size > limits.state_values:
         raise MessageTooLarge(
-            f"{name}: got {value.size} values, the limit is {limits.state_values}"
+            f"{name}: expected at most {limits.state_values} values, got {value.size}"
         )
     return value.astype(np.float32).reshape(-1)
 
@@ -287,23 +292,23 @@ def _image(
     elif image_format == RAW:
         if not isinstance(image, np.ndarray):
             raise InvalidObservation(
-                f"camera {name[:40]!r}: got {type(image).__name__}, want an array"
+                f"camera {name[:40]!r}: expected an array, got {type(image).__name__}"
             )
         frame = image
     else:
         raise MalformedMessage(
-            f"camera_data_type: got {shown(image_format)}, want {RAW!r}, {JPEG!r} or {SHARED!r}"
+            f"camera_data_type: expected {RAW!r}, {JPEG!r} or {SHARED!r}, got {shown(image_format)}"
         )
 
     if frame.ndim == 4 and len(frame):
         frame = frame[-1]
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise InvalidObservation(
-            f"camera {name[:40]!r}: got {frame.shape} {frame.dtype}, want (H, W, 3) uint8 RGB"
+            f"camera {name[:40]!r}: expected (H, W, 3) uint8 RGB, got {frame.shape} {frame.dtype}"
         )
     if frame.shape[0] * frame.shape[1] > limits.pixels:
         raise MessageTooLarge(
-            f"camera {name[:40]!r}: got {frame.shape[:2]} pixels, the limit is {limits.pixels}"
+            f"camera {name[:40]!r}: expected at most {limits.pixels} pixels, got {frame.shape[:2]}"
         )
     return frame
 
@@ -313,14 +318,16 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
     _require_known(payload, {"shm_name", "shape", "dtype"}, "shared memory")
     name, shape = payload.get("shm_name"), payload.get("shape")
     if not isinstance(name, str) or payload.get("dtype", "uint8") != "uint8":
-        raise MalformedMessage("shared memory: want a name, and pixels of uint8")
+        raise MalformedMessage(
+            f"shared memory: expected a name, and pixels of uint8, got {shown(payload)}"
+        )
     if not _is_shape(shape):
-        raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
+        raise MalformedMessage(f"shared memory: expected the shape (H, W, 3), got {shown(shape)}")
 
     size = math.prod(shape)
     if size > budget.limits.body_bytes:
         raise MessageTooLarge(
-            f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}"
+            f"shared memory: expected at most {budget.limits.body_bytes} bytes, got {size}"
         )
     budget.hold(size)
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)
@@ -336,10 +343,10 @@ def _is_shape(value: object) -> TypeGuard[list[int]]:
 def _instruction(value: Any, limits: MessageLimits) -> str | None:
     """Return an instruction, which may be missing."""
     if value is not None and not isinstance(value, str):
-        raise MalformedMessage(f"instruction: got {type(value).__name__}, want text")
+        raise MalformedMessage(f"instruction: expected text, got {type(value).__name__}")
     if value is not None and len(value) > limits.text:
         raise MessageTooLarge(
-            f"instruction: got {len(value)} characters, the limit is {limits.text}"
+            f"instruction: expected at most {limits.text} characters, got {len(value)}"
         )
     return value
 
@@ -347,7 +354,7 @@ def _instruction(value: Any, limits: MessageLimits) -> str | None:
 def _mapping(value: Any, path: str) -> dict[str, Any]:
     """Return a JSON object; raise `MalformedMessage` for anything else."""
     if not isinstance(value, dict):
-        raise MalformedMessage(f"{path}: got {type(value).__name__}, want an object")
+        raise MalformedMessage(f"{path}: expected an object, got {type(value).__name__}")
     return value
 
 
@@ -356,7 +363,7 @@ def _require_known(value: Mapping[str, Any], known_keys: set[str], path: str) ->
     unknown = value.keys() - known_keys
     if unknown:
         raise MalformedMessage(
-            f"{path}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known_keys)}"
+            f"{path}: expected some of the keys {sorted(known_keys)}, got {shown(sorted(unknown))}"
         )
 
 
@@ -410,7 +417,7 @@ def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[
         text = content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR)
         return sequence, RemoteError(text)
     if not (isinstance(content, tuple) and len(content) == 2):
-        raise MalformedMessage("rpyc: want (label, value)")
+        raise MalformedMessage(f"rpyc: expected (label, value), got {shown(content)}")
     return sequence, content[1]
 
 
@@ -462,10 +469,14 @@ def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str,
     steps = document.get("acts") if isinstance(document, dict) else None
     if not _are_steps(steps):
         raise MalformedMessage(
-            "vlagents: want `acts`, a list of one step or more, with the robots of each"
+            "vlagents: expected `acts`, a list of one step or more, with the robots of each, got "
+            f"{shown(steps)}"
         )
     if any(step.keys() != steps[0].keys() for step in steps):
-        raise MalformedMessage("vlagents: want the same robots in each step of `acts`")
+        raise MalformedMessage(
+            "vlagents: expected the same robots in each step of `acts`, got others than "
+            f"{shown(list(steps[0]))}"
+        )
 
     actions = {}
     try:
@@ -491,7 +502,9 @@ def _row(robot: str, act: Any) -> np.ndarray:
     if isinstance(action, list) and all(map(is_number, action)):
         action = np.asarray(action)
     if not isinstance(action, np.ndarray) or action.ndim != 1 or action.dtype.kind not in "fiu":
-        raise MalformedMessage(f"vlagents: action of {robot[:40]!r}: want (D,) numbers")
+        raise MalformedMessage(
+            f"vlagents: action of {robot[:40]!r}: expected (D,) numbers, got {shown(action)}"
+        )
 
     gripper = act.get("gripper")
     if gripper is None:
@@ -500,6 +513,6 @@ def _row(robot: str, act: Any) -> np.ndarray:
         gripper = gripper.item()
     if not is_number(gripper):
         raise MalformedMessage(
-            f"vlagents: gripper of {robot[:40]!r}: got {type(gripper).__name__}, want a number"
+            f"vlagents: gripper of {robot[:40]!r}: expected a number, got {type(gripper).__name__}"
         )
     return np.append(action, gripper)

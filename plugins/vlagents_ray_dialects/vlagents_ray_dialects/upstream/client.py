@@ -115,9 +115,11 @@ class UpstreamClient(abc.ABC):
 
         if not wrong:
             return []
-        return [
-            f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change mapping.cameras"
-        ]
+        difference = (
+            f"cameras: expected {keys}, which the upstream reads, got {wrong} in the mapping; "
+            "change mapping.cameras"
+        )
+        return [difference]
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
         """Return the number of rows of the upstream's actions; None if the metadata do not contain
@@ -175,6 +177,6 @@ class UpstreamClient(abc.ABC):
     def unreadable(self, content: object, expected: str) -> MalformedMessage:
         """Return the error for an answer that violates the protocol."""
         return MalformedMessage(
-            f"upstream {self.options.url}: got {content}, want {expected}; does it speak the "
-            "protocol of the deployment?"
+            f"upstream {self.options.url}: expected {expected}, got {content}; check whether it "
+            "speaks the protocol of the deployment"
         )

@@ -125,13 +125,13 @@ class GR00TClient(UpstreamClient):
 
             if missing:
                 differences.append(
-                    f"{modality}: the upstream needs {missing}, the mapping gives {sent_keys}; add "
-                    f"them to mapping.{field}"
+                    f"{modality}: expected {missing}, which the upstream needs, got {sent_keys} "
+                    f"in the mapping; add them to mapping.{field}"
                 )
             if len(needed["steps"]) > 1:
                 differences.append(
-                    f"{modality}: the upstream needs the moments {needed['steps']}, and only the "
-                    "newest is sent; serve a model that needs one"
+                    f"{modality}: expected one moment, as only the newest is sent, got "
+                    f"{needed['steps']} from the upstream; serve a model that needs one"
                 )
 
         names = metadata.get("action", {"keys": []})["keys"]

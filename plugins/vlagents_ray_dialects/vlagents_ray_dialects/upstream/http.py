@@ -82,7 +82,7 @@ class HttpClient(UpstreamClient):
             try:
                 metadata = json_numpy.loads(self._request("GET", path, None), self.options.limits)
             except VLAgentsError as error:
-                raise PolicyUnavailable(f"{error}; want its metadata at {path}") from error
+                raise PolicyUnavailable(f"{error}; expected its metadata at {path}") from error
             finally:
                 self.close()  # the upstream may have closed the connection
         self._open(timeout_s)
@@ -206,13 +206,13 @@ class FlashRTClient(HttpClient):
         differences = []
         if unfit or not cameras:
             differences.append(
-                f"cameras: got {unfit}, want images/NAME for each, none optional; change "
+                f"cameras: expected images/NAME for each, none optional, got {unfit}; change "
                 "mapping.cameras"
             )
         instruction = outgoing.mapping.instruction
         if instruction != "prompt":
             differences.append(
-                f"instruction: got {instruction!r}, want 'prompt'; change mapping.instruction"
+                f"instruction: expected 'prompt', got {instruction!r}; change mapping.instruction"
             )
         return differences
 
@@ -221,8 +221,8 @@ class FlashRTClient(HttpClient):
         shapes = sorted({image.shape for image in images})
         if len(shapes) != 1 or not observation.get("prompt"):
             raise InvalidObservation(
-                f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images "
-                "of one shape and a prompt; resize them, and reset with an instruction"
+                f"flashrt: expected images of one shape and a prompt, got images of {shapes} and "
+                f"the keys {sorted(observation)}; resize them, and reset with an instruction"
             )
 
         body: dict[str, Any] = {}

@@ -128,14 +128,17 @@ class UpstreamConfig(BaseModel, extra="forbid"):
             address = urlsplit(url)
             if address.scheme not in self.client.schemes or not address.hostname:
                 forms = " or ".join(f"{scheme}://HOST:PORT" for scheme in self.client.schemes)
-                raise ValueError(f"urls: got {url!r}, want {forms} for {self.protocol}")
+                raise ValueError(f"urls: expected {forms} for {self.protocol}, got {url!r}")
             if address.username is not None or address.password is not None:
                 raise ValueError(
-                    "urls: got a name or a password in one; put the key into a variable, and name "
-                    "it in key_env"
+                    "urls: expected no name and no password in them, got one; put the key into a "
+                    "variable, and name it in key_env"
                 )
         if self.key_env is not None and not self.client.takes_key:
-            raise ValueError(f"key_env: {self.protocol} has no place for a key; remove it")
+            raise ValueError(
+                f"key_env: expected none, as {self.protocol} has no place for a key, got one; "
+                "remove it"
+            )
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
                 f"mapping: {self.protocol} has none of its own; give an object, or a preset, such "

@@ -139,7 +139,9 @@ class OpenPiClient(WebSocketClient):
             return self._map(self.recv(timeout_s))
         except VLAgentsError as error:
             self.close()
-            raise PolicyUnavailable(f"{error}; its first message must be its metadata") from error
+            raise PolicyUnavailable(
+                f"{error}; expected its metadata as the first message"
+            ) from error
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
@@ -232,13 +234,13 @@ class RoboArenaClient(OpenPiClient):
         external = metadata.get("n_external_cameras")
         if isinstance(external, int) and external > have:
             differences.append(
-                f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
-                f"add them to mapping.cameras"
+                f"cameras: expected {external} external ones, which the upstream needs, got "
+                f"{have} in the mapping; add them to mapping.cameras"
             )
         if metadata.get("needs_wrist_camera") is True and not wrist_cameras:
             differences.append(
-                "cameras: the upstream needs one at the wrist, the mapping has none; add it to "
-                "mapping.cameras"
+                "cameras: expected one at the wrist, which the upstream needs, got none in the "
+                "mapping; add it to mapping.cameras"
             )
         return differences
 
@@ -288,8 +290,8 @@ class VlaEvalClient(WebSocketClient):
         if theirs != vla_eval.PROTOCOL_VERSION:
             self.close()
             raise PolicyUnavailable(
-                f"upstream {self.options.url}: got protocol version {shown(theirs, 20)}, "
-                f"want {vla_eval.PROTOCOL_VERSION}"
+                f"upstream {self.options.url}: expected protocol version "
+                f"{vla_eval.PROTOCOL_VERSION}, got {shown(theirs, 20)}"
             )
         return {key: hello[key] for key in _METADATA_KEYS if key in hello}
 
@@ -318,8 +320,8 @@ class VlaEvalClient(WebSocketClient):
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
             sentence = (
-                "state: the upstream needs it (send_state), the mapping has none; add it to "
-                "mapping.state"
+                "state: expected one, which the upstream needs (send_state), got none in the "
+                "mapping; add it to mapping.state"
             )
             return [sentence]
         return []
