@@ -85,13 +85,14 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
 
     branch = DiffusionPolicyConfig(checkpoint="org/name@main", trust_checkpoint=True)
     with pytest.raises(
-        ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"
+        ConfigError,
+        match=rf"expected the commit that you trust, as this is a pickle of the hub.*{NAMED}",
     ):
         checkpoint_file(branch)
 
     (snapshot / "other.ckpt").touch()
     with pytest.raises(
-        ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"
+        ConfigError, match=r"expected one \.ckpt file.*\['checkpoints/latest.ckpt', 'other.ckpt'\]"
     ):
         checkpoint_file(config)
 

@@ -95,7 +95,7 @@ def test_a_step_that_is_not_lerobots_is_refused_with_the_cure(name: object, tmp_
     )
     with pytest.raises(
         ConfigError,
-        match=r"policy_preprocessor\.json: got a step of the class .* trust_remote_code: true",
+        match=r"policy_preprocessor\.json: expected a step with a registry_name.* trust_remote_code: true",
     ):
         require_known_steps(file)
 
@@ -172,7 +172,9 @@ def test_anything_else_is_refused_at_every_depth_with_the_cure(
         {"encoder": deep},
         {"text": TEXT | {"args": [foreign]}},
     ):
-        with pytest.raises(ConfigError, match=r"config\.json: names .* trust_remote_code: true"):
+        with pytest.raises(
+            ConfigError, match=r"config\.json: expected a class of .* trust_remote_code: true"
+        ):
             require_own_classes(config(tmp_path, **changed))
 
 
@@ -208,7 +210,7 @@ def test_octo_loads_nothing_before_the_check(
     for name in ("example_batch.msgpack", "dataset_statistics.json", "7/default"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).touch()
-    with used_checkpoints() as used, pytest.raises(ConfigError, match="names 'system' of 'os'"):
+    with used_checkpoints() as used, pytest.raises(ConfigError, match="got 'system' of 'os'"):
         OctoNetwork.load(OctoConfig(checkpoint=str(folder)))
     assert loaded == []
     assert [path.name for path in used] == [

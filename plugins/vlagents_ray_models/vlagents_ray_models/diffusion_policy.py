@@ -261,9 +261,9 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
     if commit is not None and commit not in config.checkpoint:
         repository = config.checkpoint.partition("@")[0]
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may "
-            f"become others; want the commit that you trust, such as {repository}@{commit}, which "
-            "it is now"
+            "checkpoint: expected the commit that you trust, as this is a pickle of the hub, "
+            f"whose branches and tags may become others, got {config.checkpoint!r}; name it as "
+            f"{repository}@{commit}, which it is now"
         )
 
     if path.is_file():
@@ -272,8 +272,8 @@ def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
     if len(files) != 1:
         names = [str(file.relative_to(path)) for file in files[:10]]
         raise ConfigError(
-            f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only "
-            "one"
+            f"checkpoint {path}: expected one .ckpt file, or a folder with only one, got a folder "
+            f"with {names}; name the file"
         )
     return find_checkpoint(str(files[0]))
 
@@ -289,15 +289,15 @@ def _read_payload(path: Path) -> tuple[Any, Mapping[str, Any]]:
         settings, states = payload["cfg"], payload["state_dicts"]
     except Exception as error:  # unpickling can raise any exception
         raise ConfigError(
-            f"checkpoint {path}: got no payload of a Diffusion Policy workspace "
-            f"({type(error).__name__}: {error}); want a .ckpt that its save_checkpoint wrote"
+            f"checkpoint {path}: expected a .ckpt that save_checkpoint of a Diffusion Policy "
+            f"workspace wrote, got no such payload ({type(error).__name__}: {error})"
         ) from error
 
     averages = require("omegaconf").OmegaConf.select(settings, "training.use_ema")
     name = "ema_model" if averages else "model"
     if name not in states:
         raise ConfigError(
-            f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has "
+            f"checkpoint {path}: expected {name!r}, which its training.use_ema needs, got "
             f"{sorted(states)}"
         )
     return settings, states[name]
@@ -317,16 +317,17 @@ def _make_module(path: Path, settings: Any) -> Any:
     module = require("hydra.utils").instantiate(settings.policy)
     if not hasattr(module, "noise_scheduler"):
         raise ConfigError(
-            f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of "
-            "diffusion_policy.policy's Diffusion…Policy"
+            f"checkpoint {path}: expected one of diffusion_policy.policy's Diffusion…Policy, got "
+            f"{type(module).__name__}"
         )
 
     for submodule in module.modules():
         cls = type(submodule)
         if cls.__name__ == "CropRandomizer" and "robomimic" in cls.__module__:
             raise ConfigError(
-                f"checkpoint {path}: its encoder crops at random while it acts, so actions would "
-                "depend on neighbours; want one trained with eval_fixed_crop: true"
+                f"checkpoint {path}: expected an encoder trained with eval_fixed_crop: true, got "
+                "one that crops at random while it acts, so that actions would depend on "
+                "neighbours; train it with that"
             )
     return module
 

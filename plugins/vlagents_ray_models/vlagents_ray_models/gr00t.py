@@ -136,7 +136,7 @@ def _read_processor(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     except FileNotFoundError as error:
         files = sorted(file.name for file in folder.iterdir())
         raise ConfigError(
-            f"checkpoint {folder}: has no {Path(error.filename).name}, has {files}; {_CURE}"
+            f"checkpoint {folder}: expected {Path(error.filename).name}, got {files}; {_CURE}"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
@@ -156,7 +156,7 @@ def _choose_embodiment(
     if name is None or name not in usable:
         unusable = sorted(set(configs) - set(statistics))
         hint = f"; {unusable} have no statistics in this checkpoint" if unusable else ""
-        raise ConfigError(f"embodiment: got {name!r}, want one of {usable}{hint}")
+        raise ConfigError(f"embodiment: expected one of {usable}, got {name!r}{hint}")
     return name
 
 
@@ -185,8 +185,9 @@ def _bounds(
     )
     if lower.ndim != 1 or not lower.size or lower.shape != upper.shape:
         raise ConfigError(
-            f"checkpoint {folder}: {STATISTICS} has no {list(bound_names)} of {kind} {group!r}, "
-            f"has those of {sorted(of_kind)}; without them its numbers have no units: {_CURE}"
+            f"checkpoint {folder}: expected {list(bound_names)} of {kind} {group!r} in "
+            f"{STATISTICS}, got those of {sorted(of_kind)}; without them its numbers have no "
+            f"units: {_CURE}"
         )
     if not np.isfinite([lower, upper]).all():
         raise ConfigError(
@@ -342,9 +343,9 @@ class Gr00tNetwork:
         embodiment.require_fits(model.config)
         if embodiment.value not in processor.embodiment_id_mapping:
             raise ConfigError(
-                f"embodiment {embodiment.value!r}: has no number in embodiment_id.json, which has "
-                f"{sorted(processor.embodiment_id_mapping)}; save the checkpoint's processor with "
-                "it"
+                "embodiment: expected one in embodiment_id.json, "
+                f"{sorted(processor.embodiment_id_mapping)}, got {embodiment.value!r}; save the "
+                "checkpoint's processor with it"
             )
 
         if config.steps is not None:
@@ -462,8 +463,8 @@ def _use_checkout(source_dir: str | None) -> Path:
     use_source("gr00t", SOURCE, source_dir)
     if importlib.util.find_spec("gr00t.policy") is None:
         raise ConfigError(
-            f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or "
-            "before, want that of N1.6 or N1.7; serve N1.5 by its own server, and the policy "
+            f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: expected GR00T's code of N1.6 or "
+            "N1.7, got that of N1.5 or before; serve N1.5 by its own server, and the policy "
             "`upstream` in front of it"
         )
     # Otherwise its import queries PyPI for a newer version.
@@ -515,8 +516,8 @@ def _require_version(folder: Path) -> None:
     else:
         cure = "name the checkout of its version"
     raise ConfigError(
-        f"checkpoint {folder}: got model_type {model_type!r}, this checkout has {registered}; "
-        f"{cure}"
+        f"checkpoint {folder}: expected a model_type of this checkout, {registered}, got "
+        f"{model_type!r}; {cure}"
     )
 
 

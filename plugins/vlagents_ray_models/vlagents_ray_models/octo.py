@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.errors import ConfigError, InvalidObservation, shown
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import jax_device
@@ -136,18 +136,18 @@ class Octo(ModelPolicy):
             )
         if config.window is not None and config.window > network.longest:
             raise ConfigError(
-                f"window: got {config.window}, want at most {network.longest}; trained: "
-                f"{network.window}"
+                f"window: expected at most {network.longest}, got {config.window}; set "
+                f"{network.window}, as in training"
             )
 
         if (network.proprio_dim is None) != (not config.state):
-            need = (
-                "reads no state"
+            needed_state = (
+                "no state"
                 if network.proprio_dim is None
-                else f"reads a state of {network.proprio_dim} numbers"
+                else f"a state of {network.proprio_dim} numbers"
             )
             raise ConfigError(
-                f"state: got {config.state}, but the checkpoint {need}; set it as in training"
+                f"state: expected {needed_state}, got {config.state}; set it as in training"
             )
         if network.proprio_dim is not None:
             network.statistics(config.dataset, PROPRIO)  # raises if there are none
@@ -243,8 +243,9 @@ class Octo(ModelPolicy):
             tasks = {"language": "an instruction", "image": f"info[{GOAL_IMAGE!r}]"}
             expected = tasks.get(task, " or ".join(tasks.values()))
             raise InvalidObservation(
-                f"task: got {'no goal image' if goal is None else 'a goal image'} and the "
-                f"instruction {instruction!r}, want {expected}; see the policy's `goal`"
+                f"task: expected {expected}, got "
+                f"{'no goal image' if goal is None else 'a goal image'} and the instruction "
+                f"{instruction!r}; see the policy's `goal`"
             )
 
         if goal is None:
@@ -255,7 +256,9 @@ class Octo(ModelPolicy):
             or goal.shape[2] != 3
             or goal.dtype != np.uint8
         ):
-            raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: want (H, W, 3) uint8 RGB")
+            raise InvalidObservation(
+                f"info[{GOAL_IMAGE!r}]: expected (H, W, 3) uint8 RGB, got {shown(goal)}"
+            )
         return self._image(PRIMARY, goal)
 
     def _image(self, name: str, image: np.ndarray) -> np.ndarray:
@@ -373,7 +376,7 @@ class OctoNetwork:
         require_filled(model.params, shapes)
         if type(network.head).__name__ not in _HEADS:
             raise ConfigError(
-                f"action head: got {type(network.head).__name__}, want one of {list(_HEADS)}"
+                f"action head: expected one of {list(_HEADS)}, got {type(network.head).__name__}"
             )
         return network
 
@@ -418,8 +421,9 @@ class OctoNetwork:
                 f"one of {choices}" if choices else "a checkpoint with dataset_statistics.json"
             )
             raise ConfigError(
-                f"dataset {dataset!r}: the checkpoint has no statistics of {name!r} for it, so its "
-                f"numbers have no units; want {expected}{', or none' if name in by_dataset else ''}"
+                f"dataset: expected {expected}{', or none' if name in by_dataset else ''}, got "
+                f"{dataset!r}, for which the checkpoint has no statistics of {name!r}, so that "
+                "its numbers have no units"
             )
         return {statistic: np.asarray(values) for statistic, values in by_name[name].items()}
 
@@ -551,7 +555,8 @@ def _folder_and_step(checkpoint: str, step: int | None) -> tuple[Path, int]:
             steps.append(int(path.name))
     if not steps:
         raise ConfigError(
-            f"checkpoint {folder}: has no step, a folder with a number for a name; copy all of it"
+            f"checkpoint {folder}: expected a step, a folder with a number for a name, got none; "
+            "copy all of it"
         )
     if step is None:
         step = max(steps)
@@ -588,9 +593,9 @@ def require_own_classes(file: Path) -> None:
         for module, name in classes:
             if not is_own(module, name):
                 raise ConfigError(
-                    f"{file}: names {name!r} of {module!r}, want a class of {_COMPONENTS}* or "
-                    f"{_TEXT_PROCESSING}: loading the checkpoint would run that, whatever it is; "
-                    f"{CURE}"
+                    f"{file}: expected a class of {_COMPONENTS}* or {_TEXT_PROCESSING}, got "
+                    f"{name!r} of {module!r}, which loading the checkpoint would run, whatever it "
+                    f"is; {CURE}"
                 )
 
 

@@ -69,7 +69,10 @@ class Scaling(BaseModel, extra="forbid"):
         if (self.min is None) != (self.max is None) or (
             self.min is not None and {"mean", "std"} & self.model_fields_set
         ):
-            raise ValueError("want min and max, or mean and std, or neither pair")
+            raise ValueError(
+                "expected min and max, or mean and std, or neither pair, got "
+                f"{sorted(self.model_fields_set)}; leave one pair out"
+            )
         return self
 
     @property
@@ -161,7 +164,9 @@ class Input(Scaling):
     def _one_source(self) -> Self:
         sources = [name for name in SOURCES if getattr(self, name) is not None]
         if len(sources) > 1:
-            raise ValueError(f"got {sources}, want one source of an input")
+            raise ValueError(
+                f"expected one source of an input, got {sources}; leave the others out"
+            )
         return self
 
 
@@ -343,8 +348,8 @@ class TorchScript:
         results = returned if isinstance(returned, tuple | list) else (returned,)
         if len(results) != len(self.outputs):
             raise ConfigError(
-                f"outputs: got {self.outputs}, want names for the {len(results)} results of "
-                "`forward`"
+                f"outputs: expected names for the {len(results)} results of `forward`, got "
+                f"{self.outputs}"
             )
         return {
             name: fetch(result.float()) for name, result in zip(self.outputs, results, strict=True)
@@ -369,8 +374,8 @@ def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:
     if len(graph_files) != 1:
         names = [file.name for file in graph_files or files]
         raise ConfigError(
-            f"checkpoint {path}: got {names[:10]}, want one file with the suffix .onnx or "
-            f"{', '.join(_TORCHSCRIPT)}; name that file"
+            f"checkpoint {path}: expected one file with the suffix .onnx or "
+            f"{', '.join(_TORCHSCRIPT)}, got {names[:10]}; name the file"
         )
     [file] = graph_files
 
@@ -410,8 +415,9 @@ def _shape(name: str, lengths: Sequence[int] | None, config: OnnxConfig) -> tupl
     shape = lengths if configured is None else configured
     if shape is None or shape.count(-1) > 1:
         raise ConfigError(
-            f"inputs: {name}: shape: got {configured}, the file states {lengths or 'none'}, want "
-            "all lengths that the policy was trained with, and -1 for the batch, such as [-1, 48]"
+            f"inputs: {name}: shape: expected all lengths that the policy was trained with, and "
+            f"-1 for the batch, such as [-1, 48], got {configured}, and {lengths or 'none'} in "
+            "the file; set them"
         )
     return tuple(shape)
 
@@ -465,9 +471,9 @@ class Network:
             input_shape, output_shape = graph.inputs[name].row_shape, example[next_value].shape
             if output_shape != input_shape:
                 raise ConfigError(
-                    f"recurrent: {{{name}: {next_value}}}: got an output {output_shape} for an "
-                    f"input {input_shape}, want equal shapes; name the output that is the input's "
-                    "next value"
+                    f"recurrent: {{{name}: {next_value}}}: expected an output of the input's "
+                    f"shape, {input_shape}, got {output_shape}; name the output that is the "
+                    "input's next value"
                 )
         # PREVIOUS before the first action, (H * D,).
         self.zero_output = np.zeros(example[self.action].size, np.float32)
@@ -532,7 +538,8 @@ class Network:
             ids = self.tokenizer.encode(instruction).ids
             if len(ids) > tensor.size:
                 raise InvalidObservation(
-                    f"instruction: got {len(ids)} tokens, want at most {tensor.size}; shorten it"
+                    f"instruction: expected at most {tensor.size} tokens, got {len(ids)}; shorten "
+                    "it"
                 )
             is_mask = option.instruction == "mask"
             values = np.full(tensor.size, 0 if is_mask else self.pad_id, tensor.dtype)
@@ -683,7 +690,8 @@ class Network:
         for setting, names in unused.items():
             if names:
                 raise ConfigError(
-                    f"{setting}: has no use of {sorted(names)}; leave it out, or correct the name"
+                    f"{setting}: expected names that are used, got {sorted(names)}; leave them "
+                    "out, or correct the names"
                 )
 
     def _usable_options(self, name: str) -> set[str]:
@@ -704,7 +712,8 @@ class Network:
             return np.broadcast_to(np.asarray(value, tensor.dtype), tensor.row_shape).copy()
         except ValueError as error:
             raise ConfigError(
-                f"inputs: {name}: constant: got {value}, want numbers of {tensor.row_shape}"
+                f"inputs: {name}: constant: expected numbers of shape {tensor.row_shape}, got "
+                f"{value}"
             ) from error
 
     def _require_fitting(self, example: Arrays) -> None:
@@ -720,8 +729,9 @@ class Network:
             height, width = self.image_size(name)
             if len(tensor.shape) < 4 or tensor.size != option.history * height * width * 3:
                 raise ConfigError(
-                    f"cameras: {name}: got an input {tensor.shape}, want (-1, 3, H, W) or (-1, H, "
-                    "W, 3), with `history` images before them; is it an image?"
+                    f"cameras: {name}: expected an input (-1, 3, H, W) or (-1, H, W, 3), with "
+                    f"`history` images before them, got {tensor.shape}; check whether it is an "
+                    "image"
                 )
             conversions.append((f"inputs: {name}", option.normalized, np.zeros((1, 3))))
 
@@ -741,9 +751,8 @@ class Network:
                 fits = False
             if not fits:
                 raise ConfigError(
-                    f"{setting}: got lists of statistics of another length, want "
-                    f"{values.shape[-1]} numbers, or one for all; with {PREVIOUS}, statistics by "
-                    "part"
+                    f"{setting}: expected statistics of {values.shape[-1]} numbers, or one for "
+                    f"all, got another length; with {PREVIOUS}, give statistics by part"
                 )
 
     def _tokenizer(self, path: Path) -> Any:
@@ -753,7 +762,10 @@ class Network:
 
         file = path.with_name(TOKENIZER)
         if not file.is_file():
-            raise ConfigError(f"{file}: is missing, want that of the instruction, by `tokenizers`")
+            raise ConfigError(
+                f"{file}: expected the instruction's tokenizer, by `tokenizers`, got none; copy "
+                "it there"
+            )
         tokenizer = require("tokenizers", extra="onnx").Tokenizer.from_file(str(file))
         self.pad_id = (tokenizer.padding or {}).get("pad_id", 0)
         tokenizer.no_padding()
@@ -960,8 +972,9 @@ class Onnx(ModelPolicy):
             image = resize_with_pad(image, height, width)
         if image.shape[:2] != (height, width):
             raise InvalidObservation(
-                f"camera {network.cameras[name]!r}: got {image.shape[0]}x{image.shape[1]}, want "
-                f"{height}x{width}; send that size, or set `resize: true` for the input {name!r}"
+                f"camera {network.cameras[name]!r}: expected {height}x{width}, got "
+                f"{image.shape[0]}x{image.shape[1]}; send that size, or set `resize: true` for "
+                f"the input {name!r}"
             )
 
         if tensor.dtype != np.uint8:

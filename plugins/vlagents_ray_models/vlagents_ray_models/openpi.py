@@ -129,9 +129,9 @@ def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotCo
     if usual is None:
         if cameras is None or state is None:
             raise ConfigError(
-                f"config {config!r}: its observations go through {transform or 'no transform'}, "
-                f"want one of {sorted(ROBOTS)}, or its keys, as in cameras: {{KEY: front}}, state: "
-                "{KEY: {joints: 7}}"
+                f"config {config!r}: expected a transform of {sorted(ROBOTS)} for its "
+                f"observations, got {transform or 'none'}; choose another config, or give its "
+                "keys, as in cameras: {KEY: front}, state: {KEY: {joints: 7}}"
             )
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
@@ -347,7 +347,7 @@ def _read_statistics(folder: Path, asset: str | None) -> Any:
     """Return openpi's statistics of "state" and "actions" for an asset of a checkpoint."""
     if asset is None:
         raise ConfigError(
-            "config: has no asset_id, so that nothing says which statistics are its own; set one"
+            "config: expected an asset_id, which names its statistics, got none; set one"
         )
 
     assets = folder / "assets"
@@ -364,7 +364,7 @@ def _read_statistics(folder: Path, asset: str | None) -> Any:
     absent = sorted({"state", "actions"} - set(statistics))
     if absent:
         raise ConfigError(
-            f"checkpoint {folder}: assets/{asset}/norm_stats.json has no {absent}, has "
+            f"checkpoint {folder}: expected {absent} in assets/{asset}/norm_stats.json, got "
             f"{sorted(statistics)}"
         )
     return statistics
@@ -669,8 +669,8 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
 
     if settings.noise_level:
         raise ConfigError(
-            f"noise_level: got {settings.noise_level} for a JAX checkpoint, want 0, as its "
-            "compiled loop has no random steps; convert it to PyTorch with openpi's script, or "
+            "noise_level: expected 0 for a JAX checkpoint, whose compiled loop has no random "
+            f"steps, got {settings.noise_level}; convert it to PyTorch with openpi's script, or "
             "leave it out"
         )
     is_fast = config.model.model_type is models.ModelType.PI0_FAST
@@ -834,8 +834,9 @@ class OpenPi(ModelPolicy):
             return load_torch(config, folder, self.config, self.compilation)
         if not (folder / "params").is_dir():
             raise ConfigError(
-                f"checkpoint {folder}: has {sorted(path.name for path in folder.iterdir())}, want "
-                "params/ or model.safetensors; name the folder of one step, not that of the run"
+                f"checkpoint {folder}: expected params/ or model.safetensors, got "
+                f"{sorted(path.name for path in folder.iterdir())}; name the folder of one step, "
+                "not that of the run"
             )
         if self.config.compile not in (False, "auto"):
             raise ConfigError("compile: openpi's JAX models always are; leave it out")
@@ -939,6 +940,6 @@ def train_config(name: str) -> Any:
         ) from error
     if not isinstance(config, configs.TrainConfig):
         raise ConfigError(
-            f"config {name!r}: got {type(config).__name__}, want an openpi TrainConfig"
+            f"config {name!r}: expected an openpi TrainConfig, got {type(config).__name__}"
         )
     return config

@@ -186,8 +186,8 @@ class Pi0(ModelPolicy):
         different = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
         if different:
             raise ConfigError(
-                f"{file}: got other {different} than the base has, want the same; merge the "
-                "adapter into its base, and serve that as a checkpoint of its own"
+                f"{file}: expected {different} as the base has, got others; merge the adapter "
+                "into its base, and serve that as a checkpoint of its own"
             )
 
     def perceive(self, obs: Obs) -> StagedRow:
@@ -273,13 +273,13 @@ class Pi0(ModelPolicy):
         text_tokens = int(tokens["attention_mask"].sum()) - patches
         if text_tokens > max_tokens:
             raise InvalidObservation(
-                f"instruction: got {text_tokens} tokens, want at most {max_tokens}, as in "
-                "training; shorten it, or set the policy's max_tokens"
+                f"instruction: expected at most {max_tokens} tokens, as in training, got "
+                f"{text_tokens}; shorten it, or set the policy's max_tokens"
             )
         if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
             raise InvalidObservation(
-                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it "
-                "stands for an image"
+                f"instruction: expected words, got {processor.image_token!r} in {instruction!r}; "
+                "leave it out, as it stands for an image"
             )
         self._current_episode().prompt = {name: array[0] for name, array in tokens.items()}
 
@@ -366,8 +366,8 @@ def _processor(path: Path) -> Any:
     absent = [name for name in _STATISTICS if getattr(processor, name) is None]
     if absent:
         raise ConfigError(
-            f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was "
-            f"trained on: PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
+            f"checkpoint {path}: {_PROCESSOR}: expected {absent}, got none; save those of the "
+            f"dataset it was trained on: PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder)"
         )
     return processor
 
@@ -400,9 +400,9 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
         levels * factor + summand, converted, atol=_ROUNDING
     ):
         raise ConfigError(
-            f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a "
-            "factor and a summand for each channel, want do_rescale and do_normalize alone; images "
-            "are resized before"
+            f"{_PROCESSOR}: expected an image processor with do_rescale and do_normalize alone, "
+            f"got one that changes an image of {levels.shape} by more than a factor and a summand "
+            "for each channel; images are resized before"
         )
 
     # An image that is twice as wide is padded at the bottom, if the processor pads.

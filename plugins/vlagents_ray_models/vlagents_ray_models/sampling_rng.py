@@ -150,7 +150,8 @@ class RowNoise(RowDraws):
     def _randn(self, shape: tuple[int, ...], device: Any, dtype: Any) -> Any:
         if len(shape) < 2 or shape[0] != len(self._rows):
             raise PolicyFailed(
-                f"the model asked for noise {shape}, want one row for each of {len(self._rows)}"
+                f"expected noise of one row for each of {len(self._rows)}, got {shape} from the "
+                "model"
             )
         if not self._prepared:
             noise = np.stack([row.noise(self._ahead, *shape[1:]) for row in self._rows], 1)

@@ -102,8 +102,8 @@ class VJepa2AcConfig(ModelConfig):
     def _topk_within_samples(self) -> Self:
         if self.topk > self.samples:
             raise ValueError(
-                f"topk {self.topk} is over samples {self.samples}; want it to be a small part of "
-                "them"
+                f"topk: expected a small part of the {self.samples} samples, got {self.topk}; "
+                "lower it"
             )
         return self
 
@@ -163,8 +163,8 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
         model = from_pretrained(transformers.VJEPA2Model, path)
         if model.config.crop_size != config.image_size:
             raise ConfigError(
-                f"encoder {path}: made for images of {model.config.crop_size} px, want "
-                f"{config.image_size} as in image_size; give that of the checkpoint's predictor"
+                f"encoder {path}: expected images of {config.image_size} px, as in image_size, "
+                f"got {model.config.crop_size}; give that of the checkpoint's predictor"
             )
         return model
     if saved is None:
@@ -211,7 +211,8 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
     missing, _ = model.load_state_dict(tensors, strict=False)
     if missing:
         raise ConfigError(
-            f"the checkpoint's encoder lacks {missing[:8]}; is it upstream's, and whole?"
+            "the checkpoint's encoder: expected upstream's parameters, got none of "
+            f"{missing[:8]}; check whether it is upstream's, and whole"
         )
     require_loaded(model, tensors)
     return model
@@ -237,8 +238,8 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
 
     if _PATCHES not in tensors or _FIRST_MLP not in tensors:
         raise ConfigError(
-            f"the checkpoint's encoder: got {sorted(saved)[:4]}, want names as "
-            "'patch_embed.proj.weight', upstream's"
+            "the checkpoint's encoder: expected upstream's names, as 'patch_embed.proj.weight', "
+            f"got {sorted(saved)[:4]}"
         )
     return tensors
 
@@ -264,7 +265,8 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
     files = [path] if path.is_file() else sorted(path.glob("*.pt"))
     if len(files) != 1:
         raise ConfigError(
-            f"checkpoint {path}: got {[file.name for file in files]}, want one .pt file; name it"
+            f"checkpoint {path}: expected one .pt file, got {[file.name for file in files]}; name "
+            "it"
         )
 
     [file] = files
@@ -272,16 +274,16 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
         raise ConfigError(
-            f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's "
-            ".pt"
+            f"checkpoint {file}: expected upstream's .pt, a file of tensors, got another "
+            f"({type(error).__name__})"
         ) from error
     if not isinstance(content, Mapping) or not isinstance(content.get("predictor"), Mapping):
         description: object = type(content).__name__
         if isinstance(content, Mapping):
             description = sorted(map(str, content))[:8]
         raise ConfigError(
-            f"checkpoint {file}: got {description}, want 'predictor' among them; is it V-JEPA "
-            "2-AC's, and not V-JEPA 2's?"
+            f"checkpoint {file}: expected 'predictor', got {description}; check whether it is "
+            "V-JEPA 2-AC's, and not V-JEPA 2's"
         )
 
     networks: dict[str, dict[str, Any]] = {}
@@ -321,10 +323,10 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
     if embedding is None or embedding.shape[1] != width:
         description = "no 'predictor_embed.weight'"
         if embedding is not None:
-            description = f"a predictor of features {embedding.shape[1]} wide"
+            description = f"{embedding.shape[1]} wide"
         raise ConfigError(
-            f"checkpoint {config.checkpoint!r}: got {description}, want {width}, the encoder's; "
-            "they belong together"
+            f"checkpoint {config.checkpoint!r}: expected a predictor of features {width} wide, as "
+            f"the encoder's are, got {description}; use those of one checkpoint"
         )
 
     blocks = {name.split(".")[1] for name in saved if name.startswith("predictor_blocks.")}
@@ -657,7 +659,7 @@ class VJepa2Ac(ModelPolicy):
             if isinstance(image, np.ndarray):
                 description = f"{image.shape} {image.dtype}"
             raise InvalidObservation(
-                f"info[{GOAL_IMAGE!r}]: got {description}, want (H, W, 3) uint8 RGB"
+                f"info[{GOAL_IMAGE!r}]: expected (H, W, 3) uint8 RGB, got {description}"
             )
 
         pixels, memory = to_pixels(image, self.config.image_size), self._current_episode().memory
@@ -676,8 +678,8 @@ class VJepa2Ac(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Plan for all rows that have a goal; the others fail."""
         no_goal = InvalidObservation(
-            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) "
-            "uint8"
+            f"info[{GOAL_IMAGE!r}]: expected an image of the goal, (H, W, 3) uint8, got none "
+            "since the reset"
         )
         return compute_valid([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
 

@@ -213,7 +213,7 @@ def test_an_image_of_another_size_is_refused_or_padded_as_set(tmp_path: Path) ->
     file, image = exported(tmp_path, PIXELS["uint8"]), RNG.integers(0, 256, (12, 12, 3), np.uint8)
     with pytest.raises(
         InvalidObservation,
-        match=r"'front': got 12x12, want 4x6; .* `resize: true` for the input 'image'",
+        match=r"'front': expected 4x6, got 12x12; .* `resize: true` for the input 'image'",
     ):
         action(loaded(file, cameras={"image": "front"}), Obs({"front": image}))
 
@@ -362,11 +362,11 @@ def test_the_instruction_is_a_string_or_its_tokens(tmp_path: Path) -> None:
     inputs = {"ids": {"instruction": "tokens"}, "mask": {"instruction": "mask"}}
     policy = loaded(exported(tmp_path, ids), inputs=inputs)
     assert action(policy, Obs(), "lift push").tolist() == [1, 2, 7, 7, 1, 1, 0, 0]
-    with pytest.raises(InvalidObservation, match="got 5 tokens, want at most 4"):
+    with pytest.raises(InvalidObservation, match="expected at most 4 tokens, got 5"):
         action(policy, Obs(), "lift lift lift lift lift")
 
     (tmp_path / "tokenizer.json").unlink()
-    with pytest.raises(ConfigError, match=r"tokenizer.json: is missing"):
+    with pytest.raises(ConfigError, match=r"tokenizer.json: expected the instruction's tokenizer"):
         loaded(tmp_path / "policy.onnx", inputs=inputs)
 
 
@@ -422,12 +422,12 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             SAME.format(4),
             {"cameras": {"x": "front"}},
-            r"cameras: x: got an input \(-1, 4\), want \(-1, 3, H, W\)",
+            r"cameras: x: expected an input \(-1, 3, H, W\).*got \(-1, 4\)",
         ),
         (
             TWO,
             {"state": ["joints"], "inputs": {"y": {"constant": 1}}, "recurrent": {"h": "h_out"}},
-            r"got an output \(1, 2\) for an input \(1, 5\), want equal shapes",
+            r"expected an output of the input's shape, \(1, 5\), got \(1, 2\)",
         ),
         (
             TWO,
@@ -436,7 +436,7 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
                 "inputs": {"y": {"constant": 1}, "h": {"constant": [1, 2]}},
                 "info": ["h_out"],
             },
-            r"inputs: h: constant: got \[1, 2\], want numbers of \(1, 5\)",
+            r"inputs: h: constant: expected numbers of shape \(1, 5\), got \[1, 2\]",
         ),
         (
             TWO,
@@ -446,12 +446,12 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             SAME.format(4),
             {"state": ["a"], "inputs": {"x": {"mean": [1, 2]}}},
-            "inputs: x: got lists of statistics .* want 4 numbers",
+            "inputs: x: expected statistics of 4 numbers",
         ),
         (
             SAME.format(4),
             {"state": ["a"], "action": {"std": [1, 2]}},
-            "action: got lists of statistics .* want 4 numbers",
+            "action: expected statistics of 4 numbers",
         ),
         (
             SAME.format(4),
@@ -471,23 +471,23 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             SAME.format(4),
             {"state": ["a"], "inputs": {"x": {"std": {"b": 2}}}},
-            r"inputs: x: has no use of \['b'\]",
+            r"inputs: x: expected names that are used, got \['b'\]",
         ),
         (
             SAME.format(4),
             {"state": ["a"], "inputs": {"x": {"range": [0, 1]}}},
-            r"inputs: x: has no use of \['range'\]",
+            r"inputs: x: expected names that are used, got \['range'\]",
         ),
         (
             SAME.format(4),
             {"state": ["a"], "action": {"std": {"a": 2}}},
-            r"action: has no use of \['a'\]",
+            r"action: expected names that are used, got \['a'\]",
         ),
         (NOISY, {"state": ["joints"]}, "draws noise, or keeps a state"),
         (
             OPEN,
             {"state": ["joints"]},
-            r"inputs: x: shape: got None, the file states \[-1, -1\], want all lengths",
+            r"inputs: x: shape: expected all lengths .*got None, and \[-1, -1\] in the file",
         ),
         (
             SAME.format(4),
@@ -506,9 +506,9 @@ def test_a_wrong_mapping_says_what_the_file_has(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"inputs": {"x": {"step": 0, "constant": 1}}}, "want one source of an input"),
-        ({"inputs": {"x": {"min": 0}}}, "want min and max, or mean and std"),
-        ({"action": {"min": 0, "max": 1, "mean": 2}}, "want min and max, or mean and std"),
+        ({"inputs": {"x": {"step": 0, "constant": 1}}}, "expected one source of an input"),
+        ({"inputs": {"x": {"min": 0}}}, "expected min and max, or mean and std"),
+        ({"action": {"min": 0, "max": 1, "mean": 2}}, "expected min and max, or mean and std"),
         ({"inputs": {"x": {"scale": 2}}}, "scale"),
     ],
 )
@@ -633,5 +633,5 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path, name: str, message: 
     with pytest.raises(ConfigError, match=message):
         loaded(tmp_path / name, state=["x"])
     (tmp_path / name).unlink()
-    with pytest.raises(ConfigError, match=r"got \[\], want one file"):
+    with pytest.raises(ConfigError, match=r"expected one file .*got \[\]"):
         loaded(tmp_path, state=["x"])

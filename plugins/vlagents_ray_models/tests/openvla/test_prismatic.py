@@ -118,9 +118,9 @@ def test_a_name_may_lack_its_ending_and_the_only_dataset_needs_none() -> None:
 
 
 def test_an_unknown_name_is_told_what_there_is() -> None:
-    with pytest.raises(InvalidObservation, match=r"got None, want one of .*\['a', 'b'\]"):
+    with pytest.raises(InvalidObservation, match=r"expected one of .*\['a', 'b'\], got None"):
         Statistics({"a": {}, "b": {}}).key(None)
-    with pytest.raises(ConfigError, match=r"action has \[\], want 'q01' and 'q99'"):
+    with pytest.raises(ConfigError, match=r"action: expected 'q01' and 'q99', got \[\]"):
         Statistics({"a": {}}).scale("a")
 
 

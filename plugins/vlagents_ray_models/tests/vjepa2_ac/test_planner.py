@@ -109,7 +109,7 @@ def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"topk": 500}, "topk 500 is over samples 400"),
+        ({"topk": 500}, "topk: expected a small part of the 400 samples, got 500"),
         ({"cameras": {"front": "front", "wrist": "wrist"}}, "cameras: expected"),
         ({"cem_steps": 5}, "cem_steps"),
     ],

@@ -133,7 +133,7 @@ def _read_settings(folder: Path, config: LeRobotConfig) -> Any:
         known = {setting.name for setting in dataclasses.fields(settings)}
         unknown = sorted(set(config.overrides) - known)
         if unknown:
-            raise ConfigError(f"overrides: got {unknown}, want some of {sorted(known)}")
+            raise ConfigError(f"overrides: expected some of {sorted(known)}, got {unknown}")
         if not config.overrides:
             return settings
 
@@ -189,8 +189,9 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     """
     if settings.use_peft:
         raise ConfigError(
-            "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and "
-            "save that, or serve its base with the adapter as one of the deployment's `checkpoints`"
+            "checkpoint: expected whole weights, got a PEFT adapter; merge it (merge_and_unload) "
+            "and save that, or serve its base with the adapter as one of the deployment's "
+            "`checkpoints`"
         )
 
     settings.device = str(device)
@@ -201,7 +202,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if issubclass(sampler, (DiffusionSampler, FlowSampler)):  # the types that `compile` supports
         if config.overrides.get("compile_model"):
             raise ConfigError(
-                "overrides: got compile_model, want `compile: true` in its place, which is checked"
+                "overrides: expected no compile_model, got one; set `compile: true` in its place, "
+                "which is checked"
             )
         settings.compile_model = False
     if issubclass(sampler, FlowSampler):
@@ -233,7 +235,8 @@ def _set_dtype(settings: Any, config: LeRobotConfig) -> None:
         choices.append("bfloat16")
     if config.dtype not in choices:
         raise ConfigError(
-            f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}"
+            f"dtype: expected one of {choices} for LeRobot's {settings.type!r}, got "
+            f"{config.dtype!r}"
         )
 
     if has_dtype and config.dtype != "auto":
@@ -277,9 +280,9 @@ def _require_no_nvidia(file: Path) -> None:
     """
     if file.is_file() and "gr00t" in str(_read_config(file).get("model_type", "")).lower():
         raise ConfigError(
-            f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot "
-            "saved; serve it by the policy gr00t (docs/policies/gr00t.md), or train it on with "
-            "LeRobot 0.6 (lerobot-train --policy.type=groot "
+            f"checkpoint {file.parent}: expected one that LeRobot saved, got one of NVIDIA's own "
+            "GR00T code; serve it by the policy gr00t (docs/policies/gr00t.md), or train it on "
+            "with LeRobot 0.6 (lerobot-train --policy.type=groot "
             f"--policy.base_model_path={file.parent})"
         )
 

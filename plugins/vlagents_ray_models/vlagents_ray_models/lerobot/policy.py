@@ -126,13 +126,13 @@ class LeRobot(ModelPolicy):
             sampler.passes.adapters = self.adapters
         elif self.config.adapters:
             raise ConfigError(
-                f"adapters: got them for LeRobot's {policy_type!r}, want one of {_FLOWS}; merge "
-                "each into its base"
+                f"adapters: expected one of LeRobot's {_FLOWS} for them, got {policy_type!r}; "
+                "merge each into its base"
             )
         elif self.config.noise_level:
             raise ConfigError(
-                f"noise_level: got {self.config.noise_level} for LeRobot's {policy_type!r}, want "
-                f"0, as its actions come out of no flow; those of {_FLOWS} do"
+                f"noise_level: expected 0 for LeRobot's {policy_type!r}, whose actions come out "
+                f"of no flow, unlike those of {_FLOWS}, got {self.config.noise_level}"
             )
 
     def _describe(
@@ -210,9 +210,8 @@ class LeRobot(ModelPolicy):
         has_same_contract = dataset in (None, model.trained)
         if not has_same_names or not (is_base_undescribed or has_same_contract):
             raise ConfigError(
-                f"{folder}: its dataset has another contract, or its cameras other names, than "
-                "that of the base or of an adapter before, want the same; serve it in a deployment "
-                "of its own"
+                f"{folder}: expected the contract and the names of cameras of the base and of the "
+                "adapters before, got others; serve it in a deployment of its own"
             )
 
         if trained != model.trained:
@@ -310,8 +309,8 @@ def _with_defaults(config: LeRobotConfig, sampler: samplers.Sampler) -> LeRobotC
 
     if (config.execute or 0) > sampler.horizon:
         raise ConfigError(
-            f"execute: got {config.execute}, the checkpoint's chunks have {sampler.horizon} rows "
-            "from the observation on; want at most these"
+            f"execute: expected at most {sampler.horizon}, as the checkpoint's chunks have that "
+            f"many rows from the observation on, got {config.execute}"
         )
     unset = {name: default for name, default in defaults.items() if not _is_set(config, name)}
     return config.model_copy(update=unset)
@@ -448,11 +447,12 @@ def _cameras(
     known = sorted(name_of.values())
     unknown = sorted(set(config.masked_cameras) - set(known))
     if unknown:
-        raise ConfigError(f"masked_cameras: got {unknown}, want some of {known}")
+        raise ConfigError(f"masked_cameras: expected some of {known}, got {unknown}")
     if config.masked_cameras and settings.type not in samplers.MASKING:
         raise ConfigError(
-            f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, {known}; "
-            f"{sorted(samplers.MASKING)} can do without"
+            f"masked_cameras: expected none, as LeRobot's {settings.type!r} needs all its "
+            f"cameras, {known}, unlike {sorted(samplers.MASKING)}, got {config.masked_cameras}; "
+            "leave it out"
         )
 
     used = {key: name for key, name in name_of.items() if name not in config.masked_cameras}

@@ -95,7 +95,8 @@ class Processors:
         unknown = sorted(set(config.processors) - before.keys() - after.keys())
         if unknown:
             raise ConfigError(
-                f"processors: got {unknown}, the checkpoint has {[sorted(before), sorted(after)]}"
+                "processors: expected some of the checkpoint's "
+                f"{[sorted(before), sorted(after)]}, got {unknown}; correct the names"
             )
 
         self.steps = [list(before), list(after)]  # the registered names, for both pipelines
@@ -344,7 +345,7 @@ def _require_feature_statistics(pipeline: Any, key: str, settings: Any, file: st
     ]
     if missing:
         raise ConfigError(
-            f"checkpoint: {file} has no usable {missing} of {key!r}, has {sorted(statistics)}; "
+            f"checkpoint: {file}: expected finite {missing} of {key!r}, got {sorted(statistics)}; "
             "without them its inputs and actions are wrong: save its processors with the "
             "statistics of its dataset"
         )
@@ -375,8 +376,8 @@ def adapter_processors(
         return None
     if missing:
         raise ConfigError(
-            f"{folder}: misses {missing}, want both pipelines as LeRobot saves them, or none of "
-            "them"
+            f"{folder}: expected both pipelines as LeRobot saves them, or none of them, got no "
+            f"{missing}; copy it there"
         )
 
     if not config.trust_remote_code:
@@ -390,9 +391,9 @@ def adapter_processors(
     differences = _differences(processors, base, settings, allowed)
     if differences:
         raise ConfigError(
-            f"{folder}: its processors have other {', '.join(differences)} than those of the base, "
-            f"want the same but for the statistics of {sorted(allowed)}; merge the adapter into "
-            "its base, and serve that as a checkpoint of its own"
+            f"{folder}: expected the base's processors, but for the statistics of "
+            f"{sorted(allowed)}, got other {', '.join(differences)}; merge the adapter into its "
+            "base, and serve that as a checkpoint of its own"
         )
     return processors
 
@@ -466,8 +467,8 @@ def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> N
 
     if of_adapter:
         raise ConfigError(
-            f"{file}: was trained with {of_adapter}, the base with {of_base}, want the same; merge "
-            "the adapter into its base, and serve that as a checkpoint of its own"
+            f"{file}: expected an adapter trained with {of_base}, as the base, got {of_adapter}; "
+            "merge the adapter into its base, and serve that as a checkpoint of its own"
         )
 
 
@@ -487,9 +488,9 @@ def require_known_steps(file: Path) -> None:
     for step in steps:
         if "registry_name" not in step and not _is_lerobots(step.get("class")):
             raise ConfigError(
-                f"{file}: got a step of the class {step.get('class')!r}, want one with a "
-                "registry_name, or a processor step in lerobot.*: loading the checkpoint would run "
-                f"that, whatever it is; {CURE}"
+                f"{file}: expected a step with a registry_name, or a processor step in lerobot.*, "
+                f"got the class {step.get('class')!r}, which loading the checkpoint would run, "
+                f"whatever it is; {CURE}"
             )
 
 

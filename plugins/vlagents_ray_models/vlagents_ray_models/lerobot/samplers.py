@@ -62,8 +62,9 @@ class Sampler:
         self.staging = Staging(policy.config.device)
         if type(self) is Sampler and self.steps > 1:
             raise ConfigError(
-                f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that "
-                "sessions would mix; want another type, or a policy with n_obs_steps 1"
+                f"checkpoint: {policy.name!r}: expected n_obs_steps 1, got {self.steps}, which "
+                "the policy keeps by itself, so that sessions would mix; use another type, or "
+                "train with n_obs_steps 1"
             )
 
     @property
@@ -244,8 +245,8 @@ class FlowSampler(Sampler):
         memories = [name for name in _MEMORIES if getattr(config, name, False)]
         if memories:
             raise ConfigError(
-                f"checkpoint: has {memories}, want none: the policy object keeps them, so that "
-                "sessions would mix"
+                f"checkpoint: expected none of {memories}, got some, which the policy object "
+                "keeps, so that sessions would mix"
             )
 
         # The policy calls it after preparing the inputs and before converting the actions.
@@ -545,8 +546,8 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
         )
     if pack.embodiment_tag not in pack.embodiment_mapping:
         raise ConfigError(
-            f"checkpoint: got the embodiment {pack.embodiment_tag!r}, want one of "
-            f"{sorted(pack.embodiment_mapping)}: LeRobot would act as the first of them"
+            f"checkpoint: expected an embodiment of {sorted(pack.embodiment_mapping)}, got "
+            f"{pack.embodiment_tag!r}, for which LeRobot would act as the first of them"
         )
 
     sources = [
@@ -568,9 +569,9 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
         short = [name for name in _BOUNDS if name in bounds and bounds[name].numel() < width]
         if missing or short:
             raise ConfigError(
-                f"checkpoint: {file} has no usable {missing or short} of {key!r}, has "
-                f"{sorted(bounds)}, want {width} numbers each; without them its inputs and actions "
-                "are wrong: save it with its dataset's statistics"
+                f"checkpoint: {file}: expected {width} finite numbers each in {missing or short} "
+                f"of {key!r}, got {sorted(bounds)}; without them its inputs and actions are "
+                "wrong: save it with its dataset's statistics"
             )
 
 

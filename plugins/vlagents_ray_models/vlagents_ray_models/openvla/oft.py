@@ -73,7 +73,8 @@ class OpenVLAOFTConfig(prismatic.PrismaticConfig):
     def _steps_fit(self) -> Self:
         if self.inference_steps > self.diffusion_steps:
             raise ValueError(
-                f"inference_steps: got {self.inference_steps}, want at most {self.diffusion_steps}"
+                f"inference_steps: expected at most {self.diffusion_steps}, got "
+                f"{self.inference_steps}"
             )
         return self
 
@@ -172,8 +173,8 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         dim = base.statistics.scale(key).dim
         if dim != self.model.dim:
             raise InvalidObservation(
-                f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the "
-                "head's"
+                f"unnorm_key: expected a dataset of {self.model.dim} numbers, as the head's, got "
+                f"{key!r} of {dim}"
             )
 
         proprio = None
@@ -217,8 +218,8 @@ def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: 
         dims.add(head.dim)
     if len(dims) != 1:
         raise ConfigError(
-            f"actions: the checkpoint's head and statistics have {sorted(dims)} numbers a row, "
-            "want one length; set unnorm_key to the dataset that the head was trained on"
+            "actions: expected one length of rows in the checkpoint's head and statistics, got "
+            f"{sorted(dims)}; set unnorm_key to the dataset that the head was trained on"
         )
     return dims.pop()
 
@@ -515,9 +516,9 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
     if len(files) != 1:
         have = sorted(path.name for path in folder.glob("*.pt"))
         raise ConfigError(
-            f"checkpoint {folder}: got {files or have} for {name!r}, want one file "
-            f"{name}--STEP_checkpoint.pt; copy it there, or check `head`, `film` and `state` "
-            "against how the checkpoint was trained"
+            f"checkpoint {folder}: expected one file {name}--STEP_checkpoint.pt, got "
+            f"{files or have}; copy it there, or check `head`, `film` and `state` against how the "
+            "checkpoint was trained"
         )
     saved = require("torch").load(folder / files[0], map_location="cpu", weights_only=True)
     return {key.removeprefix(_WRAPPED): tensor for key, tensor in saved.items()}

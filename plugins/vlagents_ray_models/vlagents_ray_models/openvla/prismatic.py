@@ -111,9 +111,9 @@ class Statistics:
             datasets = datasets.get("norm_stats")
         if not datasets or not isinstance(datasets, dict):
             raise ConfigError(
-                f"checkpoint {checkpoint}: got no normalisation statistics, want "
-                f"{STATISTICS_FILE}, or norm_stats in config.json; copy it from where the training "
-                "run saved it"
+                f"checkpoint {checkpoint}: expected {STATISTICS_FILE}, or norm_stats in "
+                "config.json, got no normalisation statistics; copy the file from where the "
+                "training run saved it"
             )
         return cls(datasets, bounds)
 
@@ -138,9 +138,9 @@ class Statistics:
             if key in self._datasets:
                 return str(key)
         raise InvalidObservation(
-            f"unnorm_key: got {name!r}, want one of the checkpoint's datasets "
-            f"{sorted(self._datasets)}; set it in the policy's config, in reset(..., "
-            "unnorm_key=...) or in an observation's info"
+            f"unnorm_key: expected one of the checkpoint's datasets {sorted(self._datasets)}, got "
+            f"{name!r}; set it in the policy's config, in reset(..., unnorm_key=...) or in an "
+            "observation's info"
         )
 
     def scale(self, key: str, feature: Literal["action", "proprio"] = "action") -> Scale:
@@ -153,8 +153,9 @@ class Statistics:
         low, high = _STATISTICS[self.bounds]
         if low not in statistics or high not in statistics:
             raise ConfigError(
-                f"statistics of {key!r}: {feature} has {sorted(statistics)}, want {low!r} and "
-                f"{high!r}; were they saved by another version, or with other normalisation bounds?"
+                f"statistics of {key!r}: {feature}: expected {low!r} and {high!r}, got "
+                f"{sorted(statistics)}; check whether they were saved by another version, or with "
+                "other normalisation bounds"
             )
 
         mask = statistics.get("mask", [True] * len(statistics[low]))
@@ -240,7 +241,8 @@ class Prismatic:
         max_tokens = self.network.config.llm_max_length
         if len(tokens) > max_tokens:
             raise InvalidObservation(
-                f"instruction: got {len(tokens)} tokens with the prompt, want {max_tokens} at most"
+                f"instruction: expected at most {max_tokens} tokens with the prompt, got "
+                f"{len(tokens)}; shorten it"
             )
         return tokens
 
@@ -380,8 +382,8 @@ class PrismaticConfig(ModelConfig):
     def _one_source(self) -> Self:
         if self.trust_remote_code and self.source_dir:
             raise ValueError(
-                "source_dir and trust_remote_code: got both, want the model's classes from one of "
-                "them"
+                "source_dir and trust_remote_code: expected one of them as the source of the "
+                "model's classes, got both; leave one out"
             )
         return self
 
@@ -498,9 +500,9 @@ def _remote(checkpoint: Path, file: str, auto_class: str) -> Any:
     class_reference = content.get("auto_map", {}).get(auto_class)
     if class_reference is None:
         raise ConfigError(
-            f"trust_remote_code: {checkpoint / file} names no code (auto_map has no "
-            f"{auto_class!r}); "
-            f"take the classes from a source tree instead: set source_dir"
+            f"trust_remote_code: expected code named in {checkpoint / file}, got no "
+            f"{auto_class!r} in its auto_map; take the classes from a source tree instead: set "
+            "source_dir"
         )
     return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(
         class_reference, str(checkpoint)
@@ -532,9 +534,9 @@ def find_source(source_dir: str | None) -> Path:
         if (root / "prismatic/extern/hf/modeling_prismatic.py").is_file():
             return root
     raise ConfigError(
-        f"OpenVLA's model classes: got {folders or 'no source tree'}, want a folder with "
-        f"prismatic/extern/hf in it; set source_dir or ${VARIABLES[0]} to a clone of openvla or "
-        "openvla-oft, or, if you trust the Python code that lies beside the weights, "
+        "OpenVLA's model classes: expected a folder with prismatic/extern/hf in it, got "
+        f"{folders or 'no source tree'}; set source_dir or ${VARIABLES[0]} to a clone of openvla "
+        "or openvla-oft, or, if you trust the Python code that lies beside the weights, "
         "trust_remote_code: true"
     )
 
@@ -649,9 +651,9 @@ class PrismaticPolicy(ModelPolicy):
         base_dims = base_statistics.action_dims(self.config.unnorm_key)
         if not dims <= base_dims:
             raise ConfigError(
-                f"{folder / STATISTICS_FILE}: got actions of {sorted(dims)} numbers, want "
-                f"{sorted(base_dims)}, as the base's; merge the adapter into its base, and serve "
-                "that as a checkpoint of its own"
+                f"{folder / STATISTICS_FILE}: expected actions of {sorted(base_dims)} numbers, as "
+                f"the base's, got {sorted(dims)}; merge the adapter into its base, and serve that "
+                "as a checkpoint of its own"
             )
         self.model.base.adapter_statistics[adapter] = statistics
 
@@ -706,7 +708,7 @@ class PrismaticPolicy(ModelPolicy):
             return None
         if not isinstance(name, str):
             raise InvalidObservation(
-                f"unnorm_key: got {type(name).__name__}, want a dataset's name"
+                f"unnorm_key: expected a dataset's name, got {type(name).__name__}"
             )
         return self._statistics(adapter).key(name)
 

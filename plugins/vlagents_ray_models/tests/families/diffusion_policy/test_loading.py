@@ -22,7 +22,9 @@ pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
 def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
     path = tmp_path / "latest.ckpt"
     path.write_bytes(b"not even a pickle")
-    with pytest.raises(ConfigError, match="no payload of a Diffusion Policy workspace"):
+    with pytest.raises(
+        ConfigError, match="of a Diffusion Policy workspace wrote, got no such payload"
+    ):
         loaded(path)
 
 
@@ -56,7 +58,7 @@ def test_a_checkpoint_without_its_normalizer_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_without_the_weights_that_its_settings_want_is_refused(tmp_path: Path) -> None:
     path = tiny.save(tmp_path / "raw", "unet", use_ema=False)
-    with pytest.raises(ConfigError, match=r"has no 'model'.*has \['ema_model'\]"):
+    with pytest.raises(ConfigError, match=r"expected 'model'.*got \['ema_model'\]"):
         loaded(path)
 
 
@@ -82,7 +84,7 @@ def _spoilt(path: Path, to: Path, change: Callable[[Any], None]) -> Path:
             lambda payload: payload["cfg"].policy.model.update(down_dims=[16, 16]),
             "does not fill its own policy",
         ),
-        (lambda payload: payload.pop("cfg"), "no payload"),
+        (lambda payload: payload.pop("cfg"), "got no such payload"),
     ],
 )
 def test_a_checkpoint_that_is_not_whole(

@@ -83,7 +83,7 @@ def step(pipeline: str, name: str, **changed: Any) -> Callable[[Path], None]:
         (without(PRE, "observation.state.min"), "'min'.* of 'observation.state'"),
         (without(PRE, "action.max"), "'max'.* of 'action'"),
         (without(POST, "action.min"), f"{POST}.*'min'.* of 'action'"),
-        (step(PRE, PACK, embodiment_tag="ours"), "embodiment 'ours', want one of"),
+        (step(PRE, PACK, embodiment_tag="ours"), "expected an embodiment of .*got 'ours'"),
         (lambda folder: shutil.rmtree(folder / "vlm"), r"cannot load it as 'groot'.*vlm"),
         (lambda folder: shutil.rmtree(folder / "base"), "has to be in the cache"),
     ],

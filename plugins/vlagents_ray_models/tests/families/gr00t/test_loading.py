@@ -40,8 +40,11 @@ def copied(checkpoint: Checkpoint, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({}, rf"embodiment: got None, want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
-        ({"embodiment": "ours"}, rf"got 'ours', want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
+        ({}, rf"embodiment: expected one of \['{tiny.LIBERO}', 'new_embodiment'\], got None"),
+        (
+            {"embodiment": "ours"},
+            rf"expected one of \['{tiny.LIBERO}', 'new_embodiment'\], got 'ours'",
+        ),
         ({"embodiment": tiny.LIBERO, "device": "tpu:1"}, "device 'tpu:1': not available"),
         (
             {"embodiment": tiny.LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"},
@@ -111,12 +114,15 @@ MODALITIES = ("processor_config.json", "processor_kwargs", "modality_configs")
         (without("model.safetensors"), r"misses \['\*.safetensors'\]"),
         (
             without("processor_config.json"),
-            "has no processor_config.json.*save the checkpoint's processor",
+            "expected processor_config.json, got .*save the checkpoint's processor",
         ),
-        (without("statistics.json"), "has no statistics.json.*save the checkpoint's processor"),
+        (
+            without("statistics.json"),
+            "expected statistics.json, got .*save the checkpoint's processor",
+        ),
         (
             changed(*STATISTICS, "state", "arm"),
-            r"no \['min', 'max'\] of state 'arm', has those of \['gripper'\]",
+            r"expected \['min', 'max'\] of state 'arm' in .*, got those of \['gripper'\]",
         ),
         (changed(*STATISTICS, "action", "arm", "max"), "of action 'arm'.*numbers have no units"),
         (
@@ -124,15 +130,18 @@ MODALITIES = ("processor_config.json", "processor_kwargs", "modality_configs")
             "state 'arm' are not all finite",
         ),
         (changed(*STATISTICS, "relative_action"), "Relative action statistics"),
-        (changed(*STATISTICS), r"want one of \[\]; \['new_embodiment'\] have no statistics"),
-        (changed(*MODALITIES, value={}), r"embodiment: got None, want one of \[\]"),
+        (
+            changed(*STATISTICS),
+            r"expected one of \[\], got .*; \['new_embodiment'\] have no statistics",
+        ),
+        (changed(*MODALITIES, value={}), r"embodiment: expected one of \[\], got None"),
         (
             changed(*MODALITIES, "new_embodiment", "action", "delta_indices", value=[*range(9)]),
             "9 rows.*at most 8",
         ),
         (
             changed("config.json", "model_type", value="gr00t_n1_5"),
-            "got model_type 'gr00t_n1_5'.*policy `upstream`",
+            "expected a model_type .*got 'gr00t_n1_5'.*policy `upstream`",
         ),
         (
             changed("config.json", "model_type", value="Gr00tN1d9"),
@@ -140,7 +149,7 @@ MODALITIES = ("processor_config.json", "processor_kwargs", "modality_configs")
         ),
         (
             changed("config.json", "model_type"),
-            "got model_type None.*is served by the policy `lerobot`",
+            "expected a model_type .*got None.*is served by the policy `lerobot`",
         ),
         (tensor("action_head.vlln.weight", drop=True), r"does not fill.*action_head.vlln.weight"),
         (tensor("action_head.vlln.weight", drop=False), "action_head.vlln.weight|size mismatch"),
@@ -161,7 +170,7 @@ def test_a_robot_of_which_the_model_has_no_number(copied: Path, checkout: Path) 
         (copied / name).write_text(text.replace('"new_embodiment"', '"ours"'))
     with pytest.raises(
         ConfigError,
-        match=r"embodiment 'ours': has no number in embodiment_id.json, which has .*'new_",
+        match=r"embodiment: expected one in embodiment_id.json, .*'new_.*got 'ours'",
     ):
         load(copied, checkout)
 
@@ -173,7 +182,7 @@ def test_a_folder_that_is_no_checkout_or_an_older_one(
     with pytest.raises(ConfigError, match=r"'gr00t': neither installed nor in .*GR00T_SRC"):
         load(checkpoint("relative"), tmp_path)
     monkeypatch.setattr(gr00t.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match=r"code of N1\.5 or before.*policy `upstream`"):
+    with pytest.raises(ConfigError, match=r"expected GR00T's code of N1\.6 .*policy `upstream`"):
         load(checkpoint("relative"), checkout)
 
 

@@ -103,7 +103,9 @@ def test_it_acts_with_pushed_weights(both: tuple[LeRobot, LeRobot], programs: li
 
 @pytest.mark.parametrize("kind", ["diffusion", "smolvla"])
 def test_lerobots_own_compilation_is_refused_where_ours_replaces_it(kind: str, made: Made) -> None:
-    with pytest.raises(ConfigError, match="got compile_model, want `compile: true`"):
+    with pytest.raises(
+        ConfigError, match="expected no compile_model, got one; set `compile: true`"
+    ):
         LeRobot.from_config(
             {"checkpoint": str(made(kind)), "overrides": {"compile_model": True}}
         ).initialize()

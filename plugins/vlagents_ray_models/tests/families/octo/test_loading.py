@@ -32,8 +32,8 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"dataset": "bridge"}, r"no statistics of 'action'.*bridge_dataset.*fractal20220817_data"),
-        ({"dataset": None}, "no statistics of 'action'.*bridge_dataset"),
+        ({"dataset": "bridge"}, r"bridge_dataset.*fractal20220817_data.*no statistics of 'action'"),
+        ({"dataset": None}, "bridge_dataset.*no statistics of 'action'"),
         (
             {"cameras": {"image_top": "front"}},
             r"expected .* \['image_primary', 'image_wrist'\], got \['image_top'\]",
@@ -42,8 +42,8 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
             {"normalization": "bounds"},
             r"have \['mask', 'mean', 'std'\].*p01.*set it as in training",
         ),
-        ({"window": 5}, "got 5, want at most 4; trained: 2"),
-        ({"state": ["joints"]}, "reads no state"),
+        ({"window": 5}, "expected at most 4, got 5; set 2, as in training"),
+        ({"state": ["joints"]}, "expected no state"),
         ({"device": "tpu:1"}, "not here"),
     ],
 )
@@ -55,7 +55,7 @@ def test_settings_that_do_not_fit_the_checkpoint(
 
 
 def test_a_checkpoint_that_reads_a_state_needs_its_parts(finetuned: Path) -> None:
-    with pytest.raises(ConfigError, match="reads a state of 3 numbers"):
+    with pytest.raises(ConfigError, match="expected a state of 3 numbers"):
         load(finetuned, dataset=None)
 
 
@@ -90,7 +90,7 @@ def _elsewhere(folder: Path) -> None:
     [
         (_without("config.json"), r"misses \['config.json'\]"),
         (_without("dataset_statistics.json"), r"misses \['dataset_statistics.json'\]"),
-        (lambda folder: shutil.rmtree(folder / "7"), "has no step"),
+        (lambda folder: shutil.rmtree(folder / "7"), "expected a step"),
         (lambda folder: shutil.rmtree(folder / "7" / "default"), "could not load"),
         (_elsewhere, "could not load.*no-t5"),
         (_deeper, "could not load|does not fill"),

@@ -168,7 +168,7 @@ def test_an_episode_without_its_kind_of_task_is_refused(
 ) -> None:
     other = made(pretrained, goal=goal)
     other.model = policy.model
-    with pytest.raises(InvalidObservation, match="want"):
+    with pytest.raises(InvalidObservation, match="expected"):
         other.reset(seen(1, **info), instruction)
 
 

@@ -69,7 +69,8 @@ def test_quantiles_that_a_config_needs_must_be_there(checkpoint: Any, tmp_path: 
 def test_the_folder_of_a_run_is_told_from_that_of_a_step(whole: Path) -> None:
     shutil.rmtree(whole / "params")
     with pytest.raises(
-        ConfigError, match=r"want params/ or model\.safetensors; name the folder of one step"
+        ConfigError,
+        match=r"expected params/ or model\.safetensors, got .*; name the folder of one step",
     ):
         load(whole)
 
@@ -100,7 +101,7 @@ def test_lora_weights_are_not_dropped(checkpoint: Any, tmp_path: Path, tiny: Mod
         ({"config": "pi7"}, "not one of openpi's .*pi05_libero"),
         (
             {"config": "plugins.vlagents_ray_models.tests.families.openpi.tiny:NONE"},
-            "got NoneType, want an openpi TrainConfig",
+            "expected an openpi TrainConfig, got NoneType",
         ),
         ({"config": "no_such_module:X"}, "no module 'no_such_module'"),
         ({"cameras": {"observation/image": "front"}}, "cameras: got .*want .*wrist_image"),

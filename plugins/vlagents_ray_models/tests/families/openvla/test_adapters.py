@@ -156,6 +156,6 @@ def test_statistics_of_another_action_are_refused(
         json.dumps({"d": {"action": {"q01": [0.0], "q99": [1.0]}}})
     )
     with pytest.raises(
-        ConfigError, match=r"adapter 'short': .*got actions of \[1\] numbers, want \[7\], as"
+        ConfigError, match=r"adapter 'short': .*expected actions of \[7\] numbers, .*got \[1\]"
     ):
         load(checkpoint("openvla"), adapters={"short": str(folder)})

@@ -50,7 +50,7 @@ def _link(source: str, target: str) -> None:
             "openvla",
             "openvla",
             {"unnorm_key": "bridge"},
-            r"got 'bridge', want one of .*bridge_orig.*libero_spatial",
+            r"expected one of .*bridge_orig.*libero_spatial.*got 'bridge'",
         ),
         (
             "openvla",
@@ -62,22 +62,27 @@ def _link(source: str, target: str) -> None:
             "openvla",
             "openvla",
             {"source_dir": "/nowhere"},
-            r"got \['/nowhere'\], want a folder with prismatic",
+            r"expected a folder with prismatic.*, got \['/nowhere'\]",
         ),
-        ("openvla", "openvla", {"trust_remote_code": True}, "names no code"),
+        ("openvla", "openvla", {"trust_remote_code": True}, "expected code named in"),
         (
             "openvla",
             "openvla",
             {"trust_remote_code": True, "source_dir": "."},
-            "got both, want .* one of them",
+            "expected one of them .*got both",
         ),
         (
             "openvla_oft",
             "oft",
             {"film": True},
-            r"'vision_backbone', want one file vision_backbone--STEP",
+            r"expected one file vision_backbone--STEP",
         ),
-        ("openvla_oft", "oft", {"head": "diffusion"}, "'noisy_action_projector', want one file"),
+        (
+            "openvla_oft",
+            "oft",
+            {"head": "diffusion"},
+            "expected one file noisy_action_projector--STEP",
+        ),
         ("openvla_oft", "oft", {"head": "tokens"}, "has action_head--.*do not use"),
         ("openvla_oft", "oft", {"state": []}, "has proprio_projector--.*do not use"),
         ("openvla_oft", "oft-film", {}, "has vision_backbone--.*do not use"),
@@ -95,7 +100,7 @@ def _link(source: str, target: str) -> None:
             r"expected .* \['full_image', 'wrist_image'\]",
         ),
         ("openvla_oft", "oft", {"attention": "flash_attention_2"}, "attention"),
-        ("openvla_oft", "oft", {"inference_steps": 51}, "got 51, want at most 50"),
+        ("openvla_oft", "oft", {"inference_steps": 51}, "expected at most 50, got 51"),
     ],
 )
 def test_settings_that_do_not_fit(
@@ -125,7 +130,7 @@ def test_statistics_are_in_the_checkpoint_or_nothing_is_served(
     statistics = json.loads((folder / "dataset_statistics.json").read_text())
     (folder / "dataset_statistics.json").unlink()
     with pytest.raises(
-        ConfigError, match=r"got no normalisation statistics, want dataset_statistics.json"
+        ConfigError, match=r"expected dataset_statistics.json.*got no normalisation statistics"
     ):
         load("openvla", folder)
 
@@ -151,7 +156,7 @@ def test_no_source_and_no_leave_to_run_remote_code(
     for name in VARIABLES:
         monkeypatch.delenv(name)
     with pytest.raises(
-        ConfigError, match=r"got no source tree, want .*OPENVLA_SRC.*trust_remote_code: true"
+        ConfigError, match=r"got no source tree; .*OPENVLA_SRC.*trust_remote_code: true"
     ):
         load("openvla", copied("remote"))
 
@@ -172,7 +177,7 @@ def test_components_of_two_steps_are_not_guessed_between(copied: Callable[[str],
     shutil.copy(
         folder / "action_head--100_checkpoint.pt", folder / "action_head--200_checkpoint.pt"
     )
-    with pytest.raises(ConfigError, match=r"got .*100.*200.* for 'action_head', want one file"):
+    with pytest.raises(ConfigError, match=r"expected one file action_head--STEP.*got .*100.*200"):
         load("openvla_oft", folder)
 
 

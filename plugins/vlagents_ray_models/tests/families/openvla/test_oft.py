@@ -337,5 +337,5 @@ def test_a_dataset_whose_actions_are_longer_than_the_heads_is_refused_alone(
         [seen(0, unnorm_key="aloha"), seen(1)], [begun(policy, 0), begun(policy, 1)]
     )
     assert isinstance(bad, InvalidObservation)
-    assert "'aloha' of 14 numbers, want one of 7" in str(bad)
+    assert "expected a dataset of 7 numbers, as the head's, got 'aloha' of 14" in str(bad)
     assert isinstance(good, Act)

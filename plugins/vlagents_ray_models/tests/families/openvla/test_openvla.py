@@ -123,13 +123,14 @@ def test_a_bad_request_fails_alone(
 def test_an_instruction_longer_than_the_model_was_trained_for_is_refused(policy: OpenVLA) -> None:
     session = begun(policy, 0)
     session.reset(seen(0), "go " * 2048)
-    with pytest.raises(InvalidObservation, match="tokens with the prompt, want 2048"):
+    with pytest.raises(InvalidObservation, match="expected at most 2048 tokens with the prompt"):
         session.act(seen(0))
 
 
 def test_an_unknown_dataset_is_refused_when_an_episode_begins(policy: OpenVLA) -> None:
     with pytest.raises(
-        InvalidObservation, match=r"got 'aloha', want one of .*bridge_orig.*libero_spatial_no_noops"
+        InvalidObservation,
+        match=r"expected one of .*bridge_orig.*libero_spatial_no_noops.*got 'aloha'",
     ):
         begun(policy, 0, unnorm_key="aloha")
 

@@ -118,6 +118,6 @@ def test_an_adapter_with_other_statistics_is_refused(
     processor["state_mean"][0] += 1
     file.write_text(json.dumps(processor))
     with pytest.raises(
-        ConfigError, match=r"adapter 'own': .*got other \['state_mean'\] than the base has"
+        ConfigError, match=r"adapter 'own': .*expected \['state_mean'\] as the base has, got others"
     ):
         made(folder, adapters=adapters)

@@ -134,7 +134,7 @@ def test_a_neighbours_plan_changes_nothing(loaded: Pi0) -> None:
 
 
 def test_a_long_instruction_is_refused_and_not_cut_off(loaded: Pi0) -> None:
-    with pytest.raises(InvalidObservation, match="want at most 48"):
+    with pytest.raises(InvalidObservation, match="expected at most 48"):
         copy.copy(loaded).reset(seen(0), "pick up the cube " * 20)
 
 

@@ -69,7 +69,7 @@ def test_an_image_is_cut_to_the_square_in_its_middle() -> None:
 
 
 def test_an_encoder_for_images_of_another_size_is_refused(folder: Path) -> None:
-    with pytest.raises(ConfigError, match=f"images of {SIDE} px, want 256"):
+    with pytest.raises(ConfigError, match=f"expected images of 256 px.*got {SIDE}"):
         load_encoder(config(encoder=str(folder), image_size=256), None)
 
 

@@ -258,14 +258,18 @@ def altered(checkpoint: Path, folder: Path, network: str, tensor: str | None) ->
 @pytest.mark.parametrize(
     ("network", "tensor", "says"),
     [
-        ("predictor", None, "want 'predictor' among them"),
+        ("predictor", None, "expected 'predictor', got"),
         ("encoder", None, "it has no 'encoder'"),
         ("predictor", "module.predictor_proj.bias", r"does not fit.*predictor_proj\.bias"),
-        ("encoder", "module.backbone.blocks.1.mlp.fc2.bias", r"encoder lacks.*mlp\.fc2\.bias"),
+        (
+            "encoder",
+            "module.backbone.blocks.1.mlp.fc2.bias",
+            r"expected upstream's parameters, got none of .*mlp\.fc2\.bias",
+        ),
         (
             "encoder",
             "module.backbone.patch_embed.proj.weight",
-            "want names as 'patch_embed.proj.weight'",
+            "expected upstream's names, as 'patch_embed.proj.weight'",
         ),
     ],
 )
@@ -299,7 +303,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_unpickled(tmp_path: P
 
     file = tmp_path / "odd.pt"
     file.write_bytes(pickle.dumps(Path))
-    with pytest.raises(ConfigError, match="not a file of tensors"):
+    with pytest.raises(ConfigError, match="a file of tensors, got another"):
         VJepa2Ac.from_config({"checkpoint": str(file), "encoder_heads": HEADS}).initialize()
 
 
