@@ -135,7 +135,7 @@ EVAL = ("--out", "runs/x", "--policy")
         (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'"),
         (
             ("eval", "libero/libero_spatial/12", *EVAL, "scripted"),
-            "has no task '12': want 0 to 9, or a name",
+            "expected a task from 0 to 9, or a name, got '12'",
         ),
         (
             ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),

@@ -21,7 +21,7 @@ def test_silence_and_nonsense_are_errors() -> None:
         mute.read(0.1)
     with (
         LineProcess("talker", ["echo", "hello"]) as talker,
-        pytest.raises(ProcessFailed, match="want a line of JSON"),
+        pytest.raises(ProcessFailed, match="expected a line of JSON"),
     ):
         talker.read(10)
 

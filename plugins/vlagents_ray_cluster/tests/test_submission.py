@@ -71,14 +71,14 @@ def test_an_option_that_only_a_newer_sbatch_knows_is_passed_on() -> None:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--nodes"], "want --nodes=VALUE"),
-        (["--policy"], "want --policy=VALUE"),
+        (["--nodes"], "expected --nodes=VALUE"),
+        (["--policy"], "expected --policy=VALUE"),
         (["--ntasks=4"], "--nodes and --cpus-per-task"),
         (["-n4"], "--nodes"),
         (["--gpus-per-task=1"], "--gpus-per-node"),
         (["--wrap=ls"], "written for you"),
         (["-Z"], "neither this command.s"),
-        (["--=3"], "want --NAME=VALUE"),
+        (["--=3"], "expected --NAME=VALUE"),
     ],
 )
 def test_words_that_would_not_work_are_told_with_what_would(words: list[str], text: str) -> None:
@@ -88,7 +88,7 @@ def test_words_that_would_not_work_are_told_with_what_would(words: list[str], te
 
 def test_the_first_task_of_an_array() -> None:
     assert [first_index(array) for array in ("0-15", "4,9", "7-99:3%2")] == ["0", "4", "7"]
-    with pytest.raises(ConfigError, match="want numbers"):
+    with pytest.raises(ConfigError, match="expected numbers"):
         first_index("all")
 
 

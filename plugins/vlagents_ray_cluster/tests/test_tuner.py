@@ -124,7 +124,7 @@ def test_a_policy_without_such_settings_gets_a_batch_size() -> None:
     args = ServerArgs(policy="tuned_policies:Plain", batch={"max_size": 2})
     plan = TunePlan(args, TuningGoal("throughput"), max_batch=2, seconds=0.1)
     assert {point.variant.name for point in Tuner(plan).measure()} == {"own settings"}
-    with pytest.raises(ConfigError, match="no setting `dtype`"):
+    with pytest.raises(ConfigError, match="expected a policy with the setting `dtype`"):
         Tuner(TunePlan(args, TuningGoal("throughput"), dtypes=["bfloat16"])).measure()
 
 
@@ -133,7 +133,9 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
         batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=TuningGoal("robots", 60_000.0)
     )
     assert [point.sessions for point in measured.measure()] == [2, 3]
-    with pytest.raises(ConfigError, match="--max-batch: got 1"):
+    with pytest.raises(
+        ConfigError, match="--max-batch: expected at least 2, the file's smallest fixed size, got 1"
+    ):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
 
 

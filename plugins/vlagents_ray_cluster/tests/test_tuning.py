@@ -149,7 +149,10 @@ def test_for_robots_the_most_sessions_within_the_time_are_chosen() -> None:
 
 
 def test_a_goal_that_nothing_reaches_is_an_error_with_the_nearest() -> None:
-    with pytest.raises(GoalMissed, match=r"got 10.* 20\.0 ms, with 1 session and own settings"):
+    with pytest.raises(
+        GoalMissed,
+        match=r"expected a p99 of at most 10.* ms, got 20\.0 ms at best, with 1 session and own settings",
+    ):
         choose([point(OWN, 1, 30, 20), point(COMPILED, 2, 50, 40)], TuningGoal("robots", 10.0))
 
 

@@ -136,5 +136,5 @@ def test_where_nothing_can_be_saved_a_press_says_why(
 
 
 def test_settings_of_a_ring_without_a_folder_are_refused() -> None:
-    with pytest.raises(ValidationError, match="got ring_s without `folder`"):
+    with pytest.raises(ValidationError, match="expected a folder with ring_s, got none"):
         LiveConfig(ring_s=10.0)

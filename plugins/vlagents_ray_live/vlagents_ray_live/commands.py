@@ -99,8 +99,8 @@ class CommandBoard:
         """
         if do not in COMMANDS:
             raise InvalidInput(
-                f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its "
-                "instruction or move it at the robot"
+                f"do: expected one of {list(COMMANDS)}, got {do[:40]!r}; resume a robot, change "
+                "its instruction or move it at the robot"
             )
         if session_id not in self._sessions:
             raise UnknownSession(

@@ -218,7 +218,8 @@ class EpisodeWriter:
                     size += os.stat(os.path.join(root, name)).st_size
         if size > self._most_bytes:
             raise RecordingEnded(
-                f"{self._folder} holds {size / 1e9:.3g} GB, want {self._most_bytes / 1e9:g} at most"
+                f"{self._folder}: expected at most {self._most_bytes / 1e9:g} GB, got "
+                f"{size / 1e9:.3g}"
             )
         free = shutil.disk_usage(self._folder).free
         if free < _FREE_BYTES:

@@ -202,7 +202,7 @@ class _LiveEndpoint:
             return _ViewerRequest.model_validate_json(text[:_CHARACTERS]).shown
         except ValidationError as error:
             raise MalformedMessage(
-                f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}'
+                f'live: expected {{"shown": ["SESSION", ...]}}, got {text[:80]!r}'
             ) from error
 
 
@@ -226,7 +226,7 @@ async def _command(http: HttpRequest) -> _Command:
     # The page of another site cannot send this type without the server's permission.
     if content_type != "application/json":
         raise MalformedMessage(
-            f"content-type: got {content_type or 'none'!r}, want application/json"
+            f"content-type: expected application/json, got {content_type or 'none'!r}"
         )
 
     body = b""
@@ -238,7 +238,7 @@ async def _command(http: HttpRequest) -> _Command:
         return _Command.model_validate_json(body)
     except ValidationError as error:
         raise MalformedMessage(
-            f'live: got {body[:80]!r}, want {{"session": ..., "do": ...}}'
+            f'live: expected {{"session": ..., "do": ...}}, got {body[:80]!r}'
         ) from error
 
 

@@ -73,7 +73,8 @@ class LiveConfig(PartConfig):
                 changed.append(name)
         if changed:
             raise ValueError(
-                f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a folder"
+                f"expected a folder with {', '.join(changed)}, got none, so that nothing is kept; "
+                "name one"
             )
         return self
 

@@ -152,7 +152,7 @@ def test_results_of_several_bundles_are_pooled(bundle: Path, line: Path, tmp_pat
     for name, file in (("a", bundle), ("b", tmp_path / "line.zip")):
         verify(file, into=tmp_path / name, replay=0)
     assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).total.episodes == 5
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="expected a new folder, got one that exists"):
         verify(bundle, into=tmp_path / "a")
 
 
@@ -266,7 +266,7 @@ def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
             (json.dumps(json.loads(settings) | {"env_options": options}),),
         )
     write_bundle(tmp_path / "run", tmp_path / "b.zip")
-    assert "which could name files or code; --trust takes them" in details(
+    assert "that cannot name files or code, got" in details(
         verify(tmp_path / "b.zip"), "replay of tabletop#0@0"
     )
 
@@ -287,7 +287,10 @@ def test_a_path_that_no_bundle_has_is_refused_and_nothing_is_written(
     bundle: Path, tmp_path: Path, name: str
 ) -> None:
     hostile = rewritten(bundle, tmp_path / "b.zip", {name: b"x"}, honest=True)
-    with pytest.raises(ConfigError, match=r"got the file .*do not trust the author of this bundle"):
+    with pytest.raises(
+        ConfigError,
+        match=r"expected only files of results, got .*do not trust the author of this bundle",
+    ):
         verify(hostile, into=tmp_path / "deep" / "kept")
     assert not list((tmp_path / "deep").iterdir())
 
@@ -308,7 +311,8 @@ def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(
         with pytest.raises(ConfigError, match=why):
             verify(hostile)
     with pytest.raises(
-        ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --max-gb"
+        ConfigError,
+        match=r"expected at most 1000 unpacked bytes, got \d+; allow more with --max-gb",
     ):
         verify(bundle, most_bytes=1000)
 

@@ -57,7 +57,7 @@ def test_a_dataset_without_cameras_has_a_state_of_the_environment(
         ("successes=often", "'often'"),
         ("succeses=true", "did you mean 'successes'"),
         ("results=x", "there is no such setting"),
-        ("cameras=[front]", "has no 'front', want some of"),
+        ("cameras=[front]", "got 'front'"),
     ],
 )
 def test_a_setting_that_a_dataset_does_not_have_is_refused(

@@ -102,7 +102,7 @@ def test_other_envs_and_seeds_join_the_table_also_of_a_suite_that_was_renamed(
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"seed": 3}, r"seeds \[3\]; together they are \[0, 3\].*6 or more apart"),
+        ({"seed": 3}, r"expected seeds 6 or more apart.*got \[3\], together \[0, 3\]"),
         ({"execute": 2}, r"Line has other settings: execute: None and 2"),
     ],
 )

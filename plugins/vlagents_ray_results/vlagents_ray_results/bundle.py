@@ -88,8 +88,7 @@ def pack(folder: Path, archive: Path) -> str:
     unknown = [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]
     if unknown:
         raise ConfigError(
-            f"{folder}: got the files {unknown[:5]}, which a bundle may not hold; rename or remove "
-            "them"
+            f"{folder}: expected only files of results, got {unknown[:5]}; rename or remove them"
         )
 
     manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
@@ -174,7 +173,7 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
     listed = file.infolist()
     if len(listed) > _MOST_MEMBERS:
         raise ConfigError(
-            f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}"
+            f"{archive}: expected at most {_MOST_MEMBERS} files, got {len(listed)}; {_DISTRUST}"
         )
 
     members: dict[str, zipfile.ZipInfo] = {}
@@ -183,10 +182,12 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
         kind = stat.S_IFMT(member.external_attr >> 16)
         if not _KNOWN.fullmatch(name) or member.filename != name:
             raise ConfigError(
-                f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}"
+                f"{archive}: expected only files of results, got {name!r}; {_DISTRUST}"
             )
         if name in members:
-            raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
+            raise ConfigError(
+                f"{archive}: expected each file once, got {name!r} twice; {_DISTRUST}"
+            )
         if kind not in (0, stat.S_IFREG):
             raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
         is_encrypted = member.flag_bits & 0x1
@@ -200,8 +201,8 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
     total = sum(member.file_size for member in listed)
     if total > most_bytes:
         raise ConfigError(
-            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with "
-            "--max-gb if you trust it"
+            f"{archive}: expected at most {most_bytes} unpacked bytes, got {total}; allow more "
+            "with --max-gb if you trust it"
         )
     return members
 
@@ -212,11 +213,13 @@ def _manifest(
     """Return the manifest and its SHA-256."""
     if member is None:
         raise ConfigError(
-            f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote"
+            f"{archive}: expected a bundle that `vlagents-ray bundle` wrote, got one without "
+            f"{MANIFEST}"
         )
     if member.file_size > _MOST_MANIFEST:
         raise ConfigError(
-            f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}"
+            f"{archive}: {MANIFEST}: expected at most {_MOST_MANIFEST} bytes, got "
+            f"{member.file_size}"
         )
 
     with file.open(member) as opened:

@@ -98,8 +98,8 @@ def to_lerobot(
         recorded += [(case, episode) for episode in case.episodes if episode.trajectory is not None]
     if not recorded:
         raise ConfigError(
-            f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its "
-            "file)"
+            f"{results.out}: expected trajectories, got none; evaluate with --record all "
+            "(`record: all` in its file)"
         )
 
     if successes:
@@ -269,11 +269,11 @@ def _chosen(option: str, names: Sequence[str] | None, known: Sequence[str], env:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ConfigError(
-            f"{option}: {env} has no {', '.join(map(repr, unknown))}, want some of {sorted(known)}"
-            f"{did_you_mean(unknown[0], known)}"
+            f"{option}: {env}: expected some of {sorted(known)}, got "
+            f"{', '.join(map(repr, unknown))}{did_you_mean(unknown[0], known)}"
         )
     if len(set(names)) < len(names):
-        raise ConfigError(f"{option}: got {list(names)}, want each of them once")
+        raise ConfigError(f"{option}: expected each name once, got {list(names)}")
     return list(names)
 
 

@@ -208,9 +208,9 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
     ordered = sorted(seeds)
     if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
         raise ConfigError(
-            f"{folder}: {case['env']} has the seeds {added}; together they are {ordered}, and with "
-            f"{episodes} episodes of each some would be played twice; want them {episodes} or more "
-            "apart"
+            f"{folder}: {case['env']}: expected seeds {episodes} or more apart, as each has "
+            f"{episodes} episodes, got {added}, together {ordered}, of which some episodes would "
+            "be played twice"
         )
     case |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
 

@@ -107,7 +107,7 @@ def verify(
         StorageFailed: The disk is full, or cannot be written to.
     """
     if into is not None and into.exists():
-        raise ConfigError(f"{into}: is there already; want a new folder")
+        raise ConfigError(f"{into}: expected a new folder, got one that exists; choose another")
     require_file(bundle)
     if seed is None:
         seed = secrets.randbits(32)
@@ -150,11 +150,11 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     """Yield all findings except that of the digests; also write summary and report."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(
-            f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote"
+            f"expected a bundle that `vlagents-ray bundle` wrote, got one without {DATABASE}"
         )
     results = Results.load(folder)
     if not results.runs or not results.cases:
-        raise ConfigError(f"{DATABASE}: has no run, or no case; want the results of an evaluation")
+        raise ConfigError(f"{DATABASE}: expected the results of an evaluation, got none")
 
     yield _check_cases(results)
     yield _check_episodes(results)
@@ -411,7 +411,7 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
         ) from error
     if size > MOST_TRAJECTORY:
         raise ConfigError(
-            f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}"
+            f"{episode.trajectory}: expected at most {MOST_TRAJECTORY} unpacked bytes, got {size}"
         )
 
     try:
@@ -616,8 +616,8 @@ def require_harmless(case: CaseResults) -> None:
                 risky[name] = value
         if risky:
             raise ConfigError(
-                f"{case.env}: got the {kind} {risky}, which could name files or code; --trust "
-                "takes them"
+                f"{case.env}: expected {kind} that cannot name files or code, got {risky}; give "
+                "--trust if you trust their author"
             )
 
 

@@ -41,11 +41,12 @@ def test_wrong_settings_are_told_with_the_cure(
         UnknownEnv, match=r"calvin: expected a task of \['A', 'B', 'C', 'D'\], got 'E'"
     ):
         make_env("calvin/E")
-    with pytest.raises(ConfigError, match="renderer is 'vulkan', want egl or tiny"):
+    with pytest.raises(ConfigError, match="renderer: expected egl or tiny, got 'vulkan'"):
         make_env("calvin/D", renderer="vulkan")
     with pytest.raises(ConfigError, match="CALVIN_SRC is not set; git clone --recurse-submodules"):
         make_env("calvin/D")
     with pytest.raises(
-        ConfigError, match=r"lacks \['calvin_env/conf', .*want a checkout .* with its submodules"
+        ConfigError,
+        match=r"expected a checkout .* with its submodules .*got none of \['calvin_env/conf'",
     ):
         make_env("calvin/D", source_dir=str(tmp_path))

@@ -99,7 +99,7 @@ def test_the_expert_says_what_it_wants() -> None:
         expert.act(Obs())
     with pytest.raises(MissingState, match="robot0_eef_pos"):
         expert.reset(Obs(), "")
-    with pytest.raises(InvalidObservation, match=r"want 'Can_quat', \(4,\)"):
+    with pytest.raises(InvalidObservation, match=r"expected 'Can_quat', \(4,\)"):
         expert.reset(seen((0, 0, 1)), "")
     with pytest.raises(ContractMismatch, match="robosuite/Lift"):
         RobosuiteExpert("robosuite/ToolHang")

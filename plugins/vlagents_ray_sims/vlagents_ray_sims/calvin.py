@@ -235,11 +235,11 @@ class Calvin(SimulatorEnv):
         """
         super().__init__(task, task_steps=task_steps)
         if renderer not in ("egl", "tiny"):
-            raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
+            raise ConfigError(f"{self._name}: renderer: expected egl or tiny, got {renderer!r}")
         if Calvin._open is not None:
             raise ConfigError(
-                f"{self._name}: {Calvin._open} is open in this process, want one at a time; close "
-                "it"
+                f"{self._name}: expected one open env in a process, got {Calvin._open} before it; "
+                "close that"
             )
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
         self._task_steps, self.max_steps = task_steps, TASKS * task_steps
@@ -408,8 +408,8 @@ def find_checkout(chosen: str | None) -> Path:
     missing = [str(path) for path in (_CONF, _TASKS, _WORDS) if not (checkout / path).exists()]
     if missing:
         raise ConfigError(
-            f"calvin: {checkout} lacks {missing}, want a checkout of CALVIN with its submodules; "
-            f"{_CURE}"
+            f"calvin: expected a checkout of CALVIN with its submodules in {checkout}, got none "
+            f"of {missing}; {_CURE}"
         )
     return checkout
 

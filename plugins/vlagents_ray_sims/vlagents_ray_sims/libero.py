@@ -224,12 +224,13 @@ def require_suite(name: str, suites: Mapping[str, Suite] = SUITES) -> tuple[str,
     suite, _, task = name.partition("/")
     if suite not in suites:
         raise UnknownEnv(
-            f"libero has no suite {suite!r}: want one of {sorted(suites)}, as in "
-            f"'{next(iter(suites))}/0'{did_you_mean(suite, suites)}"
+            f"libero: expected a suite of {sorted(suites)}, as in '{next(iter(suites))}/0', got "
+            f"{suite!r}{did_you_mean(suite, suites)}"
         )
     if not task or (task.isdecimal() and int(task) >= suites[suite].tasks):
         raise UnknownEnv(
-            f"libero: {suite} has no task {task!r}: want 0 to {suites[suite].tasks - 1}, or a name"
+            f"libero: {suite}: expected a task from 0 to {suites[suite].tasks - 1}, or a name, "
+            f"got {task!r}"
         )
     return suite, task
 
@@ -257,8 +258,8 @@ def find_task(name: str, suites: Mapping[str, Suite] = SUITES) -> LiberoTask:
     names = list(suite_tasks)
     if not task.isdecimal() and task not in names:
         raise UnknownEnv(
-            f"libero: {suite} has no task {task!r}: want 0 to {len(names) - 1}, or a name such as "
-            f"{names[0]!r}"
+            f"libero: {suite}: expected a task from 0 to {len(names) - 1}, or a name such as "
+            f"{names[0]!r}, got {task!r}"
         )
     number = int(task) if task.isdecimal() else names.index(task)
     entry = suite_tasks[names[number]]
@@ -375,7 +376,9 @@ class Libero(SimulatorEnv):
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
-            raise ConfigError(f"{self._name}: settling_steps is {settling_steps}, want 0 or more")
+            raise ConfigError(
+                f"{self._name}: settling_steps: expected 0 or more, got {settling_steps}"
+            )
         self._task = find_task(task, self.suites)
         self._name = f"{self.suite}/{self._task.suite}/{self._task.number}"
         self._assets = find_assets(assets)
@@ -392,7 +395,8 @@ class Libero(SimulatorEnv):
         )
         if self._rules.gripper_open == self._rules.gripper_closed:
             raise ConfigError(
-                f"{self._name}: the gripper opens and closes at {gripper_open}; want two numbers"
+                f"{self._name}: expected two different numbers as gripper_open and "
+                f"gripper_closed, got {gripper_open} twice; change one"
             )
         self.max_steps, self._ends_on_success = self._rules.max_steps, stop_at_success
         self._instruction = instruction or self._task.language

@@ -87,8 +87,8 @@ class MetaWorld(SimulatorEnv):
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(
-                f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it "
-                "stops"
+                f"metaworld: max_steps: expected at most {PROTOCOL.max_steps}, at which it stops, "
+                f"got {max_steps}"
             )
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success

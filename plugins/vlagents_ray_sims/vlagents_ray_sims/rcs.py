@@ -187,8 +187,8 @@ def scene_creator(task: RcsTask, name: str) -> Any:
     entry_point = gymnasium.registry[task.id].entry_point
     if not hasattr(entry_point, "create_env"):
         raise ConfigError(
-            f"{name}: {task.id!r} is no scene of RCS: want one whose entry point is an "
-            "RCSEnvCreator"
+            f"{name}: expected a scene of RCS, whose entry point is an RCSEnvCreator, got "
+            f"{task.id!r}"
         )
     return entry_point
 

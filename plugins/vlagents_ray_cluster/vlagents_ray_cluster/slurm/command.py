@@ -79,8 +79,8 @@ def eval_(
             registered_class("trackers", tracker)  # raises an error for an unknown name
         if "array" in options and config.out == other_config.out:
             raise ConfigError(
-                f"--array: its tasks write to one folder; want {_TASK} in it, as in --out "
-                f"runs/x/{_TASK}"
+                f"--array: expected a folder for each task, got one for all; put {_TASK} in it, "
+                f"as in --out runs/x/{_TASK}"
             )
 
         # Without --workers, the workers fill the job. They must not have GPUs then, since the
@@ -89,8 +89,8 @@ def eval_(
         if "workers" not in config.model_fields_set:
             if most_gpus(cases):
                 raise ConfigError(
-                    "workers have GPUs, but their number is not said; want --workers: policies get "
-                    "the GPUs left over"
+                    "workers: expected their number, as they have GPUs, got none; set --workers, "
+                    "as policies get the GPUs left over"
                 )
             fill = [f"--fill={max(1.0, most_cpus(cases)):g}"]
 

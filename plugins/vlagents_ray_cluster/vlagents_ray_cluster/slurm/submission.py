@@ -124,16 +124,16 @@ def split(
 
             if option in _OURS:
                 raise ConfigError(
-                    f"{word}: got an option that does not fit one Ray process on each node; want "
-                    f"{_OURS[option]}"
+                    f"{word}: expected options that fit one Ray process on each node, got "
+                    f"another; use {_OURS[option]}"
                 )
             if is_short and len(option) == 1:
                 raise ConfigError(
-                    f"{word}: got an option that is neither this command's nor a short one of "
-                    "sbatch"
+                    f"{word}: expected an option of this command or a short one of sbatch, got "
+                    "another"
                 )
             if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
-                raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
+                raise ConfigError(f"{word}: expected --NAME=VALUE, got an invalid name")
 
             if option not in _ALONE and attached is None:
                 attached = _next(remaining, f"--{option}")
@@ -145,7 +145,7 @@ def _next(words: Iterable[str], option: str) -> str:
     """Return the next word, which is the value of an option; raises `ConfigError` at the end."""
     value = next(iter(words), None)
     if value is None:
-        raise ConfigError(f"{option}: got no value; want {option}=VALUE")
+        raise ConfigError(f"{option}: expected {option}=VALUE, got no value")
     return value
 
 
@@ -157,7 +157,7 @@ def first_index(array: str) -> str:
     """
     match = re.match(r"\d+", array)
     if match is None:
-        raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
+        raise ConfigError(f"--array: expected numbers, as in 0-15, 1,3,7 or 0-99%4, got {array!r}")
     return match[0]
 
 
@@ -201,7 +201,7 @@ class Script:
             spaced = value is not None and any(sign.isspace() for sign in value)
             if value is not None and spaced and '"' in value:
                 raise ConfigError(
-                    f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces"
+                    f"slurm: expected no quotes in a value with spaces, got {value[:200]!r}"
                 )
 
             if value is None:
@@ -214,8 +214,7 @@ class Script:
         for word in (self.name, str(self.folder), *words):
             if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
                 raise ConfigError(
-                    f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, "
-                    "in it"
+                    f"slurm: expected no control characters, such as line feeds, got {word[:200]!r}"
                 )
 
         settings = {

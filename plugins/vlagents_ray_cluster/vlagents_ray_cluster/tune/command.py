@@ -86,7 +86,7 @@ def tune_command(
     with errors():
         tuning_goal = TuningGoal(goal.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
-            raise ConfigError(f"got {str(file)!r}, want a deployment file (.yaml)")
+            raise ConfigError(f"expected a deployment file (.yaml), got {str(file)!r}")
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
         plan = TunePlan(

@@ -96,7 +96,9 @@ class LineProcess:
         try:
             return json.loads(line)
         except ValueError as error:
-            raise ProcessFailed(f"{self.name}: wrote {line[:80]!r}, want a line of JSON") from error
+            raise ProcessFailed(
+                f"{self.name}: expected a line of JSON, got {line[:80]!r}"
+            ) from error
 
     def send(self, line: str) -> None:
         """Send a line, without waiting for the answer."""

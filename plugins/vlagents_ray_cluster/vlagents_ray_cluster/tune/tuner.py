@@ -45,8 +45,8 @@ class TuningGoal:
     def __post_init__(self) -> None:
         if self.kind == "robots" and self.p99_ms is None:
             raise ConfigError(
-                "--for robots: got no --p99-ms, want the longest round trip that your robots bear, "
-                "ms"
+                "--for robots: expected --p99-ms, the longest round trip that your robots bear, "
+                "ms, got none; set it"
             )
         if self.kind == "throughput" and self.p99_ms is not None:
             raise ConfigError("--p99-ms: is for --for robots; leave it out")
@@ -130,9 +130,9 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     if not reaching:
         closest = min(points, key=lambda point: point.p99_ms)
         raise GoalMissed(
-            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was "
-            f"{closest.p99_ms:.1f} ms, with {sessions(closest.sessions)} and "
-            f"{closest.variant.name}; raise --p99-ms, or use a faster machine or model"
+            f"--p99-ms: expected a p99 of at most {goal.p99_ms} ms, got {closest.p99_ms:.1f} ms "
+            f"at best, with {sessions(closest.sessions)} and {closest.variant.name}; raise "
+            "--p99-ms, or use a faster machine or model"
         )
 
     def score(point: MeasuredPoint) -> float:
@@ -348,7 +348,8 @@ class Tuner:
                 self.device, self.fixed = ready["device"], ready["settings"].get("batch_sizes")
                 if self._plan.dtypes and "dtype" not in ready["settings"]:
                     raise ConfigError(
-                        f"--dtypes: {self._plan.args.policy!r} has no setting `dtype`; leave it out"
+                        "--dtypes: expected a policy with the setting `dtype`, got "
+                        f"{self._plan.args.policy!r}; leave it out"
                     )
                 sizes = self._candidates()
                 self._expected = self._actions(process, sizes[0])[:FRAMES]
@@ -371,8 +372,8 @@ class Tuner:
         candidates = [size for size in sizes if size <= self._plan.max_batch]
         if not candidates:
             raise ConfigError(
-                f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is "
-                f"{sizes[0]}"
+                f"--max-batch: expected at least {sizes[0]}, the file's smallest fixed size, got "
+                f"{self._plan.max_batch}; raise it"
             )
         return candidates
 
@@ -531,8 +532,8 @@ class Tuner:
             difference = largest_difference(self._actions(process, size), self._expected)
             if difference > self._plan.tolerance:
                 off = (
-                    f"actions differ by {difference:.2%} of their range, want at most "
-                    f"{self._plan.tolerance:.2%}"
+                    f"expected actions within {self._plan.tolerance:.2%} of their range, got "
+                    f"{difference:.2%}"
                 )
                 if variant.changes or points:
                     raise VariantFailed(f"refused, as {off}")
@@ -637,8 +638,8 @@ def recorded_observations(folder: Path, count: int) -> list[Obs]:
     files = sorted(folder.rglob("*.npz"))
     if not files:
         raise ConfigError(
-            f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations "
-            "save"
+            f"--frames {folder}: expected a folder of trajectories (.npz), as evaluations save, "
+            "got none"
         )
 
     used = files[:: max(1, len(files) // count)][:count]
@@ -673,5 +674,7 @@ def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
 
     missing = sorted(set(steps) - set(images))
     if missing:
-        raise ConfigError(f"--frames: {video} has no frames {missing}, which its trajectory has")
+        raise ConfigError(
+            f"--frames: {video}: expected the frames of its trajectory, got none of {missing}"
+        )
     return images

@@ -90,7 +90,9 @@ class AlohaExpert:
         self._task = env_task(env_name) or "transfer_cube"
         if self._task not in _SIM_STATE_SIZES:
             envs = [f"aloha/{task}" for task in _SIM_STATE_SIZES]
-            raise ContractMismatch(f"no expert for {env_name!r}: want one of {envs}")
+            raise ContractMismatch(
+                f"expected an env with an expert, one of {envs}, got {env_name!r}"
+            )
         # Arm -> the steps and the commands, (7,), between which the arm moves.
         self._commands: dict[str, list[tuple[int, np.ndarray]]] = {}
         self._step = 0

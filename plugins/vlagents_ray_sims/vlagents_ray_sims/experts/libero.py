@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, InvalidObservation
+from vlagents_ray.errors import ContractMismatch, InvalidObservation, shown
 from vlagents_ray.interface import Obs
 from vlagents_ray_sims.experts.osc_pose import (
     CLOSED,
@@ -115,7 +115,8 @@ class LiberoExpert(PickExpert):
         unknown = sorted(kinds - set(_MOTIONS))
         if unknown:
             raise ContractMismatch(
-                f"{self._name}: the expert meets goals of {sorted(_MOTIONS)}, not {unknown}"
+                f"{self._name}: expected goals of {sorted(_MOTIONS)}, as this expert meets, got "
+                f"{unknown}"
             )
         self._tries = {}
         self._choose(obs)
@@ -144,7 +145,8 @@ class LiberoExpert(PickExpert):
         pose = obs.state.get("xyz_axis_angle")
         if pose is None or pose.shape != (6,):
             raise InvalidObservation(
-                "state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it"
+                "state 'xyz_axis_angle': expected (6,), m and rad, as LIBERO's env gives it, got "
+                f"{shown(pose)}"
             )
         return pose[:3].astype(np.float64), rotation(pose[3:].astype(np.float64))
 
@@ -227,7 +229,7 @@ class LiberoExpert(PickExpert):
         if not isinstance(state, dict) or not set(state) >= _STATE_KEYS:
             content: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
             raise InvalidObservation(
-                f"info['sim_state']: got {content}, want goal, unmet, positions and quaternions, "
-                f"as the env {self._name} gives them; this expert cannot act on images"
+                "info['sim_state']: expected goal, unmet, positions and quaternions, as the env "
+                f"{self._name} gives them, got {content}; this expert cannot act on images"
             )
         return state

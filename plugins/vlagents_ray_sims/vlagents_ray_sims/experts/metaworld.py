@@ -23,7 +23,8 @@ class MetaWorldExpert:
         task = env_task(env_name) or "reach-v3"
         if task not in oracles:
             raise ContractMismatch(
-                f"Meta-World has no oracle for {env_name!r}: want one of {sorted(oracles)}"
+                f"expected an env with an oracle of Meta-World, one of {sorted(oracles)}, got "
+                f"{env_name!r}"
             )
         self._name = env_name
         self._oracle = oracles[task]()

@@ -15,7 +15,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, InvalidObservation, MissingState, NotReset
+from vlagents_ray.errors import (
+    ContractMismatch,
+    InvalidObservation,
+    MissingState,
+    NotReset,
+    shown,
+)
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_task
 
@@ -143,7 +149,9 @@ class RobosuiteExpert(PickExpert):
         task = env_task(env_name) or "Lift"
         if task not in _HANDLING:
             envs = [f"robosuite/{known_task}" for known_task in _HANDLING]
-            raise ContractMismatch(f"no scripted expert for env {env_name!r}: want one of {envs}")
+            raise ContractMismatch(
+                f"expected an env with a scripted expert, one of {envs}, got {env_name!r}"
+            )
         self._handling = _HANDLING[task]
         phases = _PICK if self._handling.release_m is None else (*_PICK, *_PLACE)
         super().__init__(f"robosuite/{task}", phases)
@@ -191,8 +199,8 @@ class RobosuiteExpert(PickExpert):
         value = state.get(name) if isinstance(state, dict) else None
         if not isinstance(value, np.ndarray) or value.shape != (size,):
             raise InvalidObservation(
-                f"info['sim_state']: want {name!r}, ({size},), as the env {self._name} gives it; "
-                f"this expert cannot act on images"
+                f"info['sim_state']: expected {name!r}, ({size},), as the env {self._name} gives "
+                f"it, got {shown(value)}; this expert cannot act on images"
             )
         return value
 

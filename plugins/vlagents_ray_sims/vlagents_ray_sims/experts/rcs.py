@@ -71,8 +71,8 @@ class RcsPick:
         pose = obs.info.get("objects", {}).get(_CUBOID)
         if not isinstance(pose, np.ndarray) or pose.shape != (7,):
             raise InvalidObservation(
-                f"info['objects'][{_CUBOID!r}]: got {type(pose).__name__}, want (7,) float64; this "
-                f"expert is for {self._name} in the control mode tquat"
+                f"info['objects'][{_CUBOID!r}]: expected (7,) float64, got {type(pose).__name__}; "
+                f"use this expert with {self._name} in the control mode tquat"
             )
         return pose
 

@@ -217,6 +217,6 @@ def test_errors_and_the_description_say_what_a_reader_needs(env: Calvin) -> None
     described = env.describe()
     assert described["protocol"]["deviations"] == ["renderer: tiny, upstream draws by OpenGL"]
     assert (described["task"], described["pybullet"]) == ("D", "3.2.7")
-    with pytest.raises(ConfigError, match="calvin/D is open in this process, want one at a time"):
+    with pytest.raises(ConfigError, match="expected one open env in a process, got calvin/D"):
         Calvin("A")
     assert env.init_states == 1000

@@ -78,5 +78,5 @@ def test_assets_of_elsewhere_are_refused(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_task_of_libero_is_none_of_libero_pro() -> None:
-    with pytest.raises(UnknownEnv, match=r"want one of .*libero_goal_swap"):
+    with pytest.raises(UnknownEnv, match=r"expected a suite of .*libero_goal_swap"):
         LiberoPro("libero_goal/0")
