@@ -118,7 +118,7 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
     scans = file.count(bytes((0xFF, _SOS)))
     if scans > _MOST_SCANS:
         raise MessageTooLarge(
-            f"image: a JPEG of {scans} scans, the limit is {_MOST_SCANS}; encode it again"
+            f"image: expected a JPEG of at most {_MOST_SCANS} scans, got {scans}; encode it again"
         )
 
     # The decoder pads an image to whole units, of up to 32 x 32 pixels.
@@ -237,12 +237,12 @@ def _check_size(
         )
     if height * width > max_pixels:
         raise MessageTooLarge(
-            f"image: declares {height}x{width} pixels, the limit is {max_pixels}; send a smaller "
-            "one, or raise `limits.pixels`"
+            f"image: expected at most {max_pixels} pixels, got {height}x{width} declared; send a "
+            "smaller one, or raise `limits.pixels`"
         )
     max_bytes = 2 * pixel_bytes * height * width + _MOST_METADATA
     if file_bytes > max_bytes:
         raise MessageTooLarge(
-            f"image: a file of {file_bytes} bytes for {height}x{width} pixels, the limit is "
-            f"{max_bytes}; encode it again without metadata"
+            f"image: expected a file of at most {max_bytes} bytes for {height}x{width} pixels, "
+            f"got {file_bytes}; encode it again without metadata"
         )

@@ -224,7 +224,8 @@ class ShmReader:
                 layout = self._known[number]
                 if at + layout.size > memory.size:
                     raise MalformedMessage(
-                        f"local: {memory.size} bytes of memory, the arrays need more"
+                        f"local: expected at least {at + layout.size} bytes of memory for the "
+                        f"arrays, got {memory.size}"
                     )
 
                 id_bytes = request_id.rstrip(b"\0")

@@ -130,14 +130,20 @@ OBS = ("obs", None, json.dumps(GOOD).encode())
 HINTS = [  # what is sent, and what the answer says of it
     (
         form(OBS, ("cameras.front", "f", JPEG), ("cameras.front", "f", JPEG)),
-        "'cameras.front' twice, want it once",
+        "expected the part 'cameras.front' once, got it twice",
     ),
-    (form(OBS, OBS, ("cameras.front", "f", JPEG)), "'obs' twice, want it once"),
-    (form(OBS, ("cameras.", "f", JPEG)), "names no camera, want 'cameras.<name>'"),
-    (form(OBS, ("cameras.front", None, b"text")), "is text, want a file: send it with a filename"),
+    (form(OBS, OBS, ("cameras.front", "f", JPEG)), "expected the part 'obs' once, got it twice"),
+    (
+        form(OBS, ("cameras.", "f", JPEG)),
+        "expected a part 'cameras.<name>', got 'cameras.', which names no camera",
+    ),
+    (
+        form(OBS, ("cameras.front", None, b"text")),
+        "expected a file in the part 'cameras.front', got text; send it with a filename",
+    ),
     (
         form(OBS, ("front", "f", JPEG)),
-        "unknown part 'front', want 'obs' and files 'cameras.<name>'",
+        "expected the parts 'obs' and files 'cameras.<name>', got 'front'",
     ),
     (
         form(OBS, ("cameras.front", "f", JPEG), ("cameras.left", "f", JPEG[:-20])),
@@ -155,9 +161,13 @@ DOCUMENTS = [
         "send multipart/form-data, in it the document as part 'obs' and each image",
     ),
     (b'{"state": {"joints": [1, 2], "joints": [3, 4]}}', {}, "the key 'joints' occurs twice"),
-    (gzip.compress(b"{}"), {"content-encoding": "gzip"}, "content-encoding: got 'gzip', want none"),
-    (gzip.compress(b"{}"), {}, "body: got gzip, want it uncompressed"),
-    (b"{}", {"content-encoding": "br"}, "content-encoding: got 'br', want none"),
+    (
+        gzip.compress(b"{}"),
+        {"content-encoding": "gzip"},
+        "content-encoding: expected none, got 'gzip'",
+    ),
+    (gzip.compress(b"{}"), {}, "body: expected it uncompressed, got gzip"),
+    (b"{}", {"content-encoding": "br"}, "content-encoding: expected none, got 'br'"),
 ]
 
 
@@ -174,7 +184,7 @@ def test_what_is_misplaced_is_refused_with_the_cure(client: TestClient) -> None:
     answers.append(
         (
             client.post("/v1/act", content=body, headers=MULTIPART | more),
-            "content-encoding: got 'gzip'",
+            "content-encoding: expected none, got 'gzip'",
         )
     )
     for answer, said in answers:

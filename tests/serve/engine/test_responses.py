@@ -51,7 +51,7 @@ def replied(act: Act) -> tuple[Reply, Session]:
 def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
     reply, session = replied(act)
     assert isinstance(reply.error, PolicyFailed)
-    assert "want" in str(reply.error)
+    assert "expected at most" in str(reply.error)
     assert "`limits.reply_bytes`" in str(reply.error)
     assert (reply.act, session.steps) == (None, 0)
 

@@ -117,7 +117,7 @@ def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(
     wrong: list[tuple[str, dict[str, Any]]] = [
         ("--insecure", {"host": EVERYWHERE}),
         ("keys new", {"host": EVERYWHERE, "keys_file": tmp_path / "none.json"}),
-        ("IPv6 is not supported", {"host": "::1", "insecure": True}),
+        ("expected an IPv4 address, got ::1", {"host": "::1", "insecure": True}),
         ("TLS", {"tls": Tls(certificate, other)}),
         ("TLS", {"tls": Tls(tmp_path / "none", key)}),
         ("TLS", {"tls": Tls(certificate, key, client_ca=key)}),

@@ -123,8 +123,8 @@ class AutoTransport:
         if local is None or not reaches(local):
             if self._only_shm:
                 raise ConfigError(
-                    f"{self._url}: transport 'shm' needs the policy on this machine; it is on "
-                    "another"
+                    f"{self._url}: expected the policy on this machine for transport 'shm', got "
+                    "one on another; use transport 'auto'"
                 )
             return None
         transport = ShmTransport(local, self._credentials)

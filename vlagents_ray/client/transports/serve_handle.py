@@ -297,8 +297,8 @@ class PlasmaTransport(UnixTransport):
         node = this_node()
         if node is None:
             raise ConfigError(
-                f"serve://{self._app}: transport 'plasma' needs a process on a node of the "
-                "cluster, not a Ray client (ray://); use http://"
+                f"serve://{self._app}: expected a process on a node of the cluster for transport "
+                "'plasma', got a Ray client (ray://); use http://"
             )
 
         address = read_address(PlasmaAddress, metadata.get("plasma"))
@@ -309,9 +309,8 @@ class PlasmaTransport(UnixTransport):
             )
         if address.node != node:
             raise ConfigError(
-                f"serve://{self._app}: transport 'plasma' needs the replica on this node "
-                f"({node[:8]}), the chosen one is on {address.node[:8]}; use transport 'handle', "
-                "or 'auto'"
+                f"serve://{self._app}: expected a replica on this node ({node[:8]}) for transport "
+                f"'plasma', got one on {address.node[:8]}; use transport 'handle', or 'auto'"
             )
 
         self._handle = handle

@@ -39,7 +39,7 @@ class FrontMiddleware:
                 if scope["type"] == "websocket":
                     await receive()  # the "websocket.connect" message
                 refused = problem_response(
-                    MalformedMessage(f"header {shown(name)}: want UTF-8"), ""
+                    MalformedMessage(f"header {shown(name)}: expected UTF-8, got other bytes"), ""
                 )
                 await refused(scope, receive, send)
                 return

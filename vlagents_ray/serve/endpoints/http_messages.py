@@ -149,14 +149,14 @@ _Decoder: TypeAlias = Callable[[Budget], Request | Decoded]
 def _decoder(op: Op, content_type: str, data: bytes) -> tuple[_Decoder, bool]:
     """Return the decoder of a body that is no form, and whether that is long."""
     if data.startswith(_GZIP):
-        raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
+        raise MalformedMessage("body: expected it uncompressed, got gzip; send it as it is")
     if content_type == CONTENT_TYPE:
         return partial(decode_requests, data), False
     if content_type == "application/json":
         return partial(request_from_parts, op, data, {}), len(data) > LONG_BYTES
     raise MalformedMessage(
-        f"content-type: got {content_type or 'none'!r}, want multipart/form-data, "
-        f"application/json or {CONTENT_TYPE}"
+        f"content-type: expected multipart/form-data, application/json or {CONTENT_TYPE}, got "
+        f"{content_type or 'none'!r}"
     )
 
 
@@ -185,7 +185,9 @@ def require_length(headers: Mapping[str, str], limits: MessageLimits) -> None:
     """Raise `MessageTooLarge` if the headers declare a body above its limit."""
     length = headers.get("content-length", "")
     if length.isdigit() and int(length) > limits.body_bytes:
-        raise MessageTooLarge(f"body: declares {length} bytes, the limit is {limits.body_bytes}")
+        raise MessageTooLarge(
+            f"body: expected at most {limits.body_bytes} bytes, got {length} declared"
+        )
 
 
 def _bare_close(_: Budget) -> Request:
@@ -199,8 +201,8 @@ def _read_headers(
     id_header = headers.get(REQUEST_ID_HEADER, "")
     if not is_name(id_header):
         raise MalformedMessage(
-            f"header {REQUEST_ID_HEADER}: got {id_header[:40]!r}, want 1 to 128 visible ASCII "
-            "characters"
+            f"header {REQUEST_ID_HEADER}: expected 1 to 128 visible ASCII characters, got "
+            f"{id_header[:40]!r}"
         )
 
     deadline = headers.get(DEADLINE_HEADER)
@@ -256,7 +258,9 @@ async def _receive_form(
                 is_camera = name != camera
 
                 if (is_document and document is not None) or (is_camera and camera in files):
-                    raise MalformedMessage(f"form: got the part {name[:80]!r} twice, want it once")
+                    raise MalformedMessage(
+                        f"form: expected the part {name[:80]!r} once, got it twice"
+                    )
                 if is_document:
                     document = data
                 elif is_camera and camera and isinstance(data, bytes):
@@ -315,27 +319,27 @@ async def read_body(http: HttpRequest, admission: MessageAdmission) -> bytes:
     except _Refused as refused:
         raise refused.error from None
     if body.startswith(_GZIP):
-        raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
+        raise MalformedMessage("body: expected it uncompressed, got gzip; send it as it is")
     return body
 
 
 def _describe_wrong_part(name: str) -> str:
     if name == CAMERA_PREFIX:
-        return f"the part {name!r} names no camera, want 'cameras.<name>'"
+        return f"expected a part 'cameras.<name>', got {name!r}, which names no camera"
     if name.startswith(CAMERA_PREFIX):
         return (
-            f"the part {name[:80]!r} is text, want a file: send it with a filename, as curl -F "
-            f"{name[:80]}=@FILE does"
+            f"expected a file in the part {name[:80]!r}, got text; send it with a filename, as "
+            f"curl -F {name[:80]}=@FILE does"
         )
-    return f"unknown part {name[:80]!r}, want 'obs' and files 'cameras.<name>'"
+    return f"expected the parts 'obs' and files 'cameras.<name>', got {name[:80]!r}"
 
 
 def _require_uncompressed(http: HttpRequest) -> None:
     coding = headers_of(http.scope).get("content-encoding", "identity").strip().lower()
     if coding not in ("", "identity"):
         raise MalformedMessage(
-            f"content-encoding: got {coding[:40]!r}, want none; send the body as it is (images are "
-            "compressed already)"
+            f"content-encoding: expected none, got {coding[:40]!r}; send the body as it is "
+            "(images are compressed already)"
         )
 
 
@@ -360,8 +364,8 @@ def session_id(http: HttpRequest) -> str:
     name = headers_of(http.scope).get(SESSION_HEADER, "")
     if not name or not is_name(name):
         raise MalformedMessage(
-            f"header {SESSION_HEADER}: got {name[:40]!r}, want 1 to 128 visible ASCII characters; "
-            f"choose one for each robot or env and send it with every request"
+            f"header {SESSION_HEADER}: expected 1 to 128 visible ASCII characters, got "
+            f"{name[:40]!r}; choose one for each robot or env and send it with every request"
         )
     return name
 
@@ -373,8 +377,8 @@ def _deadline_ms(text: str) -> float:
         value = -1.0
     if not 0 < value < MOST_DEADLINE_MS:
         raise MalformedMessage(
-            f"header {DEADLINE_HEADER}: got {text[:40]!r}, want milliseconds above 0 and below "
-            f"{MOST_DEADLINE_MS:g}"
+            f"header {DEADLINE_HEADER}: expected milliseconds above 0 and below "
+            f"{MOST_DEADLINE_MS:g}, got {text[:40]!r}"
         )
     return value
 
@@ -382,7 +386,8 @@ def _deadline_ms(text: str) -> float:
 def _step(text: str) -> int:
     if not text.isdecimal() or len(text) > 19:
         raise MalformedMessage(
-            f"header {STEP_HEADER}: got {text[:40]!r}, want what the last answer's header says"
+            f"header {STEP_HEADER}: expected the number in the last answer's header, got "
+            f"{text[:40]!r}"
         )
     return int(text)
 

@@ -119,7 +119,7 @@ class Pool:
         # The length includes Ray's framing; the decoder checks the exact limit.
         if length > 2 * self._limits.body_bytes:
             raise MessageTooLarge(
-                f"frame: got {length} bytes, the limit is {self._limits.body_bytes}"
+                f"frame: expected at most {self._limits.body_bytes} bytes, got {length}"
             )
 
         with self._lock:
@@ -243,7 +243,7 @@ class LeasedChannel:
         """
         if len(message) < PlasmaAddress.REQUEST.size:
             raise MalformedMessage(
-                f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}"
+                f"plasma: expected at least {PlasmaAddress.REQUEST.size} bytes, got {len(message)}"
             )
         key, flags = PlasmaAddress.REQUEST.unpack_from(message)
         if self._channel is None or self._channel.ref.binary() != key:

@@ -394,7 +394,7 @@ class MemoryFiles:
         """
         if len(message) < LocalAddress.REQUEST.size:
             raise MalformedMessage(
-                f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}"
+                f"local: expected at least {LocalAddress.REQUEST.size} bytes, got {len(message)}"
             )
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
         if descriptors:

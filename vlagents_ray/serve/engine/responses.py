@@ -55,7 +55,7 @@ def build_reply(
         if isinstance(result, Exception):
             raise result
         if not isinstance(result, Act):
-            raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
+            raise PolicyFailed(f"act: expected an Act from the policy, got {type(result).__name__}")
 
         # The size is checked before the action is copied.
         size = getattr(result.action, "nbytes", 0)
@@ -174,4 +174,6 @@ class _BoundedWriter(ValueWriter):
 
 
 def _too_large(field: str, size: int, limit: int) -> str:
-    return f"{field}: got {size} bytes, want {limit} at most (`limits.reply_bytes`); return less"
+    return (
+        f"{field}: expected at most {limit} bytes (`limits.reply_bytes`), got {size}; return less"
+    )

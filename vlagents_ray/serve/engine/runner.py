@@ -279,7 +279,9 @@ class Runner:
             agent = model.copies.make()
             info = agent.reset(request.obs, request.instruction, **opening.kwargs)
             if not isinstance(info, dict):
-                raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
+                raise PolicyFailed(
+                    f"reset: expected a dict from the policy, got {type(info).__name__}"
+                )
             for obs in request.history:
                 agent.observe(obs)
 
@@ -441,7 +443,8 @@ class Runner:
                 results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
             if len(results) != rows:
                 raise PolicyFailed(
-                    f"act_batch: got {rows} observations, returned {len(results)} actions"
+                    f"act_batch: expected {rows} actions, one for each observation, got "
+                    f"{len(results)}"
                 )
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows

@@ -65,7 +65,7 @@ class Sender:
         """
         if not isinstance(caller, Caller | NoKey):
             raise TypeError(
-                f"caller: got {caller!r}, want a Caller, or a NoKey where none is asked for"
+                f"caller: expected a Caller, or a NoKey where no key is needed, got {caller!r}"
             )
 
         self._engine = engine

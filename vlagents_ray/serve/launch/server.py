@@ -145,7 +145,7 @@ def running_server(
     """
     if ":" in host:
         raise ConfigError(
-            f"host {host}: IPv6 is not supported; use an IPv4 address, or 0.0.0.0 for all of this "
+            f"host: expected an IPv4 address, got {host}; use one, or 0.0.0.0 for all of this "
             "machine"
         )
     config = with_gateways_at(config, host)
