@@ -9,8 +9,8 @@ from lerobot.configs.policies import PreTrainedConfig
 from vlagents_ray.errors import ConfigError
 
 TRAINING = (
-    "policy.type=vlagents: got a policy on a server, whose weights are not here; train with the "
-    "type of the checkpoint that the server loads, or push weights into the server "
+    "policy.type=vlagents: expected a policy whose weights are here, got one on a server; train "
+    "with the type of the checkpoint that the server loads, or push weights into the server "
     "(docs/weights.md)"
 )
 
@@ -52,16 +52,18 @@ class VlagentsConfig(PreTrainedConfig):
         super().__post_init__()
         if self.n_obs_steps != 1:
             raise ConfigError(
-                f"policy.n_obs_steps: got {self.n_obs_steps}, want 1: the server keeps the history"
+                "policy.n_obs_steps: expected 1, as the server keeps the history, got "
+                f"{self.n_obs_steps}"
             )
         if self.n_action_steps is not None and self.n_action_steps < 1:
             raise ConfigError(
-                f"policy.n_action_steps: got {self.n_action_steps}, want 1 or more, or null for all"
+                "policy.n_action_steps: expected 1 or more, or null for all, got "
+                f"{self.n_action_steps}"
             )
         if len(self.certificate) not in (0, 2):
             raise ConfigError(
-                f"policy.certificate: got {len(self.certificate)} files, want two, as [cert.pem, "
-                "key.pem]"
+                "policy.certificate: expected two files, as [cert.pem, key.pem], got "
+                f"{len(self.certificate)}"
             )
 
     @property
@@ -75,7 +77,7 @@ class VlagentsConfig(PreTrainedConfig):
             return self.key_file.read_text().strip()
         except OSError as error:
             raise ConfigError(
-                f"policy.key_file: got {str(self.key_file)!r}, want a file with an API key "
+                f"policy.key_file: expected a file with an API key, got {str(self.key_file)!r} "
                 f"({error})"
             ) from error
 

@@ -252,8 +252,8 @@ def _state(obs: Obs, inputs: Mapping[str, tuple[int, ...]]) -> dict[str, torch.T
     seen[OBS_STATE] = values
     if (got := {name: value.shape for name, value in seen.items() if name in inputs}) != inputs:
         raise ConfigError(
-            f"input_features: got {got} from the robot, want {dict(inputs)}; train the policy on "
-            "these"
+            f"input_features: expected {dict(inputs)}, got {got} from the robot; train the policy "
+            "on these"
         )
     found = {
         name: torch.from_numpy(np.ascontiguousarray(seen[name]))[None].float() for name in inputs

@@ -71,9 +71,9 @@ class VlagentsPolicy(PreTrainedPolicy):
         """
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
-                f"policy.path: got {str(pretrained_name_or_path)!r}, want none with "
-                "policy.type=vlagents: the server loads the checkpoint; --policy.checkpoint "
-                "selects one of those that it offers"
+                "policy.path: expected none with policy.type=vlagents, as the server loads the "
+                f"checkpoint, got {str(pretrained_name_or_path)!r}; --policy.checkpoint selects "
+                "one of those that it offers"
             )
         return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
 
@@ -114,8 +114,8 @@ class VlagentsPolicy(PreTrainedPolicy):
         chunks = self._sessions.chunks(batch, _plans(left, inference_delay, _size(batch)))
         if len(lengths := {len(rows) for rows in chunks}) > 1:
             raise InvalidAction(
-                f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set "
-                "a length in the server's deployment file, or use select_action"
+                f"predict_action_chunk: expected chunks of one length, got {sorted(lengths)} "
+                "rows; set a length in the server's deployment file, or use select_action"
             )
         return torch.from_numpy(np.stack(chunks))
 
@@ -125,11 +125,12 @@ class VlagentsPolicy(PreTrainedPolicy):
         """
         if not self._sessions.agent.continues_plans:
             raise ConfigError(
-                "inference.type: got rtc, and the server's policy ignores the plan that is "
-                "executed, so that its chunks would not fit together; use --inference.type=sync, "
-                "serve a policy with real-time chunking and `actions: chunk` (pi0, openpi, or "
-                "smolvla, pi0 and pi05 of lerobot), or, to keep the robot moving while another "
-                "policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, mode='async')"
+                "inference.type: expected sync, as the server's policy ignores the plan that is "
+                "executed, so that its chunks would not fit together, got rtc; use "
+                "--inference.type=sync, serve a policy with real-time chunking and `actions: "
+                "chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep the robot "
+                "moving while another policy computes, drive it by vlagents_ray's own "
+                "ChunkPlayer(agent, mode='async')"
             )
         return True
 
@@ -143,9 +144,9 @@ class VlagentsPolicy(PreTrainedPolicy):
         wanted, usual = self.config.rtc_config, RTCConfig()
         if changed := [name for name in _GUIDANCE if getattr(wanted, name) != getattr(usual, name)]:
             raise ConfigError(
-                f"inference.rtc.{changed[0]}: got {getattr(wanted, changed[0])}, want none here: "
-                "the server guides the chunks; set it in its deployment file (for lerobot: "
-                "overrides: {rtc_config: …})"
+                f"inference.rtc.{changed[0]}: expected none here, as the server guides the "
+                f"chunks, got {getattr(wanted, changed[0])}; set it in its deployment file (for "
+                "lerobot: overrides: {rtc_config: …})"
             )
         self._of_all_threads = self._sessions
 
@@ -183,7 +184,8 @@ class _Robot:
         config = self.config
         if not config.url:
             raise ConfigError(
-                "policy.url: got none, want the server's, as --policy.url=http://gpu-box:8000"
+                "policy.url: expected the server's, got none; set it, as "
+                "--policy.url=http://gpu-box:8000"
             )
         certificate = (config.certificate[0], config.certificate[1]) if config.certificate else None
         agent = RemoteAgent(
@@ -210,8 +212,8 @@ class _Robot:
         rows = agent.contract.chunk if agent.contract else None
         if rows is not None and (self.config.n_action_steps or 0) > rows:
             raise ConfigError(
-                f"policy.n_action_steps: got {self.config.n_action_steps}, want at most {rows}, "
-                "the rows of the server's chunks"
+                f"policy.n_action_steps: expected at most {rows}, the rows of the server's "
+                f"chunks, got {self.config.n_action_steps}"
             )
 
     def mapping(
@@ -328,8 +330,8 @@ class _Sessions:
         want = self._robot.action_dim
         if odd := [chunk.shape[1] for chunk in chunks if want not in (None, chunk.shape[1])]:
             raise ContractMismatch(
-                f"action: got {odd[0]} numbers a row from the server, want {want} here; is this "
-                "another robot's policy?"
+                f"action: expected {want} numbers a row, as this robot has, got {odd[0]} from the "
+                "server; check whether this is another robot's policy"
             )
         if self._fit is not None:
             for chunk in chunks:
@@ -343,8 +345,8 @@ class _Sessions:
         contract = self.agent.contract
         if contract is not None and contract.instruction and not all(tasks):
             raise ConfigError(
-                "task: got none, the policy needs an instruction; set --dataset.single_task, or "
-                "--policy.instruction where the environment has none"
+                "task: expected an instruction, as the policy needs one, got none; set "
+                "--dataset.single_task, or --policy.instruction where the environment has none"
             )
         return [one or None for one in tasks]
 

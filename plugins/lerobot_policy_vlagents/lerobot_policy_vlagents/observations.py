@@ -52,8 +52,8 @@ class ObservationMapping:
         robots = {_short(key): key for key in shapes if key.startswith(_IMAGE)}
         if unknown := [name for name in config.cameras.values() if name not in robots]:
             raise ConfigError(
-                f"policy.cameras: got {unknown[0]!r}, want some of the cameras here, "
-                f"{sorted(robots)}{did_you_mean(unknown[0], robots)}"
+                f"policy.cameras: expected some of the cameras here, {sorted(robots)}, got "
+                f"{unknown[0]!r}{did_you_mean(unknown[0], robots)}"
             )
         known = {name: key for name, key in robots.items() if name not in config.cameras.values()}
         known |= {name: robots[robot] for name, robot in config.cameras.items()}
@@ -154,9 +154,9 @@ def _parts(
             ]
             if sorted(chosen) != sorted(wanted):
                 raise ConfigError(
-                    f"observation.state: got the values {list(names) or 'without names'}, the "
-                    f"policy wants the parts {wanted}; name those in the order in which they are "
-                    f"in it: {_STATE_OPTION}"
+                    f"observation.state: expected the parts {wanted} of the policy, got the "
+                    f"values {list(names) or 'without names'}; name the parts in the order in "
+                    f"which they are in it: {_STATE_OPTION}"
                 )
         found[OBS_STATE] = state_parts(
             widths[OBS_STATE], policy, chosen or None, option=_STATE_OPTION

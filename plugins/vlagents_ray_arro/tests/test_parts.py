@@ -156,7 +156,7 @@ def test_an_image_as_background_is_stretched_to_the_camera(tmp_path) -> None:
     [
         ("detector", "yolo", "expected one of .*grounding_dino.*got 'yolo'"),
         ("detector", {"colour": {"hue": {}}}, "detector 'colour'.*hue"),
-        ("tracker", {"iou": {}, "sam2": {}}, "want one name"),
+        ("tracker", {"iou": {}, "sam2": {}}, "expected one name"),
         ("selector", "nowhere.at.all:Selector", "no module 'nowhere'"),
     ],
 )

@@ -161,7 +161,7 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
     settings_by_name = {entry: {}} if isinstance(entry, str) else dict(entry)
     if len(settings_by_name) != 1:
         raise ConfigError(
-            f"{kind}: got {sorted(settings_by_name)}, want one name with its settings"
+            f"{kind}: expected one name with its settings, got {sorted(settings_by_name)}"
         )
     [(name, settings)] = settings_by_name.items()
     registered = PARTS[kind]

@@ -64,7 +64,7 @@ class BackgroundConfig(BaseModel, extra="forbid"):
         for colour in (self.colour, self.grid or self.colour):
             if not all(0 <= channel <= 255 for channel in colour):
                 raise ValueError(
-                    f"got colour {list(colour)}, want red, green and blue from 0 to 255"
+                    f"expected a colour as red, green and blue from 0 to 255, got {list(colour)}"
                 )
         if self.image is not None and self.model_fields_set & {"colour", "grid", "spacing"}:
             raise ValueError("image excludes colour, grid and spacing; keep one or the other")
@@ -493,7 +493,8 @@ class Arro(Wrapper):
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:
             raise InvalidObservation(
-                "instruction: got none, want one that names the things to show; or set `objects`"
+                "instruction: expected one that names the things to show, got none; give one, or "
+                "set `objects`"
             )
         tracks = self.tracking.begin([obs.cameras[name] for name in names], phrases)
         for name, track in zip(names, tracks, strict=True):
@@ -558,8 +559,8 @@ class Arro(Wrapper):
             image = obs.cameras[name]
             if len(track.masks) and track.masks[0].shape != image.shape[:2]:
                 raise InvalidObservation(
-                    f"camera {name!r}: got {image.shape[:2]}, want {track.masks[0].shape} as at "
-                    "reset; keep its size"
+                    f"camera {name!r}: expected {track.masks[0].shape}, as at reset, got "
+                    f"{image.shape[:2]}; keep its size"
                 )
             views.append((image, track))
         return views

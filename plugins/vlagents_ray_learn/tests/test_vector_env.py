@@ -222,7 +222,7 @@ def test_spaces_are_those_of_the_contract() -> None:
 
 
 def test_a_size_that_the_contract_leaves_open_is_an_error_that_names_it() -> None:
-    with pytest.raises(ConfigError, match="front: height: the env's contract does not state it"):
+    with pytest.raises(ConfigError, match="front: height: expected it in the env's contract"):
         observation_space(Contract(cameras={"front": CameraSpec()}), "all")
     with pytest.raises(ConfigError, match="the env's contract has neither a state nor a gripper"):
         observation_space(Contract(), "state")

@@ -186,7 +186,7 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
     app.start(Gain(), Gain())
     assert app.push(5, PushOptions(version=500)).version == 500
     with pytest.raises(
-        InvalidInput, match="version: got 500, want one above 500, the newest that acts"
+        InvalidInput, match="version: expected one above 500, the newest that acts, got 500"
     ):
         app.push(6, PushOptions(version=500))
     assert app.push(6).version == 501
@@ -197,7 +197,7 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
     ):
         PushOptions(version=2**53)
     # Or no later number is above it.
-    with pytest.raises(InvalidInput, match="want at most 1000000000 above 501"):
+    with pytest.raises(InvalidInput, match="expected at most 1000000000 above 501"):
         app.push(7, PushOptions(version=2**53 - 1))
     assert app.push(7, PushOptions(version=502)).version == 502
 

@@ -330,7 +330,7 @@ def test_a_push_that_sends_too_little_does_not_hold_up_others(
         assert answer(socket, header_of(values)) == {"received": 0}
         parts = parts_of(values)
         found = [answer(socket, next(parts)) for _ in range(2)]
-        assert "want at least" in str(read_error(found[-1]))
+        assert "expected at least" in str(read_error(found[-1]))
     wait_for(lambda: _is_free(server))
 
 

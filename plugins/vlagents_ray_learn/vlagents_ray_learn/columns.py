@@ -125,7 +125,8 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
     ratios = ratios[~np.isnan(ratios)]
     if not ratios.size:
         raise InvalidInput(
-            'log_ratio: got no act with log-probabilities; request them with want=["logprob"]'
+            "log_ratio: expected acts with log-probabilities, got none; request them with "
+            'want=["logprob"]'
         )
     return LogRatio(float(ratios.mean()), float(ratios.std()), ratios.size)
 

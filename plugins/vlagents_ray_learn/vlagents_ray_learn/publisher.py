@@ -88,7 +88,8 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._target = ServerTarget(target, Credentials(api_key, ca, certificate))
         else:
             raise ConfigError(
-                f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine"
+                "Publisher: expected 'serve://APP', 'http(s)://HOST:PORT' or an Engine, got "
+                f"{target!r}"
             )
 
     def push(
@@ -132,7 +133,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         """
         if not isinstance(values, Mapping):
             raise InvalidWeights(
-                f"weights: got {type(values).__name__}, want values by name, such as a state_dict"
+                "weights: expected values by name, such as a state_dict, got "
+                f"{type(values).__name__}"
             )
         return self._target.push(values, PushOptions(mode, partial, allow_same, pin, version))
 

@@ -100,7 +100,7 @@ class TransitionRecorder(EpisodeRecorder):
         missing = [name for name in self._want if name not in behaviour]
         if missing:
             raise ConfigError(
-                f"want: got no {' and no '.join(missing)} in act.info[{BEHAVIOUR!r}], which has "
+                f"want: expected {' and '.join(missing)} in act.info[{BEHAVIOUR!r}], got "
                 f"{sorted(behaviour)}; take a policy that returns it, or leave it out of `want`"
             )
 

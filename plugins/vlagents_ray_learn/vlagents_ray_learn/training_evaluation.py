@@ -139,9 +139,9 @@ class TrainingEvaluation:
             newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
         if newest.get("version") != version:
             raise WeightsLost(
-                f"version: got {version}, but the newest that {url} acts with is "
-                f"{newest.get('version')}; use what the last push returned, once `acknowledged` "
-                "counts all replicas"
+                f"version: expected {newest.get('version')}, the newest that {url} acts with, got "
+                f"{version}; use what the last push returned, once `acknowledged` counts all "
+                "replicas"
             )
         plan = self._plan_for(PushedWeights(**newest), url=url)
         return evaluate(plan, progress=self._progress)

@@ -95,7 +95,8 @@ def _size(size: int | None, field: str) -> int:
     """Return a size of the contract; raises `ConfigError` if the contract does not define it."""
     if size is None:
         raise ConfigError(
-            f"{field}: the env's contract does not state it, but Gymnasium needs it; state it there"
+            f"{field}: expected it in the env's contract, as Gymnasium needs it, got none; add it "
+            "there"
         )
     return size
 
@@ -392,8 +393,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             )
         if not mask.all() and not self._obs:
             raise NotReset(
-                f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all "
-                "first"
+                f"reset: expected a reset of all before the first {_RESET_MASK}, got none; call "
+                "reset(seed=...)"
             )
 
         numbers = range(self._begun, self._begun + len(indices))

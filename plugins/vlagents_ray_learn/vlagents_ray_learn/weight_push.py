@@ -325,12 +325,14 @@ def _number_of_push(newest: Iterable[NewestVersion], options: PushOptions) -> in
     last = max(version.number for version in versions)
     number = last + 1 if options.version is None else options.version
     if number <= last:
-        raise InvalidInput(f"version: got {number}, want one above {last}, the newest that acts")
+        raise InvalidInput(
+            f"version: expected one above {last}, the newest that acts, got {number}"
+        )
     if number > last + _MOST_AHEAD:
         raise InvalidInput(
-            f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest "
-            "that acts: versions never go back, so that a number beyond would end all "
-            "numbered pushes"
+            f"version: expected at most {_MOST_AHEAD} above {last}, the newest that acts, got "
+            f"{number}; versions never go back, so that a number beyond would end all numbered "
+            "pushes"
         )
     return number
 

@@ -167,8 +167,8 @@ class _WeightsEndpoint:
                 elapsed_s = time.monotonic() - begun
                 if elapsed_s > self._slow_s + reader.received / LEAST_RATE:
                     raise MalformedMessage(
-                        f"weights: got {reader.received} bytes in {elapsed_s:.0f} s, want at least "
-                        f"{LEAST_RATE} a second; another push may wait"
+                        f"weights: expected at least {LEAST_RATE} bytes a second, as another push "
+                        f"may wait, got {reader.received} in {elapsed_s:.0f} s"
                     )
 
             # All values have arrived: the push no longer depends on the learner's connection.
@@ -201,14 +201,14 @@ class _WeightsEndpoint:
         self._scopes.require(_SCOPE)
         data: bytes | None = message.get("bytes")
         if data is None:
-            raise MalformedMessage("weights: got a text message, want a binary one")
+            raise MalformedMessage("weights: expected a binary message, got text")
         if len(data) > MESSAGE_BYTES:
             raise MessageTooLarge(
-                f"weights: got a part of {len(data)} bytes, the limit is {MESSAGE_BYTES}"
+                f"weights: expected a part of at most {MESSAGE_BYTES} bytes, got {len(data)}"
             )
         if not data:
             raise MalformedMessage(
-                "weights: got an empty message, want a header or a part of the values"
+                "weights: expected a header or a part of the values, got an empty message"
             )
         return data
 
@@ -232,8 +232,8 @@ def _read_rest(step: Any, query: Mapping[str, str]) -> Rest:
         return Rest(step, **options)
     except (KeyError, ValueError) as error:
         raise InvalidInput(
-            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, "
-            "offload=true or false, and at_most_s=SECONDS"
+            "rest: expected sleep, restore or wake, offload=true or false, and at_most_s=SECONDS, "
+            f"got {step[:20]!r}, {shown(dict(query), 99)}"
         ) from error
 
 
@@ -248,8 +248,8 @@ def _read_options(query: Mapping[str, str]) -> PushOptions:
     for name, value in query.items():
         if name not in option_names:
             raise InvalidInput(
-                f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or "
-                "version"
+                "weights: expected the options mode, partial, allow_same, pin or version, got "
+                f"{name[:40]!r}"
             )
         if name == "mode":
             options[name] = value
@@ -258,6 +258,6 @@ def _read_options(query: Mapping[str, str]) -> PushOptions:
         elif name != "version" and value in _BOOLEANS:
             options[name] = _BOOLEANS[value]
         else:
-            want = "a number" if name == "version" else "true or false"
-            raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want {want}")
+            expected = "a number" if name == "version" else "true or false"
+            raise InvalidInput(f"weights: {name}: expected {expected}, got {value[:40]!r}")
     return PushOptions(**options)

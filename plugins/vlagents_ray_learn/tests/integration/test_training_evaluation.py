@@ -66,6 +66,6 @@ def test_each_version_is_evaluated_as_it_was_pushed(
     assert summary.results.policy_ids == [f"policy@{version}" for version in versions]
     assert len(played(summary)) == 12
     with pytest.raises(
-        ConfigError, match=rf"got 99, but the newest that {url} acts with is {versions[-1]}"
+        ConfigError, match=rf"expected {versions[-1]}, the newest that {url} acts with, got 99"
     ):
         served.play(99)

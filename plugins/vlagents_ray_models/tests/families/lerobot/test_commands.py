@@ -255,15 +255,18 @@ def test_images_are_sent_as_the_bytes_that_the_camera_gave_and_states_by_their_n
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"url": ""}, "policy.url: got none"),
-        ({"state": []}, "the policy wants the parts ['joints', 'gripper']"),
+        ({"url": ""}, "policy.url: expected the server's, got none"),
+        ({"state": []}, "expected the parts ['joints', 'gripper'] of the policy"),
         ({"state": ["joints"]}, "expected ['joints'] of the policy"),
         ({"cameras": {"top": "tpo"}}, "did you mean 'top'"),
-        ({"n_action_steps": 3}, "want at most 2"),
-        ({"n_action_steps": 0}, "want 1 or more"),
+        ({"n_action_steps": 3}, "expected at most 2"),
+        ({"n_action_steps": 0}, "expected 1 or more"),
         ({"n_obs_steps": 2}, "the server keeps the history"),
-        ({"certificate": [Path("a.pem")]}, "want two"),
-        ({"key_file": Path("nowhere")}, "policy.key_file: got 'nowhere'"),
+        ({"certificate": [Path("a.pem")]}, "expected two files"),
+        (
+            {"key_file": Path("nowhere")},
+            "policy.key_file: expected a file with an API key, got 'nowhere'",
+        ),
         ({"pretrained_path": Path("somewhere")}, "the server loads the checkpoint"),
     ],
 )
@@ -288,7 +291,7 @@ def test_other_actions_a_missing_task_and_training_are_refused(
     with pytest.raises(ConfigError, match=r"--policy\.instruction"):
         made.select_action(batch(1) | {"task": [""]})
     for train in (made.get_optim_params, made.config.get_optimizer_preset):
-        with pytest.raises(ConfigError, match="whose weights are not here"):
+        with pytest.raises(ConfigError, match="expected a policy whose weights are here"):
             train()
 
 

@@ -261,7 +261,9 @@ def test_a_label_is_the_reward_and_ends_the_episode() -> None:
     assert found[0]["next_state"]["observation.state"].tolist() == [[1, 1, 0.5]]
     assert found[0]["state"]["observation.images.top"].shape == (1, 3, 4, 6)
     assert float(found[0]["state"]["observation.images.top"].max()) == pytest.approx(0.2)
-    with pytest.raises(ConfigError, match=r"got \{.*state': \(3,\)\} from the robot, want .*wrist"):
+    with pytest.raises(
+        ConfigError, match=r"expected .*wrist.*got \{.*state': \(3,\)\} from the robot"
+    ):
         transitions(frames, None, inputs | {"observation.images.wrist": (3, 4, 6)})
 
 
