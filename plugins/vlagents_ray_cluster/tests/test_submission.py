@@ -77,7 +77,7 @@ def test_an_option_that_only_a_newer_sbatch_knows_is_passed_on() -> None:
         (["-n4"], "--nodes"),
         (["--gpus-per-task=1"], "--gpus-per-node"),
         (["--wrap=ls"], "written for you"),
-        (["-Z"], "neither this command.s"),
+        (["-Z"], "expected an option of this command"),
         (["--=3"], "expected --NAME=VALUE"),
     ],
 )

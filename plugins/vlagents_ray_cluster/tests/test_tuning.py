@@ -63,7 +63,7 @@ def test_a_file_brings_them_to_another_process(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_read_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no trajectory"):
+    with pytest.raises(ConfigError, match="expected a folder of trajectories"):
         recorded_observations(tmp_path, 3)
     record(tmp_path / "ep0.npz", 0.0, frames=4)
     with pytest.raises(ConfigError, match=r"ep0_front\.mp4.*5"):

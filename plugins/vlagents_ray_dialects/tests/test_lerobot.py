@@ -147,7 +147,7 @@ def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot) -> None:
         ),
         ({"lerobot_features": {"observation.state": None}}, "expected a dict, got NoneType"),
         ({"lerobot_features": []}, "expected dicts, got list, dict"),
-        ({"lerobot_features": many_images}, "17 cameras"),
+        ({"lerobot_features": many_images}, "expected at most 16 cameras"),
         ({"policy_type": 3}, "policy_type: expected text, got 3"),
         ({"policy_type": len}, "names 'builtins' 'len'"),
     ]
@@ -165,8 +165,8 @@ def test_a_bad_observation_is_refused_and_the_next_is_acted_on(open_lerobot) -> 
         (robot_saw(99, front=np.zeros((8, 8, 3), np.float64) + 7), "float64 from 7 to 7"),
         (robot_saw(99, front=np.zeros((8, 8), np.uint8)), "camera 'observation.images.front'"),
         (robot_saw(99, **{"gripper.pos": "open"}), "'gripper.pos': expected a number, got str"),
-        (robot_saw(-1), "timestep: expected .*got -1"),
-        (robot_saw(2**31), "timestep: expected .*got 2147483648"),
+        (robot_saw(-1), "timestep: expected an integer in [0, 2**31), got -1"),
+        (robot_saw(2**31), "timestep: expected an integer in [0, 2**31), got 2147483648"),
         (setup(), "expected a TimedObservation with its fields, got RemotePolicyConfig"),
         (b"no pickle", "protocol 4 or 5"),
     ]

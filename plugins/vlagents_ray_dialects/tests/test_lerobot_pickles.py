@@ -309,12 +309,12 @@ class Text(str):
         (2**80, "expected an integer of at most .*, got 11"),
         (2j, "names 'builtins' 'complex'"),
         ({1, 2}, "opcode 0x8f"),
-        (None, "expected a number, got NoneType"),
-        ([1], "expected a number, got list"),
-        ((1, 2), "expected a number, got tuple"),
-        (b"bytes", "expected a number, got memoryview"),
+        (None, "expected a number, text or numpy array, got NoneType"),
+        ([1], "expected a number, text or numpy array, got list"),
+        ((1, 2), "expected a number, text or numpy array, got tuple"),
+        (b"bytes", "expected a number, text or numpy array, got memoryview"),
         ({1: 2}, "texts as keys"),
-        (TimedObservation(0.0, 0, {}), "expected a number, got Record"),
+        (TimedObservation(0.0, 0, {}), "expected a number, text or numpy array, got Record"),
     ],
 )
 def test_what_is_no_number_text_or_array_of_numbers_is_refused(value: Any, says: str) -> None:

@@ -260,7 +260,7 @@ def test_a_policy_that_does_not_return_what_is_wanted_is_a_mistake_in_the_settin
     failure = played(Stating(stated={"value": 1.0}), want=["logprob", "value"]).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", "config")
-    assert "got no logprob" in failure.message
+    assert "expected logprob in act.info" in failure.message
 
 
 def test_an_act_without_a_version_is_of_the_weights_that_the_deployment_loaded() -> None:

@@ -247,7 +247,7 @@ def test_wrong_actions_and_a_step_before_the_reset_are_errors() -> None:
     venv = of(Line, 2)
     with pytest.raises(NotReset, match="reset"):
         venv.step(np.zeros((2, 1)))
-    with pytest.raises(NotReset, match="before the first reset"):
+    with pytest.raises(NotReset, match="expected a reset of all"):
         venv.reset(options={"reset_mask": np.array([True, False])})
     venv.reset(seed=0)
     with pytest.raises(InvalidAction, match=r"expected shape \(2, 1\), .* got \(1, 1\)"):

@@ -319,7 +319,7 @@ def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [(b"", "cannot be read as a bundle"), (b"PK\5\6" + 18 * b"\0", "has no bundle.json")],
+    [(b"", "cannot be read as a bundle"), (b"PK\5\6" + 18 * b"\0", "got one without bundle.json")],
 )
 def test_what_is_no_bundle_is_said_to_be_none(tmp_path: Path, text: bytes, why: str) -> None:
     (tmp_path / "b.zip").write_bytes(text)

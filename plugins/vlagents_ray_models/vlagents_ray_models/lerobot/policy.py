@@ -309,8 +309,8 @@ def _with_defaults(config: LeRobotConfig, sampler: samplers.Sampler) -> LeRobotC
 
     if (config.execute or 0) > sampler.horizon:
         raise ConfigError(
-            f"execute: expected at most {sampler.horizon}, as the checkpoint's chunks have that "
-            f"many rows from the observation on, got {config.execute}"
+            f"execute: expected at most the {sampler.horizon} rows of the checkpoint's chunks "
+            f"from the observation on, got {config.execute}"
         )
     unset = {name: default for name, default in defaults.items() if not _is_set(config, name)}
     return config.model_copy(update=unset)

@@ -204,7 +204,7 @@ def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
         ({"overrides": {"chunk_size": "many"}}, "many"),
         ({"processors": {"tokenizer_processor": {}}}, "normalizer_processor"),
         ({"processors": {"normalizer_processor": {"nonsense": 1}}}, "processors do not load"),
-        ({"dtype": "bfloat16"}, "'act' takes"),
+        ({"dtype": "bfloat16"}, "for LeRobot's 'act', got 'bfloat16'"),
         ({"device": "cuda:77"}, "cuda:77"),
         ({"temperature": 1}, "temperature"),
     ],

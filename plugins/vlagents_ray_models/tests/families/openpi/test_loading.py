@@ -50,7 +50,7 @@ def test_statistics_without_those_of_actions_are_an_error(whole: Path) -> None:
     stats = json.loads(file.read_text())
     del stats["norm_stats"]["actions"]
     file.write_text(json.dumps(stats))
-    with pytest.raises(ConfigError, match=r"has no \['actions'\]"):
+    with pytest.raises(ConfigError, match=r"expected \['actions'\] in"):
         load(whole)
 
 

@@ -161,7 +161,7 @@ def test_a_missing_file_is_named(whole: Path, file: str) -> None:
 @pytest.mark.verifies("loading")
 def test_missing_statistics_are_an_error(tmp_path: Path) -> None:
     tiny.save(tmp_path, statistics=False)
-    with pytest.raises(ConfigError, match=r"has no \['state_mean', .*'actions_std'\]"):
+    with pytest.raises(ConfigError, match=r"expected \['state_mean', .*'actions_std'\], got none"):
         made(tmp_path)
 
 
