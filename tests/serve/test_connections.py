@@ -36,16 +36,17 @@ from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
-from vlagents_ray.protocol.frames import decode_replies, encode_requests
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
-from vlagents_ray.serve.endpoints import answers, websocket
+from vlagents_ray.serve.endpoints import answers, http_connection, http_messages, websocket
 from vlagents_ray.serve.endpoints import shm as local
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.http_connection import HttpConnection
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -530,6 +531,26 @@ FAULTS = [
     (local.UnixConnection, "_authenticate"),
     (local.UnixConnection, "overdue"),
 ]
+# The same of an HTTP connection at the own port.
+HTTP_FAULTS = [
+    (Intake, "admit"),
+    (Sender, "admission"),
+    (Sender, "send"),
+    (Caller, "throttled_s"),
+    (MessageAdmission, "decode_on_thread"),
+    (websocket.WebSocketServer, "admit_request"),
+    (websocket.WebSocketServer, "serve_http"),
+    (http_connection, "read_head"),
+    (http_messages, "response_to"),
+    (http_messages, "body_of"),
+    (HttpConnection, "begin"),
+    (HttpConnection, "_receive_body"),
+    (HttpConnection, "_count_incomplete"),
+    (HttpConnection, "_complete"),
+    (HttpConnection, "_submit"),
+    (HttpConnection, "_send_answer"),
+    (HttpConnection, "overdue"),
+]
 
 
 @pytest.fixture
@@ -555,13 +576,32 @@ def frame_of(data: bytes) -> bytes:
     return frame_head(len(data), bytes(4)) + data
 
 
+def post(path: str, body: bytes, length: int | None = None) -> bytes:
+    """A request with the key "arm", whose body may be incomplete."""
+    lines = [
+        f"POST {path} HTTP/1.1",
+        "host: 127.0.0.1",
+        "authorization: Bearer vlr_arm",
+        "x-session-id: robot-1",
+        f"content-type: {CONTENT_TYPE}",
+        f"content-length: {len(body) if length is None else length}",
+    ]
+    return "\r\n".join([*lines, "", ""]).encode() + body
+
+
 @pytest.mark.parametrize(
-    ("owner", "name"), FAULTS, ids=lambda value: getattr(value, "__name__", value)
+    ("owner", "name", "over_http"),
+    [
+        *((owner, name, False) for owner, name in FAULTS),
+        *((owner, name, True) for owner, name in HTTP_FAULTS),
+    ],
+    ids=lambda value: getattr(value, "__name__", str(value)),
 )
 def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     keyed: Replica,
     owner: type | ModuleType,
     name: str,
+    over_http: bool,
     monkeypatch: pytest.MonkeyPatch,
     no_records: None,
 ) -> None:
@@ -578,6 +618,12 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     over_the_rate = [frame_of(encode_requests([Request("act", Obs())]))] * 6
     part = frame_head(2**22, bytes(4)) + bytes(100_000)
     messages = b"".join([RESET, frame_of(decoded_on_a_thread), *over_the_rate, part])
+    data = handshake(keyed.own.path, "Authorization: Bearer vlr_arm") + messages
+    if over_http:
+        reset, act = f"{keyed.own.path}/reset", f"{keyed.own.path}/act"
+        requests = [post(reset, decoded_on_a_thread)]
+        requests += [post(act, encode_requests([Request("act", Obs())]))] * 6
+        data = b"".join([*requests, post(act, bytes(100_000), 2**22)])
     sockets = open_sockets()
     raised = threading.Event()
 
@@ -592,9 +638,7 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
                 socket.create_connection(("127.0.0.1", port)) as client,
                 contextlib.suppress(OSError),
             ):
-                client.sendall(
-                    handshake(keyed.own.path, "Authorization: Bearer vlr_arm") + messages
-                )
+                client.sendall(data)
                 client.settimeout(0.3)
                 while client.recv(65536):
                     pass

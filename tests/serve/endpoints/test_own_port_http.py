@@ -192,10 +192,17 @@ def test_a_body_may_have_chunks(served_replica: Replica, chunks: list[bytes]) ->
             assert status == 200, body
 
 
-def test_many_small_chunks_end_their_connection(served_replica: Replica) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [b"1\r\nx\r\n" * 5000, b"1;a=" + b"b" * 20_000, b"0\r\n" + b"a: b\r\n" * 5000],
+    ids=["small chunks", "an extension", "trailers"],
+)
+def test_much_around_the_chunks_ends_their_connection(
+    served_replica: Replica, content: bytes
+) -> None:
     head = served_replica.request("reset", b"", "transfer-encoding: chunked", length=False)
     with served_replica.connect() as client:
-        status, headers, body = client.ask(head + b"1\r\nx\r\n" * 2000)
+        status, headers, body = client.ask(head + content)
         assert (status, code_of(body), headers["connection"]) == (400, "malformed", "close")
         assert client.is_ended()
 

@@ -35,6 +35,7 @@ from vlagents_ray.errors import (
     Unauthorized,
     UnknownApp,
     VLAgentsError,
+    shown,
 )
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import PRIORITY_HEADER, REQUEST_ID_HEADER, Budget, Op
@@ -60,10 +61,12 @@ HEAD_BYTES = 16 * 1024  # maximum size of a request's head
 END_OF_HEAD = b"\r\n\r\n"
 # Larger forms are read on another thread, since finding the end of each part takes time.
 _INLINE_FORM_BYTES = 2**20
-# Maximum number of bytes of a body with chunks that are read at once, as each chunk costs as much
-# as a kilobyte; and a number of chunks above which a body has to have larger ones.
+# Maximum number of bytes of a body with chunks that are read at once, since a chunk of one byte
+# costs as much as one of a kilobyte.
 _CHUNKED_BYTES = 16 * 1024
-_CHUNK_BYTES, _CHUNKS = 1024, 256
+# Maximum number of bytes around the chunks: the heads of chunks, their extensions, and trailers.
+# This is a constant and a part of the size of the body.
+_FRAMING_BYTES, _FRAMING_SHARE = 16 * 1024, 1 / 64
 _MOST_REFUSED_S = 1.0  # maximum time for which the refusal of a first request is delayed
 _REFUSED = "its request is refused"  # a further reason for not polling a connection
 _CONTINUE = b"HTTP/1.1 100 Continue\r\n\r\n"
@@ -115,7 +118,7 @@ class _Reading:
     def __init__(self) -> None:
         self.head = HttpHead()
         self.body = bytearray()  # received part of a chunked body
-        self.chunks = 0  # number of its chunks
+        self.fed = 0  # number of bytes that were received for it
         self.has_head = False  # whether the head is complete
         self.is_complete = False
         self.has_next = False  # whether bytes of another request followed
@@ -133,15 +136,12 @@ class _Reading:
         self.has_head = True
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        if not self.is_complete:
+        if not self.has_head:  # neither a trailer nor of the next request
             self.head.fields.append((name.lower(), value))
 
     def on_body(self, data: bytes) -> None:
         if not self.is_complete:
             self.body += data
-
-    def on_chunk_header(self) -> None:
-        self.chunks += 1
 
     def on_message_complete(self) -> None:
         self.is_complete = True
@@ -160,9 +160,8 @@ def read_head(data: bytes) -> _Reading:
     except httptools.HttpParserUpgrade:  # the offer of another protocol may be ignored
         pass
     except httptools.HttpParserError as error:
-        raise MalformedMessage(f"expected a request of HTTP/1.1, got {data[:40]!r}: {error}") from (
-            error
-        )
+        got = f"{data[:40]!r} ({error})"
+        raise MalformedMessage(f"expected a request of HTTP/1.1, got {got}") from error
 
     if not reading.has_head:
         raise MalformedMessage("expected a request of HTTP/1.1, got empty lines")
@@ -171,9 +170,8 @@ def read_head(data: bytes) -> _Reading:
         try:
             name.decode(), value.decode()
         except UnicodeDecodeError as error:
-            raise MalformedMessage(f"header {name!r}: expected UTF-8, got {value[:40]!r}") from (
-                error
-            )
+            got = shown(value)
+            raise MalformedMessage(f"header {shown(name)}: expected UTF-8, got {got}") from error
     head.method = parser.get_method().decode()
     head.version = parser.get_http_version()
     head.is_kept = parser.should_keep_alive()
@@ -279,7 +277,8 @@ class HttpConnection(MessageConnection):
         self._size = 0  # number of bytes in them
         self._is_dropped = False  # whether the body is discarded, as the request is refused
         self._answering: HttpHead | None = None  # request whose answer is awaited
-        self._request_id = ""  # of that request
+        self._request_id = ""  # of that request, in the headers of its answer
+        self._name = ""  # id of that request in the document of an error
         self._sender: Sender | None = None  # of that request
 
     # Reading.
@@ -340,7 +339,7 @@ class HttpConnection(MessageConnection):
     def _receive_head(self, data: bytes) -> None:
         """Process bytes of a head."""
         if not self._head:
-            self._request_id = ""
+            self._request_id = self._name = ""
         self._head += data
         is_too_long = len(self._head) > HEAD_BYTES
         if is_too_long or self._head.endswith(END_OF_HEAD):
@@ -368,7 +367,7 @@ class HttpConnection(MessageConnection):
             self._answer_and_end(http_messages.problem_response(error, "", status))
             return
 
-        self._request_id = http_messages.request_id(reading.head.http)
+        self._request_id = self._name = http_messages.request_id(reading.head.http)
         try:
             self._admit(reading.head)
         except VLAgentsError as error:
@@ -483,6 +482,7 @@ class HttpConnection(MessageConnection):
     def _receive_chunks(self, reading: _Reading, data: bytes | memoryview) -> None:
         if reading.parser is None:
             return
+        reading.fed += len(data)
         try:
             reading.parser.feed_data(data)
         except httptools.HttpParserUpgrade:
@@ -497,18 +497,18 @@ class HttpConnection(MessageConnection):
         limit = self._limits.body_bytes
         if self._size > limit:
             self._end_request(MessageTooLarge(f"body: over {limit} bytes, the limit"))
-        elif reading.chunks > _CHUNKS + self._size // _CHUNK_BYTES:
-            self._end_request(
-                MalformedMessage(
-                    f"body: expected chunks of {_CHUNK_BYTES} bytes and more, got "
-                    f"{reading.chunks} chunks with {self._size} bytes; send a content-length"
-                )
-            )
         elif reading.is_complete:
             # The next request has been read partly; its client sends it again.
             reading.head.is_kept = reading.head.is_kept and not reading.has_next
             self._parts = [bytes(reading.body)]
             self._complete()
+        elif reading.fed - self._size > _FRAMING_BYTES + _FRAMING_SHARE * self._size:
+            self._end_request(
+                MalformedMessage(
+                    f"body: expected longer chunks, got {self._size} bytes in chunks that take "
+                    f"{reading.fed}; send a content-length"
+                )
+            )
 
     def _end_request(self, error: VLAgentsError) -> None:
         """Answer a request whose body cannot be read, and end the connection."""
@@ -587,7 +587,7 @@ class HttpConnection(MessageConnection):
         """Send the requests to the engine; their deadlines count from the arrival of the body."""
         incoming.decoded(decoded)
         if decoded.requests:
-            self._request_id = decoded.requests[0].request_id
+            self._name = decoded.requests[0].request_id
         waited_s = time.perf_counter() - arrived
         sender.send(
             incoming,
@@ -604,9 +604,8 @@ class HttpConnection(MessageConnection):
 
     def _fail(self, incoming: IncomingMessage, error: Exception) -> None:
         """Answer a request that cannot be decoded."""
-        request_id = self._request_id
-        problem = http_messages.public_problem(error, incoming.kinds[0][0], request_id)
-        incoming.refuse(problem, request_id)
+        problem = http_messages.public_problem(error, incoming.kinds[0][0], self._name)
+        incoming.refuse(problem, self._name)
         self.deliver(incoming)
 
     def _send_answer(self, message: IncomingMessage) -> None:
@@ -616,7 +615,7 @@ class HttpConnection(MessageConnection):
         try:
             response = http_messages.response_to(message, head.headers)
         except VLAgentsError as error:
-            response = http_messages.problem_response(error, self._request_id)
+            response = http_messages.problem_response(error, self._name)
         self._answering = None
         # A replica that stops serves no further request over this connection.
         is_kept = head.is_kept and not any(reply.draining for reply in message.replies)
@@ -646,14 +645,14 @@ class HttpConnection(MessageConnection):
     # The end.
 
     def _end_sessions(self) -> None:
-        """Withdraw the request that no batch has taken; sessions of HTTP outlive a connection."""
+        """Withdraw the request that no batch has taken, and drop one that is incomplete; sessions
+        of HTTP outlive a connection.
+        """
+        self._parts, self._reading = [], None
+        self._release_arriving()
         sender, self._sender = self._sender, None
         if sender is not None:
             sender.release()
-
-    def _discard(self) -> None:
-        self._parts, self._reading = [], None
-        super()._discard()
 
     def _send_close(self, code: int, reason: str) -> None:
         """Answer the request that is incomplete or unanswered, and end the connection."""
