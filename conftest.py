@@ -22,7 +22,14 @@ from needs import (
     pytest_runtest_makereport,
     skip_what_is_missing,
 )
-from process_resources import own_ray_folder, pytest_pyfunc_call, turn
+from process_resources import (
+    own_ray_folder,
+    pytest_pyfunc_call,
+    pytest_runtest_teardown,
+    pytest_runtestloop,
+    share_cores,
+    turn,
+)
 from programs import RunPrograms
 from schedule import pytest_terminal_summary, pytest_xdist_make_scheduler, seconds, unit
 from verified import VerifyingTests
@@ -33,6 +40,8 @@ __all__ = [
     "pytest_make_collect_report",
     "pytest_pyfunc_call",
     "pytest_runtest_makereport",
+    "pytest_runtest_teardown",
+    "pytest_runtestloop",
     "pytest_terminal_summary",
     "pytest_xdist_make_scheduler",
 ]
@@ -78,6 +87,8 @@ def pytest_configure(config: pytest.Config) -> None:
         "numprocesses", None
     ):
         signal.signal(signal.SIGHUP, _ignore_hangup)
+    if config.getoption("numprocesses", None):
+        share_cores()
     if config.getoption("--verified"):
         config.pluginmanager.register(VerifyingTests())
         config.pluginmanager.register(RunPrograms())
@@ -89,6 +100,11 @@ def _ignore_hangup(*_: object) -> None: ...
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out the file if `-m` leaves out all of it."""
     return left_out(collection_path, config.option.markexpr) or None
+
+
+def pytest_collectstart() -> None:
+    """Collect no garbage until all tests are collected: what that makes lives to the end."""
+    gc.disable()
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -129,6 +145,7 @@ def pytest_collection_finish() -> None:
     collection of a test.
     """
     gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -198,3 +198,48 @@ def test_only_what_passes_the_second_time_on_ci_is_flaky(
         assert (f"flaky: test_some.py::{one}" in output) == (ci == "true")
     assert "flaky: test_some.py::test_broken" not in output
     assert (tmp_path / "times").read_text() == "once "
+
+
+OWN_PROCESSES = """
+import os
+import pytest
+
+pytestmark = pytest.mark.own_process
+held = []
+
+def test_first():
+    held.append(1)
+
+def test_fresh():
+    assert held == []
+
+def test_wrong():
+    print('its output')
+    assert held == [1]
+
+def test_that_ends_its_process():
+    os._exit(3)
+
+def test_last():
+    pass
+"""
+
+
+def test_each_test_in_an_own_process_has_a_fresh_one_and_tells_how_it_ended(tmp_path: Path) -> None:
+    (tmp_path / "test_some.py").write_text(OWN_PROCESSES)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = own_process: has its own\n")
+    hooks = "pytest_pyfunc_call, pytest_runtest_teardown, pytest_runtestloop"
+    (tmp_path / "conftest.py").write_text(f"from process_resources import {hooks}\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-rf"],
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
+        capture_output=True,
+        text=True,
+    )
+    failed = re.findall(r"^FAILED test_some.py::(\w+)", done.stdout, re.MULTILINE)
+    assert failed == ["test_wrong", "test_that_ends_its_process"], done.stdout
+    assert "3 passed" in done.stdout
+    assert "its output" in done.stdout
+    assert "its process ended with 3" in done.stdout

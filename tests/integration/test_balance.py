@@ -9,13 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from eval_fakes import wait_for
+from shared_ray import shared_server
 
 from tests.integration.conftest import deploy
 from tests.integration.test_sessions import obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 # Of equal connections the oldest go first.
 HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}
@@ -29,9 +30,8 @@ def deployed(replicas: int) -> Deployment:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    """On an address that is not the loopback's usual one."""
-    with running_server(deployed(1), host="127.0.0.2", num_cpus=4, timeout_s=120) as server:
+def server(shared_ray: None) -> Iterator[Server]:
+    with shared_server(deployed(1)) as server:
         yield server
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import end, wait_for_end
+from ray_processes import end, processes, ray_folder, wait_for_end
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
@@ -98,37 +98,42 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     assert set(before) <= set(after)
 
 
+BOTH = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--record", "all"]
+
+
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An evaluation that was begun without workers, and resumed with them."""
+    out = tmp_path_factory.mktemp("resumed") / "out"
+    with ray_folder() as ray_home:
+        for episodes, workers in (("2", "0"), ("4", "2")):
+            resume = ["--resume"] * out.exists()
+            words = ["--episodes", episodes, "--workers", workers, *resume, "--out", str(out)]
+            done = evaluate(ray_home, *BOTH, *words)
+            assert done.returncode == 0, done.stdout + done.stderr
+        assert not processes(ray_home), "left running"
+    return out
+
+
 def test_results_without_workers_are_those_with_them_which_resume_them(
-    ray_home: Path, tmp_path: Path
+    ray_home: Path, resumed: Path, tmp_path: Path
 ) -> None:
     """The test above resumes without workers what was begun with them."""
-    words = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--out"]
-    orders = {"whole": ["0"], "resumed": ["0", "2"]}
-    for name, order in orders.items():
-        for number, workers in enumerate(order):
-            episodes = "4" if number == len(order) - 1 else "2"
-            resume = ["--resume"] * bool(number)
-            done = evaluate(
-                ray_home,
-                *words,
-                str(tmp_path / name),
-                "--episodes",
-                episodes,
-                "--workers",
-                workers,
-                *resume,
-            )
-            assert done.returncode == 0, done.stdout + done.stderr
-    found = {}
-    for name in orders:
-        results = Results.load(tmp_path / name)
-        found[name] = [one.result.outcome for case in results.cases for one in case.episodes]
-        assert len(found[name]) == 8
-    assert found["whole"] == found["resumed"]
-    policies = [Results.load(tmp_path / name).policies["scripted"] for name in orders]
+    words = ["--episodes", "4", "--workers", "0", "--out", str(tmp_path / "whole")]
+    done = evaluate(ray_home, *BOTH, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    both = [Results.load(folder) for folder in (tmp_path / "whole", resumed)]
+    whole, in_two_runs = (
+        [one.result.outcome for case in results.cases for one in case.episodes] for results in both
+    )
+    assert len(whole) == 8
+    assert whole == in_two_runs
     ours, theirs = (
-        {key: one.get(key) for key in ("policy", "config", "contract", "program")}
-        for one in policies
+        {
+            key: results.policies["scripted"].get(key)
+            for key in ("policy", "config", "contract", "program")
+        }
+        for results in both
     )
     assert ours == theirs
 
@@ -173,40 +178,26 @@ def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_parts_are_merged_exported_and_one_episode_is_played_again(
-    ray_home: Path, tmp_path: Path
+    ray_home: Path, resumed: Path, tmp_path: Path
 ) -> None:
-    parts = []
-    for seed in ("0", "2"):
-        parts.append(tmp_path / seed)
-        done = evaluate(
-            ray_home,
-            "tabletop",
-            "--policy",
-            "scripted",
-            "--episodes",
-            "2",
-            "--seed",
-            seed,
-            "--video",
-            "none",
-            "--record",
-            "all",
-            "--out",
-            str(parts[-1]),
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    results = Results.load(parts[0])
-    package = results.runs[0].versions["code"]["vlagents_ray"]
-    assert results.policies["scripted"]["code"] == (results.cases[0].code or None) == package
+    more = tmp_path / "more"
+    words = ["--episodes", "4", "--seed", "4", "--workers", "0", "--out", str(more)]
+    done = evaluate(ray_home, *BOTH, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for part in (resumed, more):
+        results = Results.load(part)
+        package = results.runs[-1].versions["code"]["vlagents_ray"]
+        assert results.policies["scripted"]["code"] == (results.cases[0].code or None) == package
     out = str(tmp_path / "merged")
-    merged = command(ray_home, "merge", *map(str, parts), "--out", out)
+    merged = command(ray_home, "merge", str(resumed), str(more), "--out", out)
     assert merged.returncode == 0, merged.stdout + merged.stderr
-    assert "4/4" in merged.stdout
+    assert "8/8" in merged.stdout
     exported = command(
         ray_home, "export", out, "--out", str(tmp_path / "dataset"), "--to", "lerobot"
     )
-    assert exported.stdout.startswith("wrote 4 episodes"), exported.stdout + exported.stderr
-    key = rows(tmp_path / "merged")[3][0]
+    assert exported.stdout.startswith("wrote 16 episodes"), exported.stdout + exported.stderr
+    played_by_a_worker = [row for row in rows(tmp_path / "merged") if row[2] == 3]
+    key = played_by_a_worker[0][0]
     same = command(ray_home, "replay", out, key)
     assert same.returncode == 0, same.stdout + same.stderr
     assert "the same: " in same.stdout

@@ -34,9 +34,10 @@ def server(shared_ray: None) -> Iterator[Server]:
     config = deployment("served_agents:Hanging", replicas=2, limits=limits).model_dump(
         exclude_unset=True
     )
-    # A hung replica never drains: Serve waits for that in vain, 20 s by our default.
+    # A hung replica never drains: Serve waits for that in vain, 20 s by our default; and it asks
+    # each replica three times how it is, every 5 s.
     config["applications"][0]["deployments"] = [
-        {"name": "Policy", "graceful_shutdown_timeout_s": 2}
+        {"name": "Policy", "graceful_shutdown_timeout_s": 2, "health_check_period_s": 1}
     ]
     with shared_server(Deployment(**config)) as server:
         yield server

@@ -260,7 +260,7 @@ def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None
     while not true():
         if (now := time.monotonic()) > deadline:
             raise TimeoutError(f"waited {timeout_s:g} s for {true}")
-        time.sleep(max(every_s, min(4 * (now - begun), 0.5)))
+        time.sleep(max(every_s, min(9 * (now - begun), 0.5)))
         begun = time.monotonic()
 
 

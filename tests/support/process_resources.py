@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -49,31 +51,132 @@ def unpooled_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if not re.search(r"_\d+$", thread.name)]
 
 
+class _FreshProcesses:
+    """A pytest that has imported one file, and forks a fresh process for each test it is sent."""
+
+    def __init__(self, file: Path, root: Path) -> None:
+        self.file = file
+        asked, self._asks = os.pipe()
+        self._answers, answered = os.pipe()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        profile = settings.get_current_profile_name()
+        options = ["-q", "-p", "no:xdist", "-p", "no:cacheprovider"]
+        own = {_INSIDE: f"{asked} {answered}"}
+        inherited = {key: one for key, one in os.environ.items() if not key.startswith("PYTEST_")}
+        self._pytest = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, f"--hypothesis-profile={profile}", file],
+            cwd=root,
+            env=inherited | own,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            pass_fds=(asked, answered),
+            start_new_session=True,
+        )
+        os.close(asked)
+        os.close(answered)
+        self._lines = os.fdopen(self._answers, "rb")
+
+    def failure_of(self, name: str) -> str | None:
+        """Run the test of that name in a process of its own; returns None if it passed."""
+        with contextlib.suppress(BrokenPipeError):
+            os.write(self._asks, json.dumps(name).encode() + b"\n")
+        line = self._lines.readline()
+        if not line:  # pytest has ended
+            self._pytest.wait()
+            self._log.seek(0)
+            return self._log.read().decode(errors="replace")
+        failure: str | None = json.loads(line)
+        return failure
+
+    def kill(self) -> None:
+        """End pytest, and the test that it runs."""
+        os.killpg(self._pytest.pid, signal.SIGKILL)
+        self.end()
+
+    def end(self) -> None:
+        """End pytest, which ends once it is sent no more."""
+        os.close(self._asks)
+        self._pytest.wait()
+        self._lines.close()
+        self._log.close()
+
+
+_fresh: _FreshProcesses | None = None  # of the file whose tests run
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is marked `own_process` in a pytest of its own, and any other one here."""
+    """Run a test that is marked `own_process` in a fresh process, and any other one here."""
+    global _fresh  # noqa: PLW0603 - one for each process
     if pyfuncitem.get_closest_marker("own_process") is None or _INSIDE in os.environ:
         return None
-    profile = settings.get_current_profile_name()
-    options = ["-q", "-p", "no:xdist", "-p", "no:cacheprovider", f"--hypothesis-profile={profile}"]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            *options,
-            f"{pyfuncitem.path}::{pyfuncitem.nodeid.partition('::')[2]}",
-        ],
-        check=False,
-        cwd=pyfuncitem.config.rootpath,
-        env=environment | {_INSIDE: "1"},
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode != 0:
-        pytest.fail(done.stdout + done.stderr, pytrace=False)
+    if _fresh is None:
+        _fresh = _FreshProcesses(pyfuncitem.path, pyfuncitem.config.rootpath)
+    try:
+        failure = _fresh.failure_of(pyfuncitem.nodeid.partition("::")[2])
+    except BaseException:  # its time is over
+        _fresh.kill()
+        _fresh = None
+        raise
+    if failure is not None:
+        pytest.fail(failure, pytrace=False)
     return True
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """End what forks the processes of a file once its tests are over."""
+    global _fresh
+    if _fresh is not None and (nextitem is None or nextitem.path != item.path):
+        ending, _fresh = _fresh, None
+        ending.end()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """Fork a process for each test that is sent here, in a pytest of `_FreshProcesses`."""
+    if _INSIDE not in os.environ:
+        return None
+    asked, answered = map(int, os.environ[_INSIDE].split())
+    tests = {item.nodeid.partition("::")[2]: item for item in session.items}
+    with os.fdopen(asked, "rb") as names:
+        for name in names:
+            process = os.fork()
+            if process == 0:
+                _play_and_exit(tests[json.loads(name)], answered)
+            _, status = os.waitpid(process, 0)
+            if status != 0:
+                ended = f"its process ended with {os.waitstatus_to_exitcode(status)}"
+                os.write(answered, json.dumps(ended).encode() + b"\n")
+    return True
+
+
+def _play_and_exit(test: pytest.Item, answered: int) -> None:
+    """Play a test, say what failed, and end this process."""
+    status = 1
+    try:
+        test.ihook.pytest_runtest_protocol(item=test, nextitem=None)
+        stats = test.config.pluginmanager.get_plugin("terminalreporter").stats
+        failed = [*stats.get("failed", []), *stats.get("error", [])]
+        texts = [
+            "\n".join([one.longreprtext, *(text for _, text in one.sections)]) for one in failed
+        ]
+        answer = json.dumps("\n".join(texts) if failed else None)
+        os.write(answered, answer.encode() + b"\n")
+        status = 0
+    finally:
+        os._exit(status)
+
+
+def share_cores() -> None:
+    """Give the linear algebra of each process of a test run one thread, in what is started from
+    here on.
+
+    With a thread for each core in each process, threads wait for one another by spinning, on cores
+    that other tests need.
+    """
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # None where one process runs all tests
