@@ -642,10 +642,11 @@ class Network:
                 with_source.append(name)
         named_inputs = [*self.cameras, *config.recurrent, *with_source]
         without_source = [name for name in inputs if name not in named_inputs]
+        unused_state: list[str] = []  # the parts in `state`, if no input is left for them
         if config.state is not None:
             if not without_source:
-                without_source = ["state"]  # the setting, which has no input left
-            if len(without_source) == 1 and without_source[0] in inputs:
+                unused_state = config.state
+            elif len(without_source) == 1:
                 self.vectors[without_source.pop()] = config.state
 
         other_outputs = {*config.recurrent.values(), *config.info}
@@ -667,6 +668,7 @@ class Network:
             "unknown": sorted(unknown),
             "named twice": sorted({name for name in named_inputs if named_inputs.count(name) > 1}),
             "inputs without a source": without_source,
+            "parts in `state` without an input": unused_state,
             "one of them the action": action_candidates,
         }
         summary = "; ".join(f"{problem}: {names}" for problem, names in problems.items() if names)

@@ -464,6 +464,16 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
             r"one of them the action: \['none of the outputs'\]",
         ),
         (
+            SAME.format(4).replace("x", "state"),
+            {"state": ["a"], "inputs": {"state": {"state": ["b"]}}},
+            r"parts in `state` without an input: \['a'\]",
+        ),
+        (
+            SAME.format(4),
+            {"state": ["a"], "inputs": {"x": {"state": ["b"]}}},
+            r"parts in `state` without an input: \['a'\]",
+        ),
+        (
             SAME.format(4),
             {"state": ["a"], "contract": {"hz": 3}},
             r"contract: expected some of .*, got \['hz'\]",
