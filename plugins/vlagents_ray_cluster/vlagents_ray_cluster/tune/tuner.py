@@ -532,8 +532,8 @@ class Tuner:
             difference = largest_difference(self._actions(process, size), self._expected)
             if difference > self._plan.tolerance:
                 off = (
-                    f"expected actions within {self._plan.tolerance:.2%} of their range, got "
-                    f"{difference:.2%}"
+                    f"actions differ by {difference:.2%} of their range, expected at most "
+                    f"{self._plan.tolerance:.2%}"
                 )
                 if variant.changes or points:
                     raise VariantFailed(f"refused, as {off}")
