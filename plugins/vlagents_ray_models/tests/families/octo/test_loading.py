@@ -44,7 +44,7 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
         ),
         ({"window": 5}, "expected at most 4, got 5; set 2, as in training"),
         ({"state": ["joints"]}, "expected no state"),
-        ({"device": "tpu:1"}, "not here"),
+        ({"device": "tpu:1"}, "'tpu:1': not available, JAX finds"),
     ],
 )
 def test_settings_that_do_not_fit_the_checkpoint(
