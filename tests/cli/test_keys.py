@@ -58,10 +58,10 @@ def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
         for words in (["a", "--scope", "weights"], ["b"])
     ]
     learner, robot = (Keys.from_file(file).check(token, "pi0") for token in tokens)
-    learner.admit(scope="weights")
+    learner.require("weights")
     robot.admit()
     with pytest.raises(Forbidden, match="expected the scope 'weights', which this key lacks"):
-        robot.admit(scope="weights")
+        robot.require("weights")
     assert "weights" in keys("list", "--keys", str(file)).stdout
 
 

@@ -161,8 +161,8 @@ def _wall_clock() -> int:
 class Server:
     """What a scenario talks to.
 
-    Its settings are `sessions`, `ready`, `replicas`, `keys`, the name of a `contract`, and
-    `dialects` by name.
+    Its settings are `sessions`, `ready`, `replicas`, `keys`, the `rate` of its key, the name of a
+    `contract`, and `dialects` by name.
     """
 
     def __init__(
@@ -175,7 +175,8 @@ class Server:
         self._keys: Keys | None = None
         if settings.get("keys"):
             keys = ChangingKeys()
-            keys.add(KEY.removeprefix("vlr_"))
+            limits = {"rate": settings["rate"]} if "rate" in settings else {}
+            keys.add(KEY.removeprefix("vlr_"), **limits)
             self._keys = keys.keys
         self._shutdown = Shutdown()
         self._websockets = 0  # open ones, of HTTP
@@ -209,6 +210,11 @@ class Server:
         for name in gateway:
             self._open_gateway(name)
         stack.callback(self._gate.opened.set)
+
+    @property
+    def keys(self) -> Keys | None:
+        """The keys of the server; None without `keys`."""
+        return self._keys
 
     def line(self, endpoint: str, name: str) -> Line:
         """A new connection to the replica that the name's last digit counts from 0, or to the

@@ -62,10 +62,14 @@ class Trace:
         """Send the same to a new server; returns what came of it."""
         with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
             server = Server(stack, patch, folder, **self.settings)
-            lines: dict[str, Line] = {}
-            stack.callback(lambda: [line.close() for line in lines.values()])
-            steps = [_played(step, server, endpoint, lines) for step in self.steps]
-            return Trace(self.name, [endpoint], self.settings, steps)
+            return self.played_at(server, endpoint, stack)
+
+    def played_at(self, server: Server, endpoint: str, stack: contextlib.ExitStack) -> Trace:
+        """The same at a server whose connections stay open until `stack` is closed."""
+        lines: dict[str, Line] = {}
+        stack.callback(lambda: [line.close() for line in lines.values()])
+        steps = [_played(step, server, endpoint, lines) for step in self.steps]
+        return Trace(self.name, [endpoint], self.settings, steps)
 
 
 def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -> Step:

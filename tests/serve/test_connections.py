@@ -42,6 +42,7 @@ from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.access.charges import Account, Charge
 from vlagents_ray.serve.endpoints import answers, http_connection, http_messages, websocket
 from vlagents_ray.serve.endpoints import shm as local
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -506,7 +507,9 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
 
 FAULTS = [
     (Intake, "admit"),
-    (Sender, "admission"),
+    (Account, "charge"),
+    (Charge, "require"),
+    (Charge, "cover"),
     (Sender, "send"),
     (Caller, "throttled_s"),
     (Sender, "release"),

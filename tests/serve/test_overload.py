@@ -36,6 +36,7 @@ from api_key_replica import (
     over_websocket,
 )
 from eval_fakes import wait_for
+from frozen_rates import freeze, requests_charged
 from gr00t_client import PolicyClient
 from in_flight import read_requests
 from in_memory_keys import ChangingKeys
@@ -78,7 +79,8 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.api_keys import Identity, NoKey
+from vlagents_ray.serve.access.charges import REFUSALS, Account, free
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -89,7 +91,6 @@ from vlagents_ray.serve.engine.admission import (
     NeedsDecodingThread,
 )
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects import gr00t
 from vlagents_ray_dialects.messages import gr00t as gr00t_codec
@@ -120,9 +121,9 @@ def reset(**more: Any) -> dict[str, Any]:
 def message_admission(
     most: int = 10**9,
     limits: MessageLimits = DEFAULT_LIMITS,
-    admit: Callable[[object], bool] = lambda _: True,
+    caller: Identity = NoKey.OPEN,
 ) -> MessageAdmission:
-    return MessageAdmission(Admission(most), limits, admit)
+    return MessageAdmission(Admission(most), limits, Account(caller).charge())
 
 
 # Before anything is decoded.
@@ -215,10 +216,10 @@ FORM = (
     b"form-data; "
     b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
 )
-ACT = "`POST /v1/act`"  # for which the others reset a session first
+ACTS = {"`POST /v1/act`", "own port, HTTP act"}  # these ways reset a session first
 # Each way in by which something to decode comes, for a key; docs/keys.md has them all.
 CARRY = {
-    way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | {ACT}
+    way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | ACTS
 } | {
     f"{op}, {kind.partition(';')[0]}": _post(f"/v1/{op}", kind, content)
     for op in ("reset", "act")
@@ -248,7 +249,7 @@ def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
 
 
 def test_no_other_way_in_is_left_out() -> None:
-    assert WAYS.keys() >= NOTHING_TO_DECODE | NO_KEY | {ACT}
+    assert WAYS.keys() >= NOTHING_TO_DECODE | NO_KEY | ACTS
 
 
 @pytest.mark.parametrize("way", CARRY)
@@ -336,7 +337,7 @@ def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]
 def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     limits = MessageLimits(decoded_bytes=4 * DECODED)
     held = Admission(10**9)
-    message = MessageAdmission(held, limits, lambda _: True)
+    message = MessageAdmission(held, limits, free(NoKey.OPEN))
     good, bad = (
         {"op": "reset", "obs": SEEN, "history": [SEEN] * 3},
         {"op": "reset", "obs": SEEN, "history": [SEEN] * 4},
@@ -401,7 +402,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     whole = Admission(8 * DECODED)
 
     def message(priority: str) -> tuple[MessageAdmission, VLAgentsError | None]:
-        one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True)
+        one = MessageAdmission(whole, DEFAULT_LIMITS, free(NoKey.OPEN))
         [answer] = read_requests(frame(reset(priority=priority)), one)
         return one, answer.error if isinstance(answer, Reply) else None
 
@@ -417,7 +418,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     assert message("robot")[1] is None
     assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
     # Into which it will never fit.
-    small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, lambda _: True)
+    small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, free(NoKey.OPEN))
     [answer] = read_requests(frame(reset(priority="simulation")), small)
     assert isinstance(answer, Reply)
     assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
@@ -428,7 +429,7 @@ def test_a_key_takes_half_of_what_other_keys_leave_free() -> None:
     whole = Admission(8 * DECODED)
 
     def message(key: str) -> tuple[MessageAdmission, VLAgentsError | None]:
-        one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True, key=key)
+        one = MessageAdmission(whole, DEFAULT_LIMITS, free(NoKey.OPEN), share=key)
         [answer] = read_requests(frame(reset()), one)
         return one, answer.error if isinstance(answer, Reply) else None
 
@@ -647,9 +648,12 @@ def test_an_event_loop_goes_on_while_a_message_is_decoded(
     assert len(asyncio.run(run()).requests) == 1
 
 
-def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
-    counted: list[object] = []
-    message = message_admission(admit=lambda op: bool(counted.append(op)) or True)
+def test_a_message_that_is_read_again_elsewhere_counts_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    freeze(monkeypatch)
+    known = ChangingKeys()
+    message = message_admission(caller=known.keys.check(known.add("arm", rate=100), "app"))
     data = frame(reset(), reset(obs={"cameras": {"front": {"$": ["img", 1]}}}), files=[JPEG, LARGE])
 
     def read(budget: Budget) -> Decoded:
@@ -658,7 +662,7 @@ def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
     with pytest.raises(NeedsDecodingThread):
         read(message)
     assert not message.decode_on_thread(read).result(30).refused
-    assert counted == ["message", "reset"]
+    assert requests_charged(known.keys, "arm") == 2
 
 
 def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -667,7 +671,9 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(codecs, "thread_map", refuse)
     two = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}}
-    message = message_admission(admit=lambda _: False)
+    known = ChangingKeys()
+    token = known.add("simulations", priority="simulation")
+    message = message_admission(caller=known.keys.check(token, "app"))
     data = frame(reset(obs=two), files=[LARGE, LARGE])
     assert (
         not message.decode_on_thread(lambda budget: decode_requests(data, budget))

@@ -8,10 +8,14 @@ what varies by nature: ids that are drawn at random, times, the headers Date and
 memory files are free again.
 
 The endpoints of the core are below, in `CORE`; each plug-in has those of its own.
+
+An endpoint at which clients have API keys also has the messages of a client with a key, of each of
+the kinds `MESSAGES`, and how many requests are charged to the key for them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -20,10 +24,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from frozen_rates import freeze, requests_charged
 from golden import png
 
 from tests.golden.own_protocol import PIXELS, act, asked, reset, seen
-from tests.golden.replica import EACH_BYTE, KEY
+from tests.golden.replica import EACH_BYTE, KEY, Server
 from tests.golden.scenarios import (
     HTTP,
     ScenarioMessage,
@@ -56,6 +62,30 @@ SITUATIONS = (
     "stop of the server",
 )
 
+# Kinds of messages, of which a control frame is the only one that costs nothing.
+MESSAGES = (
+    "reset",
+    "act",
+    "close",
+    "several requests",
+    "malformed message",
+    "control frame",
+)
+_RATE = 1000.0  # of the key whose charges are counted, requests/s
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Messages of the client "a", and what they cost.
+
+    Args:
+        requests: The requests that are charged to its key.
+        steps: From the beginning of its connection, with the answer to the last message.
+    """
+
+    requests: int
+    steps: Steps
+
 
 @dataclass(frozen=True)
 class Endpoint:
@@ -67,6 +97,8 @@ class Endpoint:
         situations: The steps by situation.
         not_applicable: The reason by situation, for those that this endpoint does not have.
         settings: Of `tests.golden.replica.Server`, in all situations.
+        costs: What a key is charged, by the kinds `MESSAGES`, or the reason why there is no such
+            message. Empty if clients have no keys, which is the reason for "wrong key".
     """
 
     name: str
@@ -74,6 +106,7 @@ class Endpoint:
     situations: Mapping[str, Steps]
     not_applicable: Mapping[str, str]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    costs: Mapping[str, Cost | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         described = [*self.situations, *self.not_applicable]
@@ -82,6 +115,30 @@ class Endpoint:
                 f"{self.name}: expected steps or a reason for each of {sorted(SITUATIONS)}, got "
                 f"{sorted(described)}"
             )
+        has_keys = "wrong key" in self.situations
+        if sorted(self.costs) != (sorted(MESSAGES) if has_keys else []):
+            raise ValueError(
+                f"{self.name}: expected a cost or a reason for each of {sorted(MESSAGES)} if its "
+                f"clients have keys, got {sorted(self.costs)}"
+            )
+
+    def cost(self, kind: str) -> Cost | None:
+        """What a message of that kind costs; None if there is none."""
+        cost = self.costs[kind]
+        return cost if isinstance(cost, Cost) else None
+
+    def played_cost(self, kind: str, folder: Path) -> float:
+        """Send the messages of that kind to a new server; returns what was charged to the key."""
+        cost = self.cost(kind)
+        assert cost is not None
+        settings = {**self.settings, "keys": True, "rate": _RATE}
+        (trace,) = scenario(kind, [self.line], cost.steps, **settings)
+        with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
+            freeze(patch)
+            server = Server(stack, patch, folder, **settings)
+            trace.played_at(server, self.line, stack)
+            assert server.keys is not None
+            return requests_charged(server.keys, KEY.removeprefix("vlr_"))
 
     def scenario(self, situation: str) -> Trace:
         """What is sent, without the answers."""
@@ -98,6 +155,23 @@ def cases(endpoints: Sequence[Endpoint]) -> list[tuple[Endpoint, str]]:
     for endpoint in endpoints:
         pairs += [(endpoint, each) for each in SITUATIONS if each in endpoint.situations]
     return pairs
+
+
+def costs(endpoints: Sequence[Endpoint]) -> list[Any]:
+    """Each endpoint whose clients have keys, with each kind of message that it has."""
+    rows = []
+    for endpoint in endpoints:
+        for kind in endpoint.costs:
+            if endpoint.cost(kind) is not None:
+                rows.append(pytest.param(endpoint, kind, id=f"{endpoint.name}-{kind}"))
+    return rows
+
+
+def require_cost(endpoint: Endpoint, kind: str, folder: Path) -> None:
+    """Fail unless the messages of that kind cost exactly what the table says."""
+    cost = endpoint.cost(kind)
+    assert cost is not None
+    assert endpoint.played_cost(kind, folder) == cost.requests
 
 
 def case_ids(endpoints: Sequence[Endpoint]) -> list[str]:
@@ -151,6 +225,9 @@ def handshake(path: str, key: str | None = None) -> bytes:
     ).encode()
 
 
+PING = b"\x89\x80" + bytes(4)  # a client's ping
+
+
 def websocket_frame(payload: bytes) -> bytes:
     """A client's binary frame, whose mask is zero."""
     size = len(payload)
@@ -194,6 +271,11 @@ OTHER_SHAPES = (
     seen(state={"joints": np.zeros(3, np.float32)}),
 )
 UNKNOWN_SESSIONS = (act(), act(session="another"))
+# Requests of one message; closing a session is free beside other requests.
+SEVERAL = [
+    *(reset(session=session) for session in ("x", "y", "z")),
+    Request("close", session="x"),
+]
 
 
 def _episode_steps(
@@ -263,7 +345,23 @@ def _websocket(name: str, line: str, path: str) -> Endpoint:
             [server("stops"), gets("a"), finishes()],
         ],
     }
-    return Endpoint(name, line + EACH_BYTE, situations, NOT_APPLICABLE[name])
+
+    def sends(requests: int, *frames: bytes) -> Cost:
+        """The cost of frames after the handshake with the key."""
+        return Cost(requests, [connect("a", KEY), asks(*((each,) for each in frames))])
+
+    first = say("a", reset())[0]
+    several = websocket_frame(encode_requests(SEVERAL))
+    costs: dict[str, Cost | str] = {
+        "reset": sends(1, first),
+        "act": sends(2, first, say("a", act())[0]),
+        "close": sends(2, first, say("a", Request("close"))[0]),
+        "several requests": sends(3, several),
+        "malformed message": sends(1, websocket_frame(b"garbage")),
+        "control frame": sends(0, PING),
+    }
+    endpoint_line = line + EACH_BYTE
+    return Endpoint(name, endpoint_line, situations, NOT_APPLICABLE[name], costs=costs)
 
 
 def _unix(name: str, line: str) -> Endpoint:
@@ -297,7 +395,22 @@ def _unix(name: str, line: str) -> Endpoint:
     }
     reasons = NOT_APPLICABLE[name]
     applicable = {key: steps for key, steps in situations.items() if key not in reasons}
-    return Endpoint(name, line, applicable, reasons)
+    if "wrong key" in reasons:
+        return Endpoint(name, line, applicable, reasons)
+
+    def sends(requests: int, *messages: ScenarioMessage) -> Cost:
+        """The cost of messages after the key."""
+        return Cost(requests, [Send("a", (KEY.encode(),)), asks(*messages)])
+
+    costs: dict[str, Cost | str] = {
+        "reset": sends(1, reset()),
+        "act": sends(2, reset(), act()),
+        "close": sends(2, reset(), Request("close")),
+        "several requests": sends(6, SEVERAL, in_memory(encode_requests(SEVERAL))),
+        "malformed message": sends(2, (b"garbage",), in_memory(b"garbage!")),
+        "control frame": "its messages have no control frames",
+    }
+    return Endpoint(name, line, applicable, reasons, costs=costs)
 
 
 def _handle(name: str) -> Endpoint:
@@ -362,9 +475,30 @@ def _http(
             stopped,
         ],
     }
+
+    def sends(requests: int, *messages: Request) -> Cost:
+        """The cost of requests with the key."""
+        posts = [say("a", message, authorization=f"Bearer {KEY}") for message in messages]
+        return Cost(requests, asks(*posts))
+
+    def post(op: str, kind: str, data: bytes) -> tuple[bytes]:
+        return (http("POST", f"/v1/{op}", data, kind, "a", authorization=f"Bearer {KEY}"),)
+
+    several: Cost | str = "a document or a form is one request"
+    if body is _frame_body:
+        frame = encode_requests([reset(session=session) for session in "bcd"])
+        several = Cost(3, asks(post("reset", CONTENT_TYPE, frame)))
+    costs: dict[str, Cost | str] = {
+        "reset": sends(1, reset()),
+        "act": sends(2, reset(), act()),
+        "close": Cost(1, asks(post("close", "", b""))),
+        "several requests": several,
+        "malformed message": Cost(1, asks(post("act", body(act())[0], b"garbage"))),
+        "control frame": "HTTP/1.1 has none",
+    }
     reasons = NOT_APPLICABLE[name]
     applicable = {key: steps for key, steps in situations.items() if key not in reasons}
-    return Endpoint(name, line, applicable, reasons, settings)
+    return Endpoint(name, line, applicable, reasons, settings, costs)
 
 
 def _frame_body(request: Request) -> tuple[str, bytes]:

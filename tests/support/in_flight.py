@@ -9,6 +9,8 @@ from typing import Any
 
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.charges import Account
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
@@ -96,18 +98,23 @@ def answered(engine: Engine, session_id: str, request: Request) -> Reply:
     return asked(engine, session_id, request).get(timeout=30)
 
 
+def arrived(sender: Sender) -> IncomingMessage:
+    """A message that has just arrived from a sender, and is charged to its key."""
+    return sender.message(Account(sender._caller or NoKey.OPEN).charge())
+
+
 def send(
     sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]
 ) -> list[PendingRequest]:
     """Send the requests of a message; `done` gets all replies."""
-    message, decoded = sender.message(), Decoded(list(requests), {})
+    message, decoded = arrived(sender), Decoded(list(requests), {})
     message.decoded(decoded)
     return sender.send(message, decoded, Calls(done))
 
 
 async def ask(sender: Sender, requests: Sequence[Request]) -> list[Reply]:
     """Send the requests of a message, and wait for the replies."""
-    return await sender.ask(sender.message(), Decoded(list(requests), {}))
+    return await sender.ask(arrived(sender), Decoded(list(requests), {}))
 
 
 def in_order(decoded: Decoded) -> list[Request | Reply]:

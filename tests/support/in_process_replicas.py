@@ -31,6 +31,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.charges import free
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -145,7 +146,7 @@ class InProcess:
         frame = encode_requests(requests)
         decoded = decode_requests(frame, Budget(DEFAULT_LIMITS))
         self._sender.send(
-            self._sender.message(),
+            self._sender.message(free(NoKey.OPEN)),
             decoded,
             Calls(lambda replies: answers.put(encode_replies(replies))),
         )

@@ -113,8 +113,8 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     """Decode the requests in a frame.
 
     Args:
-        budget: The budget to charge for the message before any of it is parsed, and for each
-            further request before its images are decoded.
+        budget: The budget of the message, which may refuse it before any of it is parsed, and each
+            request before its images are decoded.
 
     Raises:
         MalformedMessage: The data are not a frame of requests.

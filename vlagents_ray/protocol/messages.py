@@ -323,9 +323,7 @@ class Budget:
         self._refill()
 
     def begin_message(self) -> None:
-        """Count the message for its sender before any of it is parsed; raise an error if it is
-        rejected.
-        """
+        """Raise an error if the message is refused, before any of it is parsed."""
 
     def parse(self, size: int) -> None:
         """Count the memory for the values of `size` bytes of JSON before they are parsed. This
@@ -335,7 +333,7 @@ class Budget:
 
     def begin(self, op: object, priority: object = "robot") -> None:
         """Begin the next request of the message after its header is parsed; raise an error if it is
-        rejected.
+        refused.
         """
         self._refill()
 
@@ -398,7 +396,7 @@ def is_probe(message: bytes | memoryview) -> bool:
 
 
 def read_probe(message: bytes, budget: Budget) -> None:
-    """Count a probe as one request of a simulation.
+    """Check a probe, which is admitted as one request of a simulation.
 
     Raises:
         MalformedMessage: The message is not a probe.

@@ -36,6 +36,7 @@ from vlagents_ray.serve.queue.preparation import Preparation
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
+    from vlagents_ray.serve.access.charges import Charge
     from vlagents_ray.serve.engine.admission import MessageAdmission
 
 logger = logging.getLogger(__name__)
@@ -220,6 +221,7 @@ class IncomingMessage:
         transport: Transport, for the metrics.
         op: Operation of its only request, if that is known before decoding.
         priority: Priority of that request.
+        charge: Charge of the message to its sender's key, if a `Sender` submits it.
     """
 
     __slots__ = (
@@ -228,6 +230,7 @@ class IncomingMessage:
         "_missing",
         "admission",
         "arrived",
+        "charge",
         "decoded_at",
         "kinds",
         "observed",
@@ -238,8 +241,15 @@ class IncomingMessage:
         "transport",
     )
 
-    def __init__(self, transport: str = "", op: str = "unknown", priority: str = "robot") -> None:
+    def __init__(
+        self,
+        transport: str = "",
+        op: str = "unknown",
+        priority: str = "robot",
+        charge: Charge | None = None,
+    ) -> None:
         self.transport = transport
+        self.charge = charge
         self.kinds: list[tuple[str, str]] = [(op, priority)]  # operation and priority by request
         self.arrived = self.decoded_at = time.perf_counter()  # s
         self.replies: list[Reply] = []  # complete when the message is delivered

@@ -104,7 +104,7 @@ def test_a_client_of_the_gateway_keeps_its_instruction_and_each_session_its_own(
 
     def acted(*texts: str | None) -> list[tuple[int, int]]:
         """The length of each session's instruction, and which act of its episode it was."""
-        acts = sessions.act_batch([obs] * len(texts), texts)
+        acts = sessions.act_batch(sessions.account.charge(), [obs] * len(texts), texts)
         return [(int(act.action[0][3]), int(act.action[0][4])) for act in acts]
 
     try:

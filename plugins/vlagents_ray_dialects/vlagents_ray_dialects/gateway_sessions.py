@@ -1,8 +1,8 @@
 """The gateway's clients and their sessions, whose episodes begin as in `ImplicitEpisode`.
 
 The gateway enforces the permissions of the client's key, since not every transport to a replica
-contains a key: each observation (with the reset before it) counts towards the key's rate, each
-session towards its limit of sessions, and the key's priority applies to all its requests.
+contains a key: each message is charged to the key (`vlagents_ray.serve.access.charges`), each
+session counts towards its limit of sessions, and the key's priority applies to all its requests.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.serve.access.api_keys import Caller, Identity
+from vlagents_ray.serve.access.charges import Account, Charge
 from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEpisode, raise_first
 
 logger = logging.getLogger(__name__)
@@ -41,12 +42,10 @@ class GatewaySessions:
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
         self._connect = connect
         self._contract = contract
-        self._caller: Identity | None = None
+        self.account = Account()  # has no caller until the client is shown
         self._key: str | None = None
         self._priority: PriorityName | None = None
 
-        # The number of requests of the current message that were counted before it was read.
-        self._counted = 0
         self._counted_sessions = 0  # the number of sessions that are counted for the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
@@ -54,17 +53,20 @@ class GatewaySessions:
     @property
     def known(self) -> bool:
         """Whether the client has sent a valid key, or needs none."""
-        return self._caller is not None
+        return self.account.caller is not None
 
     @property
     def begun(self) -> bool:
         """Whether the client has a session."""
         return bool(self._agents)
 
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+    def reset(
+        self, charge: Charge, obs: Obs, instruction: str | None, **kwargs: Any
+    ) -> dict[str, Any]:
         """Begin the next episode of the client's only session.
 
         Args:
+            charge: The charge of the client's message, which `account` made when it arrived.
             obs: The observation.
             instruction: The task in words.
             kwargs: Further options of the reset.
@@ -73,32 +75,35 @@ class GatewaySessions:
             The info of the reply.
         """
         agent = self._sessions(1)[0]
-        self._admit(1)
+        charge.cover(1)
         self.restart()
         info = agent.reset(obs, instruction, **kwargs)
         self._episodes[0].began(instruction)
         return info
 
-    def act(self, obs: Obs, instruction: str | None) -> Act:
+    def act(self, charge: Charge, obs: Obs, instruction: str | None) -> Act:
         """Return the next action of the client's only session; a new instruction resets the
         session first.
         """
-        return self.act_batch([obs], [instruction])[0]
+        return self.act_batch(charge, [obs], [instruction])[0]
 
-    def act_on(self, obs: Obs) -> Act:
+    def act_on(self, charge: Charge, obs: Obs) -> Act:
         """Return the next action of the client's only session, without a reset.
 
         Raises:
             NotReset: The session was not reset before.
         """
         agent = self._sessions(1)[0]
-        self._admit(1)
+        charge.cover(1)
         return agent.act(obs)
 
-    def act_batch(self, obs: Sequence[Obs], instructions: Sequence[str | None]) -> list[Act]:
+    def act_batch(
+        self, charge: Charge, obs: Sequence[Obs], instructions: Sequence[str | None]
+    ) -> list[Act]:
         """Return the next action of each session, and reset sessions with a new instruction first.
 
         Args:
+            charge: The charge of the client's message, which `account` made when it arrived.
             obs: The observation of each session.
             instructions: The task of each session in words.
 
@@ -106,10 +111,11 @@ class GatewaySessions:
             The action of each session.
 
         Raises:
+            TooManyRequests: The client's key is over its rate; nothing was acted on.
             VLAgentsError: The first error of a session.
         """
         agents = self._sessions(len(obs))
-        self._admit(len(obs))
+        charge.cover(len(obs))
 
         texts = [episode.instruction for episode in self._episodes]
         beginning = []  # the indices of the sessions whose episode begins
@@ -120,8 +126,9 @@ class GatewaySessions:
 
         self.restart()  # undone below, when all sessions have replied
         if beginning:
-            if isinstance(self._caller, Caller):
-                self._caller.note("reset sessions by a gateway:", str(len(beginning)))
+            caller = self.account.caller
+            if isinstance(caller, Caller):
+                caller.note("reset sessions by a gateway:", str(len(beginning)))
             infos = agents[0].reset_batch(
                 [obs[i] for i in beginning],
                 [texts[i] for i in beginning],
@@ -143,9 +150,9 @@ class GatewaySessions:
             key: Its API key, or None.
         """
         priority = caller.priority if isinstance(caller, Caller) else None
-        if caller != self._caller or priority != self._priority:
+        if caller != self.account.caller or priority != self._priority:
             self.close()
-            self._caller = caller
+            self.account.identify(caller)
             self._key = key
             self._priority = priority
             if isinstance(caller, Caller):
@@ -155,19 +162,8 @@ class GatewaySessions:
         """Return the reason why the client's key is no longer valid; None if it is valid or not
         needed.
         """
-        return self._caller.refusal() if isinstance(self._caller, Caller) else None
-
-    def begin(self) -> None:
-        """Count a message for the key before it is read; this counts the first of its requests."""
-        self._counted = 0
-        self._admit(1)
-        self._counted = 1
-
-    def throttled_s(self) -> float:
-        """Return the time for which the client must not be read, s; 0 unless its key is over its
-        rate.
-        """
-        return self._caller.throttled_s() if isinstance(self._caller, Caller) else 0.0
+        caller = self.account.caller
+        return caller.refusal() if isinstance(caller, Caller) else None
 
     def restart(self) -> None:
         """Make each session reset before its next action."""
@@ -183,7 +179,7 @@ class GatewaySessions:
 
     def _sessions(self, number: int) -> list[RemoteAgent]:
         """Return this number of sessions; begin missing ones, and end surplus ones."""
-        if self._caller is None:
+        if not self.known:
             raise TypeError("a session without a client: call show() first")
         # Sessions are counted before they exist, and until they have ended.
         self._hold(max(number, self._counted_sessions))
@@ -206,18 +202,10 @@ class GatewaySessions:
         """Set the number of sessions that count for the key; raise `TooManyRequests` beyond its
         limit.
         """
-        if isinstance(self._caller, Caller) and number != self._counted_sessions:
-            self._caller.hold(number - self._counted_sessions)
+        caller = self.account.caller
+        if isinstance(caller, Caller) and number != self._counted_sessions:
+            caller.hold(number - self._counted_sessions)
         self._counted_sessions = number
-
-    def _admit(self, number: int) -> None:
-        """Count requests for the key before any of them is sent; raise `TooManyRequests` beyond
-        its rate.
-        """
-        counted, self._counted = self._counted, 0
-        if isinstance(self._caller, Caller):
-            for _ in range(number - counted):
-                self._caller.admit()
 
 
 def internal_error(dialect: str) -> str:

@@ -23,14 +23,13 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     VLAgentsError,
 )
-from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.endpoints.connection import ANSWERS_S, wait_delivered
 from vlagents_ray.serve.engine.admission import Admission
-from vlagents_ray.serve.token_bucket import TokenBucket
 from vlagents_ray.wire.mapping import KeyMapping, matches
 from vlagents_ray_dialects.acceptor import TICK_S, Acceptor
 from vlagents_ray_dialects.client_reader import ClientReader, set_keep_alive, share_of, shut_down
@@ -83,7 +82,6 @@ class GR00TConnection(GatewayClient):
         self._is_robot = dialect.config.priority == "robot"
         self._share = share_of(connection)  # the name of its share of the bytes in flight
         self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
-        self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
         # The time at which a stranger is disconnected, s.
         self._valid_until = time.monotonic() + _STRANGER_S
         self._refused = 0  # the number of messages without a valid key
@@ -251,8 +249,7 @@ class GR00TConnection(GatewayClient):
 
     def _process_command(self, name: bytes, content: bytes) -> None:
         """Answer a PING; ignore other commands, at a bounded rate."""
-        if self._commands.take(time.monotonic()) > 0:
-            raise MalformedMessage(f"zmtp: more than {CONTROL_FRAMES} commands at once")
+        self.sessions.account.charge_control_frame()
         if name == b"PING":
             with self._sending:
                 self._connection.settimeout(_SEND_S)
@@ -278,7 +275,7 @@ class GR00TConnection(GatewayClient):
                 self._used = time.monotonic()
                 self._answered.notify_all()
         self._send(answer)
-        time.sleep(self.sessions.throttled_s())
+        time.sleep(self.sessions.account.throttled_s())
 
     def _send(self, answer: bytes) -> bool:
         """Send the answer to the current request, and return True; False if it already has one."""
@@ -305,12 +302,13 @@ class GR00TConnection(GatewayClient):
                 )
 
             self._identify(payload)
+            charge = self.sessions.account.charge()
             admission = self._context.admission
             admission.hold(len(payload), self._is_robot, 0, self._share)
             try:
-                self.sessions.begin()
+                charge.require()
                 request = gr00t.read_request(payload, self._context.limits)
-                return gr00t.pack(self._value(request), packed=request.packed)
+                return gr00t.pack(self._value(request, charge), packed=request.packed)
             finally:
                 admission.release(len(payload), self._share)
         except VLAgentsError as error:
@@ -350,7 +348,7 @@ class GR00TConnection(GatewayClient):
         else:
             time.sleep(_REFUSAL_S)
 
-    def _value(self, request: GR00TRequest) -> Any:
+    def _value(self, request: GR00TRequest, charge: Charge) -> Any:
         """Return the value of the reply to a request."""
         if request.endpoint == "ping":
             return {"status": "ok", "message": "Server is running"}
@@ -359,9 +357,9 @@ class GR00TConnection(GatewayClient):
         if request.endpoint == "reset":
             self.sessions.restart()
             return {}
-        return self._act(gr00t.read_observations(request.data))
+        return self._act(gr00t.read_observations(request.data), charge)
 
-    def _act(self, batch: Observations) -> Any:
+    def _act(self, batch: Observations, charge: Charge) -> Any:
         """Return the reply to a request `get_action`."""
         mapping, contract = self._mapping, self._context.contract
         self._flat = batch.flat
@@ -375,7 +373,7 @@ class GR00TConnection(GatewayClient):
 
         if not self.sessions.begun:
             mapping.warn_of_unread_cameras(gr00t.newest(batch.each[0]), "gr00t")
-        acts = self.sessions.act_batch(observations, instructions)
+        acts = self.sessions.act_batch(charge, observations, instructions)
 
         spec = None if contract is None else contract.action
         info = {"done": [act.done for act in acts], "timing": acts[0].info.get("timing", {})}

@@ -213,7 +213,7 @@ class LeRobotConnection(GatewayClient):
         last_acted = self._acted
         self._acted = max(last_acted, observation.timestep)
         try:
-            act = self.sessions.act(waiting.obs, waiting.instruction)
+            act = self.sessions.act(waiting.admission.charge, waiting.obs, waiting.instruction)
         except BaseException:
             # The client's next observation of this time step must not be ignored.
             self._acted = last_acted
@@ -356,10 +356,10 @@ class LeRobotDialect(PortDialect):
             admission = MessageAdmission(
                 self.context.admission,
                 self.context.limits,
-                None,
+                client.sessions.account.charge(),
                 robot=robot,
                 inline=False,
-                key=self._share_of(context),
+                share=self._share_of(context),
             )
             self._uploads[context] = time.monotonic()
             try:

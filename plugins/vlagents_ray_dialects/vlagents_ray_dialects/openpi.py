@@ -34,11 +34,12 @@ from vlagents_ray.errors import (
     shown,
 )
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray_dialects.messages import openpi
 
@@ -268,15 +269,15 @@ class MapConnection:
             session.episode.end()
 
     async def answer(
-        self, message: dict[str, Any], incoming: IncomingMessage, request_id: str, gate: Sender
+        self, message: dict[str, Any], incoming: IncomingMessage, charge: Charge, request_id: str
     ) -> bytes | str:
         """Return the answer to one message.
 
         Args:
             message: The message.
             incoming: The same message, for the metrics.
+            charge: The charge of the message.
             request_id: The id of the request.
-            gate: Counts the observations of a batch after the first one for the key.
         """
         dialect = self.dialect
         answer = dialect.begins(message, self)
@@ -285,10 +286,10 @@ class MapConnection:
 
         batch = dialect.batch(message)
         observations = [message] if batch is None else batch
-        gate.count(len(observations) - 1)
+        charge.cover(len(observations))
         inputs = [dialect.read(observation) for observation in observations]
 
-        sessions = [self.session] if batch is None else await self._of_batch(len(batch))
+        sessions = [self.session] if batch is None else await self._of_batch(len(batch), charge)
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
         session_inputs = []
@@ -308,14 +309,14 @@ class MapConnection:
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
-    async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
+    async def _of_batch(self, number: int, charge: Charge) -> list[base.ImplicitSession]:
         """Return the sessions of a batch of this size, in order; a change of the size ends the
         episodes.
         """
         if number != len(self._batched):
             surplus, self._batched = self._batched[number:], self._batched[:number]
             for session in surplus:
-                await session.close()
+                await session.close(charge)
             for session in self._batched:
                 session.episode.end()
             while len(self._batched) < number:
@@ -331,16 +332,16 @@ async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
         return
 
     connections: dict[str, MapConnection] = {}
-    gate = dialects[0].gate()
     try:
         await socket.send_bytes(openpi.encode(dialects[-1].first()))
-        while True:
-            received = await dialects[0].receive(socket, gate)
-            if received is None:
-                return
-            data, admission = received
-            if not await _answer(dialects, socket, data, admission, connections, gate):
-                return
+        async with dialects[0].messages(socket) as messages:
+            while True:
+                received = await dialects[0].receive(messages)
+                if received is None:
+                    return
+                data, admission = received
+                if not await _answer(dialects, socket, data, admission, connections):
+                    return
     except WebSocketDisconnect:
         return
     finally:
@@ -354,7 +355,6 @@ async def _answer(
     data: bytes | None,
     admission: MessageAdmission,
     connections: dict[str, MapConnection],
-    gate: Sender,
 ) -> bool:
     """Answer one message; return False if the connection was closed.
 
@@ -364,9 +364,9 @@ async def _answer(
         data: The message.
         admission: The admission of the message, which is released at the end.
         connections: The state of each dialect on this connection, by name.
-        gate: Counts the requests for the key.
     """
-    incoming = dialects[0].arrived()
+    charge = admission.charge
+    incoming = dialects[0].arrived(charge)
     request_id = uuid.uuid4().hex
     try:
         message = await base.decoded(
@@ -375,12 +375,12 @@ async def _answer(
 
         dialect = _dialect_of(message, dialects)
         arrived = incoming.arrived
-        incoming = dialect.arrived()
+        incoming = dialect.arrived(charge)
         incoming.arrived = arrived
         if dialect.name not in connections:
             connections[dialect.name] = MapConnection(dialect)
         connection = connections[dialect.name]
-        answer = await connection.answer(message, incoming, request_id, gate)
+        answer = await connection.answer(message, incoming, charge, request_id)
     except Exception as error:  # noqa: BLE001 - the error is the reply to the client
         problem = public_problem(error, incoming.transport, request_id)
         dialects[0].record_failure(incoming, problem)
@@ -388,9 +388,7 @@ async def _answer(
 
         # The connection stays open, as the policy has not received the message.
         if isinstance(problem, TooManyRequests):
-            if gate.refused_too_often:
-                await socket.close(base.POLICY_VIOLATION, REFUSED)
-            return not gate.refused_too_often
+            return True
 
         if isinstance(problem, PolicyUnavailable):
             await socket.close(base.SERVICE_RESTART, str(problem)[:120])

@@ -34,9 +34,9 @@ from vlagents_ray.errors import (
 from vlagents_ray.protocol.messages import PriorityName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.charged_messages import ChargedMessages
 from vlagents_ray.serve.endpoints.http_messages import problem_response, public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray_dialects.messages import vla_eval
 from vlagents_ray_dialects.messages.vla_eval import PRESETS
 
@@ -91,22 +91,23 @@ class VlaEvalDialect(base.RouteDialect):
             return
 
         sender = self.sender()
-        gate = self.gate()
         session = self.session(sender)
         chunk = ChunkBuffer()  # the rows that are not sent yet
         inbox = _Inbox()
-        reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
+        messages = self.messages(socket)
+        reading = asyncio.ensure_future(inbox.fill(messages, self))
         try:
-            while True:
-                received = await inbox.next()
-                if received is None:
-                    break
-                answer = await self._answer(received, session, chunk)
-                if answer is not None:
-                    await socket.send_bytes(vla_eval.encode(answer))
+            async with messages:
+                while True:
+                    received = await inbox.next()
+                    if received is None:
+                        break
+                    answer = await self._answer(received, session, chunk)
+                    if answer is not None:
+                        await socket.send_bytes(vla_eval.encode(answer))
 
-            if inbox.end is not None:
-                await socket.close(base.POLICY_VIOLATION, inbox.end)
+                if inbox.end is not None:
+                    await socket.close(base.POLICY_VIOLATION, inbox.end)
         except WebSocketDisconnect:
             return
         finally:
@@ -160,7 +161,7 @@ class VlaEvalDialect(base.RouteDialect):
         chunk: ChunkBuffer,
     ) -> vla_eval.VlaEvalMessage:
         """Return the action for an observation, or an error."""
-        incoming = self.arrived()
+        incoming = self.arrived(admission.charge)
         request_id = uuid.uuid4().hex
         try:
             # Some benchmarks render only the observations that begin a chunk, so the observations
@@ -219,13 +220,13 @@ class _Inbox:
             await self._arrival.wait()
         return self._messages.popleft()
 
-    async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
+    async def fill(self, messages: ChargedMessages, dialect: VlaEvalDialect) -> None:
         """Receive messages until the client disconnects, or too many of its messages wait for
         replies.
         """
         try:
-            while not gate.refused_too_often:
-                received = await dialect.receive(socket, gate)
+            while True:
+                received = await dialect.receive(messages)
                 if received is None:
                     return
                 data, admission = received
@@ -237,13 +238,12 @@ class _Inbox:
                     return
 
                 self._put(await self._read(data, admission))
-            self.end = REFUSED
         finally:
             self._put(None)
 
     @staticmethod
     async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
-        """Decode a message, which counts as a request of the key."""
+        """Decode a message."""
         try:
             message = await base.decoded(
                 lambda data, budget: vla_eval.decode(data, budget.limits), data, admission

@@ -193,9 +193,9 @@ class VlagentsConnection:
         request = vlagents.read_act(text, admission, self._segments)
         obs = self._ours(request.obs)
         if request.robots:
-            act = self._session.act(obs, request.instruction)
+            act = self._session.act(admission.charge, obs, request.instruction)
         else:
-            act = self._session.act_on(obs)
+            act = self._session.act_on(admission.charge, obs)
         admission.release()
 
         columns = self._dialect.columns
@@ -212,7 +212,8 @@ class VlagentsConnection:
         """Return the result of the method `reset`."""
         admission = self._admission(text)
         request, options = vlagents.read_reset(text, admission, self._segments)
-        info = self._session.reset(self._ours(request.obs), request.instruction, **options)
+        obs = self._ours(request.obs)
+        info = self._session.reset(admission.charge, obs, request.instruction, **options)
         admission.release()
         return json_numpy.dumps(info)
 
@@ -222,11 +223,11 @@ class VlagentsConnection:
         return MessageAdmission(
             self._context.admission,
             self._context.limits,
-            None,
+            self._session.account.charge(),
             len(text),
             robot=robot,
             inline=False,
-            key=self._share,
+            share=self._share,
         )
 
     def _ours(self, obs: Obs) -> Obs:

@@ -42,6 +42,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
+from vlagents_ray.serve.access.charges import Account
 from vlagents_ray.serve.endpoints.http_messages import deny
 from vlagents_ray.serve.weights import PushOptions, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
@@ -154,8 +155,8 @@ class _WeightsEndpoint:
             options = _read_options(socket.query_params)
             caller = current_caller()
             header = await self._receive_message(socket)
+            Account(caller).charge().require()  # a push counts as one request
             if isinstance(caller, Caller):
-                caller.admit()  # a push counts as one request
                 caller.note("pushes weights:", f"mode {options.mode}")
             specs = await asyncio.to_thread(self._replicas.read_header, header, options)
             reader = ValuesReader(specs)

@@ -34,10 +34,12 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.serve.access import api_keys, audit, key_store
 from vlagents_ray.serve.access.api_keys import (
     Keys,
+    NoKey,
     load_keys,
     require_access,
     token_of,
 )
+from vlagents_ray.serve.access.charges import Account, free
 from vlagents_ray.serve.access.key_store import (
     new_key,
     parse_keys,
@@ -45,7 +47,8 @@ from vlagents_ray.serve.access.key_store import (
     revoke,
 )
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
+from vlagents_ray.serve.requests import IncomingMessage
 
 
 @pytest.fixture
@@ -309,7 +312,7 @@ def test_a_rate_is_kept_by_name_over_all_connections(
     with pytest.raises(TooManyRequests, match="send fewer, or ask the operator") as refused:
         callers[0].admit()
     assert refused.value.retry_after_s == pytest.approx(0.25)
-    callers[0].admit(free=True)
+    callers[0].require()
     now += 0.25
     callers[1].admit()
     with pytest.raises(TooManyRequests):
@@ -325,18 +328,31 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
     caller = Keys.from_file(file).check(token, "noop")
     engine, requests = Engine(Noop.from_config({})), [Request("reset", Obs())] * 3
     sender, decoded, admission = Sender(engine, "any", caller=caller), Decoded(requests, {}), None
-    if compact:
-        sender.count_message()
-    else:
-        admission = sender.admission(DEFAULT_LIMITS)
+    charge = Account(caller).charge()
+    if not compact:
+        admission = message_admission(engine, charge, DEFAULT_LIMITS)
         decoded = decode_requests(encode_requests(requests), admission)
-    message = sender.message()
+    message = sender.message(charge)
     sender.send(message, decoded, Calls(ignore), admission=admission)
     engine.close()
     # The engine is not started.
     assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3
     with pytest.raises(TooManyRequests):
         caller.admit()
+
+
+def test_an_engine_accepts_no_message_that_is_not_charged_to_its_sender(file: Path) -> None:
+    token = new_key(file, "arm")
+    caller = Keys.from_file(file).check(token, "noop")
+    engine = Engine(Noop.from_config({}))
+    sender = Sender(engine, "any", caller=caller)
+    uncharged, free_of_charge = IncomingMessage("any"), sender.message(free(NoKey.OPEN))
+    for message in (uncharged, free_of_charge):
+        with pytest.raises(TypeError, match="expected one that is charged to its sender's key"):
+            sender.send(message, Decoded([Request("reset", Obs())], {}), Calls(ignore))
+    engine.close()
+    with pytest.raises(TypeError, match="identify the client before its first message"):
+        Account().charge()
 
 
 def test_the_file_holds_hashes_for_its_owner_alone(file: Path) -> None:

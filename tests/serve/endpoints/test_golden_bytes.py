@@ -13,6 +13,8 @@ from endpoint_situations import (
     Endpoint,
     case_ids,
     cases,
+    costs,
+    require_cost,
     require_each_situation_recorded,
     require_recorded_answers,
 )
@@ -28,3 +30,10 @@ def test_the_endpoint_answers_with_the_recorded_bytes(
 @pytest.mark.parametrize("endpoint", CORE, ids=[endpoint.name for endpoint in CORE])
 def test_each_situation_of_the_endpoint_is_recorded(endpoint: Endpoint) -> None:
     require_each_situation_recorded(endpoint)
+
+
+@pytest.mark.parametrize(("endpoint", "kind"), costs(CORE))
+def test_each_request_is_charged_to_the_key_exactly_once(
+    endpoint: Endpoint, kind: str, tmp_path: Path
+) -> None:
+    require_cost(endpoint, kind, tmp_path)

@@ -40,9 +40,9 @@ from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request, peer_uid
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.access.charges import REFUSALS
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.serve.engine.settings import EngineSettings
 
 

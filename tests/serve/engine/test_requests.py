@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from in_flight import Calls, ask, send
+from in_flight import Calls, arrived, ask, send
 
 from vlagents_ray.errors import (
     DeadlineExceeded,
@@ -315,7 +315,7 @@ def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that
     served.engine.observers.add(Noting(seen))
     sender = served.sender("a")
 
-    message = sender.message()
+    message = arrived(sender)
     requests = [Request("reset", Obs(), session=name) for name in "ab"]
     decoded = Decoded(requests, {1: Reply(error=InvalidInput("no"))})
     sender.send(message, decoded, Calls(lambda _: seen.append("sent")))

@@ -138,7 +138,7 @@ class Keys:
             raise Unauthorized("the server has no such API key; ask its operator for one")
 
         caller = Caller(self, digest, key.name, app)
-        caller.admit(free=True)
+        caller.require()
         return caller
 
     def key(self, digest: bytes) -> Key | None:
@@ -292,30 +292,46 @@ class Caller:
         key = self._keys.key(self._digest)
         return 0 if key is None else key.sessions
 
-    def admit(self, *, free: bool = False, scope: str | None = None) -> None:
-        """Check the key before each request, and count the request.
+    def require(self, scope: str | None = None) -> Key:
+        """Check the key, and return what it permits now; nothing is charged.
 
         Args:
-            free: Whether the request is not counted.
             scope: The scope that the key needs; None if it needs no scope.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
             Forbidden: The key is no longer for this application, or lacks the scope.
-            TooManyRequests: The key is over its rate.
         """
         try:
-            self._admit(free, scope)
+            return self._valid_key(scope)
         except VLAgentsError as error:
             self._keys.audit.refused(self.name, error.code)
             raise
+
+    def admit(self) -> Key:
+        """Check the key as `require` does, and take one request from its rate.
+
+        Only `vlagents_ray.serve.access.charges` calls this, for all endpoints.
+
+        Raises:
+            Unauthorized: The key is revoked or has expired.
+            Forbidden: The key is no longer for this application.
+            TooManyRequests: The key is over its rate.
+        """
+        try:
+            key = self._valid_key()
+            self._keys.take(key)
+        except VLAgentsError as error:
+            self._keys.audit.refused(self.name, error.code)
+            raise
+        return key
 
     def refusal(self, scope: str | None = None) -> str | None:
         """Return the reason why the key is no longer valid or lacks the `scope`; None if it is
         valid.
         """
         try:
-            self._admit(free=True, scope=scope)
+            self._valid_key(scope)
         except VLAgentsError as error:
             return str(error)
         return None
@@ -356,7 +372,7 @@ class Caller:
         """Log an action of the key, see `Audit.did`."""
         self._keys.audit.did(self.name, event, subject)
 
-    def _admit(self, free: bool, scope: str | None = None) -> None:
+    def _valid_key(self, scope: str | None = None) -> Key:
         key = self._keys.key(self._digest)
         if key is None or key.revoked:
             raise Unauthorized(
@@ -373,8 +389,7 @@ class Caller:
                 f"key {self.name!r}: expected the scope {scope!r}, which this key lacks; use a "
                 f"key of `keys new NAME --scope {scope}`"
             )
-        if not free:
-            self._keys.take(key)
+        return key
 
 
 def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:
@@ -502,7 +517,7 @@ class ScopeCheck:
         """
         caller = current_caller()
         if isinstance(caller, Caller):
-            caller.admit(free=True, scope=scope)
+            caller.require(scope)
         elif self.open_to_network:
             raise Forbidden(
                 f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray "

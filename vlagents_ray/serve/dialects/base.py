@@ -79,6 +79,7 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, current_caller
+from vlagents_ray.serve.access.charges import Charge, current_charge
 from vlagents_ray.serve.config.dialects import (
     DialectArgs,
     DialectConfig,
@@ -87,6 +88,7 @@ from vlagents_ray.serve.config.dialects import (
     read_mapping,
 )
 from vlagents_ray.serve.endpoints import answers
+from vlagents_ray.serve.endpoints.charged_messages import ChargedMessages
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     problem_response,
@@ -97,7 +99,7 @@ from vlagents_ray.serve.endpoints.http_messages import (
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender, settle
+from vlagents_ray.serve.engine.sender import Sender, message_admission, settle
 from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.requests import IncomingMessage
 
@@ -234,30 +236,13 @@ class RouteDialect(Dialect):
         raise NotImplementedError(f"{self.name} declares a root and does not serve it")
 
     def sender(self, session_id: str = "") -> Sender:
-        """Return the sender of a connection or, given a session's name, of a request.
-
-        The sender does not count requests for the key, as `decoded` has counted them.
-        """
+        """Return the sender of a connection or, given a session's name, of a request."""
         return Sender(
             self.context.engine,
             self.name,
             session_id,
             caller=current_caller(),
             connected=not session_id,
-            counted=True,
-        )
-
-    def gate(self, *, counted: bool = False) -> Sender:
-        """Return a sender whose `admission` provides the budget for decoding messages.
-
-        `counted` is whether each message was counted for the key when it arrived.
-        """
-        return Sender(
-            self.context.engine,
-            self.name,
-            caller=current_caller(),
-            connected=False,
-            counted=counted,
         )
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
@@ -266,26 +251,37 @@ class RouteDialect(Dialect):
         """
         return ImplicitSession(self.context.engine, sender, self.config.priority, name)
 
-    async def receive(
-        self, socket: WebSocket, gate: Sender
-    ) -> tuple[bytes | None, MessageAdmission] | None:
-        """Wait for the next message of a WebSocket, and before that until the key of its `gate` is
-        within its rate.
-
-        Returns the message, or None for a text message, and its admission; None if the client is
-        gone.
+    def messages(self, socket: WebSocket) -> ChargedMessages:
+        """Return the messages of an accepted WebSocket, which are charged to the client's key; see
+        `receive`.
         """
-        await gate.wait_unthrottled()
-        event = await socket.receive()
-        if event["type"] == "websocket.disconnect":
-            return None
-        data = event.get("bytes")
-        size = 0 if data is None else len(data)
-        return data, gate.admission(self.context.limits, size, self.config.priority)
+        return ChargedMessages(socket, current_caller())
 
-    def arrived(self) -> IncomingMessage:
+    async def receive(
+        self, messages: ChargedMessages
+    ) -> tuple[bytes | None, MessageAdmission] | None:
+        """Wait for the next message of a WebSocket.
+
+        Returns the message, or None for a text message, and its admission, which has its charge;
+        None if the client is gone, or the connection has to end.
+        """
+        message = await messages.next()
+        if message is None:
+            return None
+        data, charge = message
+        return data, self.admission(charge, 0 if data is None else len(data))
+
+    def admission(self, charge: Charge, size: int = 0) -> MessageAdmission:
+        """Return the admission of a message of `size` bytes, which is the budget for decoding
+        it.
+        """
+        return message_admission(
+            self.context.engine, charge, self.context.limits, size, self.config.priority
+        )
+
+    def arrived(self, charge: Charge) -> IncomingMessage:
         """Create the `IncomingMessage` of an observation that has just arrived."""
-        return IncomingMessage(self.name, "act", self.config.priority)
+        return IncomingMessage(self.name, "act", self.config.priority, charge)
 
     def encoded(self, message: IncomingMessage, encode: Callable[[], T]) -> T:
         """Encode the replies of a message with `encode`, which completes their `timing`, and record
@@ -374,7 +370,7 @@ def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute
 async def decoded(
     read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission
 ) -> T:
-    """Decode a message with `read`, counting it as one request of the key even if it is invalid.
+    """Decode a message with `read`, unless it is refused.
 
     `data` of None is a WebSocket's text, which is refused.
     """
@@ -464,10 +460,10 @@ class ImplicitSession:
         (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id)
         return reply
 
-    async def close(self) -> None:
-        """End the session."""
+    async def close(self, charge: Charge) -> None:
+        """End the session, because of the message with that charge."""
         request = self._request("close", None, None, "")
-        await self._sender.ask(self._sender.message("close"), Decoded([request], {}))
+        await self._sender.ask(self._sender.message(charge, "close"), Decoded([request], {}))
 
     def _request(
         self, op: Op, obs: Obs | None, instruction: str | None, request_id: str
@@ -495,14 +491,20 @@ async def act_together(
     again, which is safe since the observation was not acted on.
 
     Raises:
+        TooManyRequests: The client's key is over its rate; nothing was acted on.
         VLAgentsError: The first error among the replies.
     """
+    charge = message.charge
+    if charge is None:
+        raise TypeError("message: expected one with a charge, as `RouteDialect.arrived` creates it")
+    charge.cover(len(observations))
+
     beginning = [
         session_obs
         for session_obs in observations
         if session_obs.session.episode.begins(session_obs.instruction)
     ]
-    await _reset(beginning, request_id)
+    await _reset(beginning, charge, request_id)
     replies = await _ask(message, "act", observations, [None] * len(observations), request_id)
 
     forgotten = [
@@ -515,8 +517,8 @@ async def act_together(
             request_id,
         )
         again = [observations[index] for index in forgotten]
-        await _reset(again, request_id)
-        acts = observations[0].session._sender.message()
+        await _reset(again, charge, request_id)
+        acts = observations[0].session._sender.message(charge)
         repeated = await _ask(acts, "act", again, [None] * len(again), request_id)
         for index, reply in zip(forgotten, repeated, strict=True):
             replies[index] = reply
@@ -525,8 +527,10 @@ async def act_together(
     return replies
 
 
-async def _reset(observations: Sequence[SessionObs], request_id: str) -> None:
-    """Reset the sessions of these observations, whose episodes begin with them."""
+async def _reset(observations: Sequence[SessionObs], charge: Charge, request_id: str) -> None:
+    """Reset the sessions of these observations, whose episodes begin with them; the charge is that
+    of the client's message.
+    """
     if not observations:
         return
 
@@ -537,7 +541,7 @@ async def _reset(observations: Sequence[SessionObs], request_id: str) -> None:
         session.episode.end()
 
     first = observations[0].session
-    resets = first._sender.message("reset", first._priority)
+    resets = first._sender.message(charge, "reset", first._priority)
     resets.decoded_alike(len(observations))
     replies = await _ask(resets, "reset", observations, openings, request_id)
     answers.timed(resets, lambda: None)
@@ -606,10 +610,9 @@ class HttpDialect(RouteDialect):
             media_type: The media type of the reply.
         """
         name = request_id(http)
-        message = self.arrived()
-        admission = self.gate(counted=True).admission(
-            self.context.limits, priority=self.config.priority
-        )
+        charge = current_charge()
+        message = self.arrived(charge)
+        admission = self.admission(charge)
         try:
             self.context.engine.health.require_ready()
             body = await read_body(http, admission)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import uuid
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -31,6 +31,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
+from vlagents_ray.serve.access.charges import Account, charged
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.asgi_websocket import (
     AsgiWebSocket,
@@ -112,41 +113,58 @@ class AccessMiddleware:
         if scope["type"] == "http":
             note_connection(scope)
 
-        caller: Identity = NoKey.OPEN
         try:
-            if _is_page(scope, self._public):
-                pass
-            elif self._keys is None:
-                # A page that the robot's user opens can reach loopback.
-                require_own_page(headers, self._hosts)
-            else:
-                key = caller = self._keys.check(token_of(headers), self._name)
-                # The wait bounds how often the key's requests are refused.
-                wait_s = key.throttled_s()
-                if wait_s > 0:
-                    await asyncio.sleep(wait_s)
-                    key.require_unthrottled()
-                if scope["type"] == "http":
-                    key.admit()
-                else:
-                    key.hold()
-                key.note("let in by", scope["type"])
+            caller = await self._identify(scope, headers)
+            # A request is charged, and possibly refused, before its body is read.
+            charge = Account(caller).charge() if scope["type"] == "http" else None
+            if charge is not None:
+                charge.require()
         except VLAgentsError as error:
             request_id = valid_request_id(headers.get(REQUEST_ID_HEADER, ""))
             await _refuse(error, request_id, scope, receive, send)
             return
+        if isinstance(caller, Caller):
+            caller.note("let in by", scope["type"])
 
         with on_behalf_of(caller):
-            if scope["type"] == "websocket":
+            if charge is None:
                 try:
                     await self._run_websocket(caller, scope, receive, send)
                 finally:
                     if isinstance(caller, Caller):
                         caller.hold(-1)
-            elif _has_body(scope):
-                await _run_upload(self._app, scope, receive, send, self._slow_s, self._shutdown)
-            else:
-                await self._app(scope, receive, send)
+                return
+
+            with charged(charge):
+                if _has_body(scope):
+                    await _run_upload(self._app, scope, receive, send, self._slow_s, self._shutdown)
+                else:
+                    await self._app(scope, receive, send)
+
+    async def _identify(self, scope: Scope, headers: Mapping[str, str]) -> Identity:
+        """Return the caller of a request or a WebSocket, which counts as a connection of its key.
+
+        Raises:
+            Unauthorized: The key is missing, unknown, revoked or expired.
+            Forbidden: The key is for other applications, or the page is another site's.
+            TooManyRequests: The key is over its rate, or has too many connections.
+        """
+        if _is_page(scope, self._public):
+            return NoKey.OPEN
+        if self._keys is None:
+            # A page that the robot's user opens can reach loopback.
+            require_own_page(headers, self._hosts)
+            return NoKey.OPEN
+
+        caller = self._keys.check(token_of(headers), self._name)
+        # The wait bounds how often the key's requests are refused.
+        wait_s = caller.throttled_s()
+        if wait_s > 0:
+            await asyncio.sleep(wait_s)
+            caller.require_unthrottled()
+        if scope["type"] == "websocket":
+            caller.hold()
+        return caller
 
     async def _run_websocket(
         self, caller: Identity, scope: Scope, receive: Receive, send: Send

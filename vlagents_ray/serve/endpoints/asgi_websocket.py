@@ -27,6 +27,7 @@ from websockets.protocol import State
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.serve.access.api_keys import Caller, Identity
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.endpoints.client_socket import ClientSocket
 from vlagents_ray.serve.endpoints.connection import (
     ANSWERS_S,
@@ -41,7 +42,7 @@ from vlagents_ray.serve.endpoints.websocket_connection import (
     MessageHandler,
     WebSocketConnection,
 )
-from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
+from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.poller import Poller
 
@@ -124,7 +125,7 @@ class TakenConnection(WebSocketConnection):
             idle_s=owner.idle_s,
             pings=True,
         )
-        self.caller = caller
+        self.account.identify(caller)
         self._shutdown = owner.shutdown
         self._on_end = on_end
         self._protocol.state = State.OPEN
@@ -273,15 +274,10 @@ class _AsgiMessages(MessageHandler):
         # Reason and close code with which the connection ends when the application returns.
         self.ending: tuple[str, int] | None = None
 
-    def begin(self) -> MessageAdmission | None:
+    def begin(self) -> Charge | None:
         return None
 
-    def receive(
-        self,
-        message: bytes | str,
-        arrived: float,
-        admission: MessageAdmission | None,
-    ) -> None:
+    def receive(self, message: bytes | str, arrived: float, charge: Charge | None) -> None:
         size = len(message)
         self._connection.add_unanswered(size)
         if self._waiting.add(size):

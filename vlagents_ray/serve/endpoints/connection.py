@@ -30,6 +30,7 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import Budget, MessageLimits
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
+from vlagents_ray.serve.access.charges import Account
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
@@ -97,12 +98,17 @@ class PolledConnection(ABC):
         self._name = owner.name
         self._connection = connection
 
-        self.caller: Identity | None = None  # None until the client has sent its key
+        self.account = Account()  # has no caller until the client has sent its key
         # Guards sending: other threads send answers, or end the connection.
         self._sending = threading.Lock()
         self._ended = False
         self._polled = True  # whether the poller watches the connection
         self._unpolled_for: set[str] = set()  # reasons for not polling the connection
+
+    @property
+    def caller(self) -> Identity | None:
+        """The caller of the connection; None until the client has sent its key."""
+        return self.account.caller
 
     @abstractmethod
     def _read(self) -> None:
@@ -172,10 +178,10 @@ class PolledConnection(ABC):
         """Pause the connection while the client's key is over its rate; return whether it is."""
         if THROTTLED in self._unpolled_for:
             return True
-        if self._ended or not isinstance(self.caller, Caller):
+        if self._ended:
             return False
 
-        wait_s = self.caller.throttled_s()
+        wait_s = self.account.throttled_s()
         if wait_s <= 0:
             return False
         self._pause(THROTTLED)

@@ -31,16 +31,18 @@ from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
+from vlagents_ray.serve.access.charges import current_charge
 from vlagents_ray.serve.endpoints import answers, http_messages
 from vlagents_ray.serve.endpoints.asgi_websocket import SCOPE_KEY as WEBSOCKET
 from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSocket
+from vlagents_ray.serve.endpoints.charged_messages import ChargedMessage, ChargedMessages
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
 
-_POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
+_TRY_AGAIN_LATER = 1013  # WebSocket close code
 _HEALTH_S = 1.5  # `/healthz` replies within this time
 _NO_PATH = "no such path; GET /docs lists what there is"
 
@@ -141,7 +143,8 @@ class _HttpEndpoint:
 
         async def handle(http: HttpRequest) -> Response:
             """Decode the requests of the body, submit them, and reply with the answers."""
-            incoming = IncomingMessage("http", op)
+            charge = current_charge()
+            incoming = IncomingMessage("http", op, charge=charge)
             request_id = http_messages.request_id(http)
             headers = http_messages.headers_of(http.scope)
             try:
@@ -149,9 +152,8 @@ class _HttpEndpoint:
                 sender = Sender(
                     self.engine, "http", session_id, caller=current_caller(), connected=False
                 )
-                admission = sender.admission(
-                    self.limits, priority=headers.get(messages.PRIORITY_HEADER, "robot")
-                )
+                priority = headers.get(messages.PRIORITY_HEADER, "robot")
+                admission = message_admission(self.engine, charge, self.limits, priority=priority)
 
                 decoded = await http_messages.read_requests(
                     op, _timed(http, incoming), admission, request_id
@@ -198,34 +200,34 @@ class _HttpEndpoint:
 
     async def _stream_forwarded(self, socket: WebSocket) -> None:
         """Serve a WebSocket whose messages another process passes on."""
-        sender = Sender(self.engine, "websocket", caller=current_caller())
+        caller = current_caller()
+        sender = Sender(self.engine, "websocket", caller=caller)
         await socket.accept()
         try:
-            while not sender.refused_too_often:
-                await sender.wait_unthrottled()
-                message = await socket.receive()
-                if message["type"] == "websocket.disconnect":
-                    return
-                await socket.send_bytes(await self._answer(sender, message.get("bytes")))
-            await socket.close(_POLICY_VIOLATION, REFUSED)
+            async with ChargedMessages(socket, caller) as arriving:
+                while True:
+                    message = await arriving.next()
+                    if message is None:
+                        return
+                    await socket.send_bytes(await self._answer(sender, message))
         except WebSocketDisconnect:
             return
         finally:
             sender.release()
 
-    async def _answer(self, sender: Sender, frame: bytes | None) -> bytes:
-        """Return the answer to a message of a forwarded WebSocket, a frame or a probe; None is a
-        text message.
-        """
+    async def _answer(self, sender: Sender, message: ChargedMessage) -> bytes:
+        """Return the answer to a message of a forwarded WebSocket, a frame or a probe."""
+        frame, charge = message
+        incoming = sender.message(charge)
+        size = 0 if frame is None else len(frame)
+        admission = message_admission(self.engine, charge, self.limits, size)
         if frame is not None and messages.is_probe(frame):
             try:
-                messages.read_probe(frame, sender.admission(self.limits, len(frame), "simulation"))
+                messages.read_probe(frame, admission)
                 return messages.probe_answer(len(frame))
             except VLAgentsError as error:
                 return encode_replies([messages.Reply(error=error)])
 
-        incoming = sender.message()
-        admission = sender.admission(self.limits, 0 if frame is None else len(frame))
         try:
             admission.begin_message()
             if frame is None:

@@ -40,6 +40,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import PRIORITY_HEADER, REQUEST_ID_HEADER, Budget, Op
 from vlagents_ray.serve.access.api_keys import Caller, Identity
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.connection import (
     INTERNAL_ERROR,
@@ -54,7 +55,7 @@ from vlagents_ray.serve.endpoints.message_connection import (
     MessageConnection,
 )
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
 
 HEAD_BYTES = 16 * 1024  # maximum size of a request's head
@@ -280,6 +281,7 @@ class HttpConnection(MessageConnection):
         self._request_id = ""  # of that request, in the headers of its answer
         self._name = ""  # id of that request in the document of an error
         self._sender: Sender | None = None  # of that request
+        self._charge: Charge | None = None  # of the latest request
 
     # Reading.
 
@@ -363,7 +365,7 @@ class HttpConnection(MessageConnection):
         except MalformedMessage as error:
             status = 400 if head else _HEAD_TOO_LARGE
             self._message_count += 1
-            self._charge_abuse()
+            self.account.charge_abuse()
             self._answer_and_end(http_messages.problem_response(error, "", status))
             return
 
@@ -389,10 +391,11 @@ class HttpConnection(MessageConnection):
         caller, key = self._server.admit_request(head.headers, known)
         if caller is not self.caller:
             self._server.count_connection(self, caller)
-            self.caller, self._key = caller, key
+            self.account.identify(caller)
+            self._key = key
             self._is_rated = isinstance(caller, Caller)
-        if isinstance(caller, Caller):
-            caller.admit()
+        self._charge = self.account.charge()
+        self._charge.require()
 
     def _refuse_access(self, reading: _Reading, error: VLAgentsError) -> None:
         """Refuse a request whose client has no access, or has sent too many requests."""
@@ -536,7 +539,7 @@ class HttpConnection(MessageConnection):
 
         head = self._answering = reading.head
         op = cast(Op, self._server.op_of(head.path))
-        incoming = IncomingMessage("http", op)
+        incoming = IncomingMessage("http", op, charge=self._charge)
         body = parts[0] if len(parts) == 1 else b"".join(parts)
         self.add_unanswered(len(body))
         incoming.size = len(body)
@@ -547,8 +550,8 @@ class HttpConnection(MessageConnection):
 
     def _decode(self, op: Op, head: HttpHead, incoming: IncomingMessage, data: bytes) -> None:
         """Decode the requests of a body, and submit them."""
-        caller = self.caller
-        if caller is None:
+        caller, charge = self.caller, incoming.charge
+        if caller is None or charge is None:
             raise VLAgentsError("internal error: a request without a caller")
         sender = self._sender = Sender(
             self._engine,
@@ -558,7 +561,7 @@ class HttpConnection(MessageConnection):
             connected=False,
         )
         priority = head.headers.get(PRIORITY_HEADER, "robot")
-        admission = sender.admission(self._limits, priority=priority)
+        admission = message_admission(self._engine, charge, self._limits, priority=priority)
         name = self._request_id
 
         is_form = http_messages.content_type_of(head.headers) == http_messages.FORM_TYPE

@@ -211,14 +211,6 @@ class MessageConnection(PolledConnection):
             self._pause(_DISCARDING)
             self._call_later(wait_s, lambda: self._resume(_DISCARDING))
 
-    def _charge_abuse(self) -> None:
-        """Charge a message to the key, as for a message that is refused, before the connection
-        ends.
-        """
-        if isinstance(self.caller, Caller):
-            with contextlib.suppress(VLAgentsError):
-                self.caller.admit()
-
     def count_bytes(self) -> ArrivingBytes | None:
         """Return a count of bytes that wait in this connection, as part of the memory in flight;
         None without a replica.

@@ -9,6 +9,7 @@ from vlagents_ray.errors import MalformedMessage, VLAgentsError
 from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.serve.access.api_keys import Identity
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.connection import (
     LEAST_WAIT_S,
@@ -17,7 +18,7 @@ from vlagents_ray.serve.endpoints.connection import (
 from vlagents_ray.serve.endpoints.websocket_connection import MessageHandler, WebSocketConnection
 from vlagents_ray.serve.engine.admission import MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
 
 
@@ -39,21 +40,13 @@ class RequestStream(MessageHandler):
         self._sender = Sender(engine, "websocket", caller=caller)
         self.most_unanswered_bytes = limits.body_bytes
 
-    @property
-    def refused_too_often(self) -> bool:
-        return self._sender.refused_too_often
+    def begin(self) -> Charge:
+        return self._connection.account.charge()
 
-    def begin(self) -> MessageAdmission:
-        admission = self._sender.admission(self._limits)
-        admission.begin_message()
-        return admission
-
-    def receive(
-        self, message: bytes | str, arrived: float, admission: MessageAdmission | None
-    ) -> None:
-        incoming = self._sender.message()
-        admission = admission or self._sender.admission(self._limits)
-        admission.size = len(message)
+    def receive(self, message: bytes | str, arrived: float, charge: Charge | None) -> None:
+        charge = charge or self._connection.account.charge()
+        incoming = self._sender.message(charge)
+        admission = message_admission(self._engine, charge, self._limits, len(message))
         try:
             admission.begin_message()
             if isinstance(message, str):

@@ -40,6 +40,7 @@ from vlagents_ray.protocol.messages import (
     peer_process,
 )
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.access.charges import REFUSALS, REFUSED
 from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
@@ -59,7 +60,7 @@ from vlagents_ray.serve.endpoints.connection import (
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import REFUSALS, REFUSED, Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
 
 logger = logging.getLogger(__name__)
@@ -163,15 +164,16 @@ class UnixConnection(PolledConnection):
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
         self._sender: Sender | None = None  # None until the client has sent its key
+        self._is_rated = False  # whether the client's key may be over a rate
         self._refused_keys = 0  # number of messages whose key was refused
         self._unanswered = 0  # number of unanswered messages
         self._paused = False  # whether too many messages are unanswered
         if isinstance(server.admit, NoKey):
-            self.caller = server.admit
+            self.account.identify(server.admit)
             self._sender = Sender(server.engine, server.name, caller=server.admit)
 
     def _read(self) -> None:
-        if self._sender is not None and self._sender.rated and self._throttle():
+        if self._is_rated and self._throttle():
             return
 
         message = IncomingMessage(self._name)
@@ -203,13 +205,13 @@ class UnixConnection(PolledConnection):
                 if self._refused_keys >= REFUSALS:
                     self.end(f"its key was refused {REFUSALS} times; connect with another one")
                     self.disconnect()  # its further messages are not read
-            elif self._sender.refused_too_often:
+            elif self.account.refused_too_often:
                 self.end(REFUSED)
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
 
-        if self._sender is not None and self._sender.rated:
+        if self._is_rated:
             self._throttle()
         with self._sending:
             self._paused = self._unanswered >= MOST_UNANSWERED and not self._ended
@@ -224,15 +226,12 @@ class UnixConnection(PolledConnection):
         data: memoryview,
         descriptors: list[int],
     ) -> None:
+        charge = message.charge = self.account.charge()
         # `read` only locates the memory. A client's new memory file is kept even if the message is
         # refused.
-        try:
-            memory, compact_form, text = self._payload.read(data, descriptors)
-        except VLAgentsError:
-            sender.count_message()
-            raise
+        memory, compact_form, text = self._payload.read(data, descriptors)
         if not compact_form:
-            admission = sender.admission(self._limits)
+            admission = message_admission(self._engine, charge, self._limits)
             submit = partial(self._submit, sender, message, admission, waited_s)
             self.decode(
                 partial(decode_requests, memory.data, ops=self._ops),
@@ -242,8 +241,8 @@ class UnixConnection(PolledConnection):
             )
             return
 
-        if sender.rated:
-            sender.count_message()
+        if self._is_rated:
+            charge.require()
         decoded = Decoded(self._reader.read(text, memory), {})
         message.decoded(decoded)
         sender.send(message, decoded, self, waited_s=waited_s)
@@ -287,7 +286,8 @@ class UnixConnection(PolledConnection):
         caller.hold()
         caller.note("let in by", self._name)
 
-        self.caller = caller
+        self.account.identify(caller)
+        self._is_rated = True
         self._sender = Sender(self._engine, self._name, caller=caller)
         return None if is_key else self._sender
 

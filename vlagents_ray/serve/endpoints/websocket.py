@@ -242,7 +242,7 @@ class PortConnection(WebSocketConnection):
             events = self._protocol.events_received()
         if len(events) == 1 and isinstance(events[0], Handshake):
             try:
-                self.caller = self._server.identify(self, events[0])
+                self.account.identify(self._server.identify(self, events[0]))
                 response = self._protocol.accept(events[0])
             except VLAgentsError as refused:
                 response = self._protocol.reject(refused.status, f"{refused}\n")

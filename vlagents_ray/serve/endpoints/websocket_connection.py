@@ -19,17 +19,16 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from vlagents_ray.errors import TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.protocol.websocket_frames import (
-    CONTROL_FRAMES,
-    CONTROL_FRAMES_PER_S,
     HEAD_BYTES,
     ReceiveBuffer,
     frame_head,
     frame_size,
 )
 from vlagents_ray.serve.access.api_keys import Caller
+from vlagents_ray.serve.access.charges import REFUSED, Charge
 from vlagents_ray.serve.endpoints.connection import (
     DECODING,
     POLICY_VIOLATION,
@@ -42,9 +41,7 @@ from vlagents_ray.serve.endpoints.message_connection import (
     READ_BYTES,
     MessageConnection,
 )
-from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
-from vlagents_ray.serve.engine.sender import REFUSED
-from vlagents_ray.serve.token_bucket import TokenBucket
+from vlagents_ray.serve.engine.admission import Admission
 
 logger = logging.getLogger(__name__)
 
@@ -64,22 +61,20 @@ class MessageHandler(ABC):
     most_unanswered_bytes: int  # the same of their bytes
 
     @abstractmethod
-    def begin(self) -> MessageAdmission | None:
-        """Charge a message to the key of which a part has arrived, before the rest is read.
+    def begin(self) -> Charge | None:
+        """Charge a message of which a part has arrived, before the rest is read.
 
         Returns:
-            The admission for `receive`; None if the message is charged when it is complete.
+            The charge for `receive`; None if the message is charged when the application takes it.
         """
 
     @abstractmethod
-    def receive(
-        self, message: bytes | str, arrived: float, admission: MessageAdmission | None
-    ) -> None:
+    def receive(self, message: bytes | str, arrived: float, charge: Charge | None) -> None:
         """Serve a complete message; a text is a `str`.
 
         Args:
             arrived: Time at which its last byte arrived, s, of `time.perf_counter`.
-            admission: The result of `begin`, if the message arrived in parts.
+            charge: The result of `begin`, if the message arrived in parts.
         """
 
     @abstractmethod
@@ -91,11 +86,6 @@ class MessageHandler(ABC):
         """End the connection once all messages that have arrived are answered; no further ones
         will be received.
         """
-
-    @property
-    def refused_too_often(self) -> bool:
-        """Whether so many consecutive messages were refused that the connection has to end."""
-        return False
 
 
 class WebSocketConnection(MessageConnection):
@@ -127,15 +117,14 @@ class WebSocketConnection(MessageConnection):
 
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
-        self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
         self._received = ReceiveBuffer(STREAM_BYTES)
         self._fragments: list[bytes] = []  # frames of a message whose last one has not arrived
         self._fragments_bytes = 0
         self._is_text = False  # whether those are of a text
-        # Received but unprocessed messages, their arrival times, s, and the admissions of those
+        # Received but unprocessed messages, their arrival times, s, and the charges of those
         # received in parts.
-        self._messages: deque[tuple[bytes | str, float, MessageAdmission | None]] = deque()
-        self._partial: MessageAdmission | None = None  # admission of a partly received message
+        self._messages: deque[tuple[bytes | str, float, Charge | None]] = deque()
+        self._partial: Charge | None = None  # charge of a partly received message
         self._is_partial = False  # whether a part of a message has been counted
 
         self._has_ended_sessions = False
@@ -239,7 +228,7 @@ class WebSocketConnection(MessageConnection):
 
         if was_open and self._protocol.state is State.CLOSING and self._protocol.close_rcvd is None:
             self._ended_at = time.monotonic()
-            self._charge_abuse()  # the frame is invalid; bytes after it are discarded
+            self.account.charge_abuse()  # the frame is invalid; bytes after it are discarded
         self._process_messages()
         if (self._received.size or self._fragments) and not self._ended:
             self._count_partial()
@@ -256,10 +245,12 @@ class WebSocketConnection(MessageConnection):
         is_data = frame.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT)
         is_fragment = frame.opcode is Opcode.CONT or not frame.fin
         is_limited = not is_data or (is_fragment and len(frame.data) < _FRAGMENT_BYTES)
-        if is_limited and self._control_frames.take(time.monotonic()) > 0:
-            self._charge_abuse()
-            self.end(f"more than {CONTROL_FRAMES} control frames or small fragments at once")
-            return False
+        if is_limited:
+            try:
+                self.account.charge_control_frame()
+            except MalformedMessage as error:
+                self.end(str(error))
+                return False
         if not is_data:
             return True
 
@@ -280,7 +271,7 @@ class WebSocketConnection(MessageConnection):
             try:
                 message = data.decode()
             except UnicodeDecodeError:
-                self._charge_abuse()
+                self.account.charge_abuse()
                 self.end("a text is not UTF-8", _INVALID_DATA)
                 return False
 
@@ -299,11 +290,14 @@ class WebSocketConnection(MessageConnection):
             return
         try:
             if not self._is_partial:
-                self._partial = handler.begin()
+                charge = handler.begin()
+                if charge is not None:
+                    charge.require()
+                self._partial = charge
                 self._is_partial = True
         except TooManyRequests:  # the rest stays unread until the key is under its rate
             self._throttle()
-            if handler.refused_too_often:
+            if self.account.refused_too_often:
                 self.end(REFUSED)
         except VLAgentsError as error:
             self._end_for(error)
@@ -322,11 +316,11 @@ class WebSocketConnection(MessageConnection):
         while self._messages and not (
             self._ended or self._is_closed_here or self._unpolled_for & {DECODING, THROTTLED}
         ):
-            message, arrived, admission = self._messages.popleft()
+            message, arrived, charge = self._messages.popleft()
             if self._handler is None:  # no frame is read before the handshake is accepted
                 raise VLAgentsError("stream: a message before the handshake was accepted")
-            self._handler.receive(message, arrived, admission)
-            if self._handler.refused_too_often:
+            self._handler.receive(message, arrived, charge)
+            if self.account.refused_too_often:
                 self.end(REFUSED)
             if self._is_rated:
                 self._throttle()
@@ -354,7 +348,7 @@ class WebSocketConnection(MessageConnection):
     def _discard(self) -> None:
         # A connection without a message costs as much as one; so does a message that is not paid.
         if not self._message_count or (self._is_partial and self._partial is None):
-            self._charge_abuse()
+            self.account.charge_abuse()
         self._partial = None
         self._fragments = []
         self._received.discard()

@@ -1,11 +1,11 @@
-"""Admission of messages to a replica before they are decoded: rate limits, memory limits, and the
+"""Admission of messages to a replica before they are decoded: their charge, memory limits, and the
 decoding thread.
 
 A message has a `MessageAdmission` from its arrival until it is answered. Decoders use it as their
 `Budget`, so that these limits apply before anything is decoded:
 
-- The message counts towards the rate limit of the caller's key before any of it is parsed, and each
-  further request in it when its header is parsed (429).
+- The message was charged to the caller's key when it arrived (`vlagents_ray.serve.access.charges`),
+  or it is refused; each further request in it is charged when its header is parsed (429).
 - Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a
   key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved
@@ -26,9 +26,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable
 from vlagents_ray.images import thread_map
 from vlagents_ray.protocol.messages import Budget, MessageLimits, Request
+from vlagents_ray.serve.access.charges import Charge
 
 T = TypeVar("T")
 
@@ -94,7 +95,8 @@ class Admission:
 
         given_up: list[ArrivingBytes] = []
         with self._lock:
-            room = self._room(limit, key)
+            # As `_room` does, with one call less for each act of a robot without a key.
+            room = limit - self.held if key is None else self._room(limit, key)
             while size > room:
                 arriving = self._largest_arriving(size, limit, robot, key)
                 if arriving is None:
@@ -243,15 +245,14 @@ class MessageAdmission(Budget):
 
     __slots__ = (
         "_admission",
-        "_admit",
         "_decoded",
         "_decoding_s",
         "_held",
-        "_index",
         "_inline",
         "_key",
-        "_refusals",
+        "_requests",
         "_robot",
+        "charge",
         "size",
     )
 
@@ -259,51 +260,46 @@ class MessageAdmission(Budget):
         self,
         admission: Admission,
         limits: MessageLimits,
-        admit: Callable[[object], bool] | None,
+        charge: Charge,
         size: int = 0,
         *,
         robot: bool = True,
         inline: bool = True,
         keep_files: bool = False,
-        key: str | None = None,
+        share: str | None = None,
     ) -> None:
         """Create the admission of one message.
 
         Args:
-            admit: Counts a "message", or a further request of an op, for the sender's key, or
-                raises an error; returns False if the request is scheduled after those of robots.
-                None if the sender has no key.
+            charge: The charge of the message to the sender's key.
             size: Bytes of the message itself, which the replica keeps while it works on the
                 message.
-            robot: Whether the message may use the bytes reserved for robots.
+            robot: Whether the message may use the bytes reserved for robots, if the key allows it.
             inline: Whether the first decoding thread also has other work, so that large messages
                 are decoded elsewhere.
             keep_files: Whether `files` keeps the files of the message's images.
-            key: The name of the sender's key; None without one.
+            share: The name under which a sender without a key has a share of the bytes in flight;
+                None for no limit of its own.
         """
         super().__init__(limits)
 
         self.files = {} if keep_files else None
-        self._admission, self._admit = admission, admit
+        self.charge = charge
+        self._admission = admission
         self.size = size  # size of the message, until it is counted
-        self._robot, self._key = robot, key
+        self._robot = robot and charge.is_robot
+        self._key = charge.key or share
         self._held = 0  # bytes counted as in flight
         self._decoded = 0  # decoded bytes among `_held`
         self._decoding_s = 0.0  # estimated time of decoding the images so far, s
-        self._index = -1  # index of the current request
-        self._refusals: list[VLAgentsError | None] = []  # result of `admit` for each request
+        self._requests = 0  # number of requests so far that are charged
         self._inline = inline
 
     def begin_message(self) -> None:
-        """Count the message, as in `Budget`, but only once if it is decoded again on another
-        thread.
+        """Raise the reason why the message is refused, as in `Budget`; it was charged when it
+        arrived.
         """
-        if self._admit is not None:
-            if not self._refusals:
-                self._refusals.append(self._refusal_of(self._admit, "message"))
-            refusal = self._refusals[0]
-            if refusal is not None:
-                raise refusal
+        self.charge.require()
 
     def parse(self, size: int) -> None:
         """Count the memory for JSON, as in `Budget`; raise `NeedsDecodingThread` on a thread
@@ -314,17 +310,15 @@ class MessageAdmission(Budget):
         super().parse(size)
 
     def begin(self, op: object, priority: object = "robot") -> None:
-        """Begin the next request, as in `Budget`; the first request is counted with its message."""
+        """Begin the next request, as in `Budget`, and charge it; the first one was charged with its
+        message.
+        """
         self._refill()
         if priority == "simulation":
             self._robot = False
-        if self._admit is not None:
-            self._index += 1
-            if self._index == len(self._refusals):
-                self._refusals.append(self._refusal_of(self._admit, op))
-            refusal = self._refusals[self._index]
-            if refusal is not None:
-                raise refusal
+        if op != "close":
+            self.charge.cover(self._requests + 1)
+            self._requests += 1
 
         self.serial = not (self._robot or self._inline)
         if self.size:
@@ -378,7 +372,7 @@ class MessageAdmission(Budget):
         self._decoded = 0
         self._decoding_s = 0.0
         self._refill()
-        self._index = -1
+        self._requests = 0  # they are read again, and each is charged once
         self._inline = False
         return self._admission.submit(lambda: read(self), self._robot)
 
@@ -401,14 +395,6 @@ class MessageAdmission(Budget):
 
     def __del__(self) -> None:
         self.release()
-
-    def _refusal_of(self, admit: Callable[[object], bool], op: object) -> VLAgentsError | None:
-        try:
-            if not admit(op):
-                self._robot = False
-        except VLAgentsError as error:
-            return error
-        return None
 
 
 def image_bytes(request: Request) -> int:

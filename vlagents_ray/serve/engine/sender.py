@@ -8,10 +8,11 @@ import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Priority, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
+from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
 from vlagents_ray.serve.requests import IncomingMessage, Origin, PendingRequest, Receiver
 
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
 
 T = TypeVar("T")
-
-# Number of consecutive messages over the rate of the key after which a connection ends.
-REFUSALS = 8
-REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
 class Sender:
@@ -33,10 +30,8 @@ class Sender:
     If the server has API keys, a caller cannot reach sessions of other keys: the key's name is part
     of the session ids in the engine.
 
-    Each message is charged to the key before it is parsed, and each further request in it before it
-    is submitted. The charge for HTTP is made by the guard on arrival, then by the `admission`; for
-    frames, by the `admission` alone; for the compact form of shared memory, by `count_message`,
-    then by `send`; for batches of a dialect, by the `admission` of its gate, then by `count`.
+    Each message has the `Charge` that was made when it arrived, which the sender completes: it
+    charges the requests that were not charged while they were decoded.
     """
 
     def __init__(
@@ -47,7 +42,6 @@ class Sender:
         *,
         caller: Identity,
         connected: bool = True,
-        counted: bool | None = None,
     ) -> None:
         """Create a sender.
 
@@ -56,9 +50,6 @@ class Sender:
             caller: The authenticated caller, or the reason why none is needed. It has no default,
                 so that an endpoint without authentication fails.
             connected: Whether the sender has a connection, whose end also ends its sessions.
-            counted: Whether the first request of each message was charged to the key on arrival, as
-                it is by default for senders without a connection. Further requests of messages
-                without an admission are charged by `count`.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
@@ -70,14 +61,9 @@ class Sender:
 
         self._engine = engine
         self._session_id = session_id or uuid.uuid4().hex
-        self._counted = not connected if counted is None else counted
         # Whether the client has to reconnect, so that its sessions move.
         self._asked_to_reconnect = False
         self._caller = caller if isinstance(caller, Caller) else None
-        self.rated = self._caller is not None  # whether its key may be over a rate
-        # Whether a message without an admission, and with it its first request, was counted.
-        self._paid = False
-        self._refused = 0  # number of consecutive refused messages
 
         # Prefix of the sender's session ids.
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""
@@ -88,79 +74,11 @@ class Sender:
             transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock()
         )
 
-    def message(self, op: str = "unknown", priority: str = "robot") -> IncomingMessage:
+    def message(
+        self, charge: Charge, op: str = "unknown", priority: str = "robot"
+    ) -> IncomingMessage:
         """Return a message that has just arrived from the sender, see `IncomingMessage`."""
-        return IncomingMessage(self._origin.transport, op, priority)
-
-    def admission(
-        self, limits: MessageLimits, size: int = 0, priority: str = "robot"
-    ) -> MessageAdmission:
-        """Return the admission of a message of `size` bytes, which charges its requests to the
-        key; see `counted`.
-        """
-        robot, caller, counted = priority != "simulation", self._caller, self._counted
-        keep = self._engine.observers.any
-        if caller is None:
-            return MessageAdmission(
-                self._engine.admission, limits, None, size, robot=robot, keep_files=keep
-            )
-
-        def admit(op: object) -> bool:
-            """Charge a message or a request to the key; see `MessageAdmission`."""
-            nonlocal counted
-            is_free, counted = counted, False
-            if op == "message" and not is_free:
-                return self._count_message(caller)
-            return self._count(caller, op, is_free)
-
-        return MessageAdmission(
-            self._engine.admission,
-            limits,
-            admit,
-            size,
-            robot=robot,
-            keep_files=keep,
-            key=caller.name,
-        )
-
-    def count(self, requests: int) -> None:
-        """Charge requests to the key before they are sent; raise `TooManyRequests` over its
-        rate.
-        """
-        if self._caller is not None:
-            for _ in range(requests):
-                self._count(self._caller, "act", counted=False)
-
-    def count_message(self) -> None:
-        """Charge a message without an admission to the key before it is parsed; raise
-        `TooManyRequests`.
-        """
-        if self._caller is not None:
-            self._paid = False
-            self._count_message(self._caller)
-            self._paid = True
-
-    def throttled_s(self) -> float:
-        """Return for how long the server must not read from the sender, s; 0 if the key is within
-        its rate.
-
-        The pause slows down senders of a key whose messages are refused in any case.
-        """
-        return 0.0 if self._caller is None else self._caller.throttled_s()
-
-    async def wait_unthrottled(self) -> None:
-        """Wait until the server may read from the sender."""
-        wait_s = self.throttled_s()
-        while wait_s > 0:
-            await asyncio.sleep(wait_s)
-            wait_s = self.throttled_s()
-
-    @property
-    def refused_too_often(self) -> bool:
-        """Return whether so many consecutive messages were refused that the connection has to
-        end.
-        """
-        return self._refused >= REFUSALS
+        return IncomingMessage(self._origin.transport, op, priority, charge)
 
     def send(
         self,
@@ -175,13 +93,21 @@ class Sender:
 
         Args:
             receiver: Takes the message with all its replies, on the thread of the last one.
-            admission: Admission of the message, which has already charged the requests to the key.
+            admission: Admission of the message, if it was decoded with one.
             waited_s: Time that the message waited before it was read, s, which counts towards the
                 deadlines.
+
+        Raises:
+            TypeError: The message has no charge, or another key is charged for it.
         """
+        charge = message.charge
+        if charge is None or not (charge.caller is self._caller or charge.caller == self._caller):
+            raise TypeError(
+                "message: expected one that is charged to its sender's key, by Account.charge, got "
+                f"one charged to {None if charge is None else charge.key!r}"
+            )
         engine, (requests, refused) = self._engine, decoded
         now = engine.clock()
-        is_observed = engine.observers.any
         sent: list[PendingRequest] = []
 
         size = REQUEST_BYTES * len(requests)
@@ -190,9 +116,7 @@ class Sender:
             if admission is not None:
                 admission.grow(size)
             elif requests:
-                is_robot = requests[0].priority == "robot" and (
-                    self._caller is None or self._caller.priority != "simulation"
-                )
+                is_robot = requests[0].priority == "robot" and charge.is_robot
                 engine.admission.hold(size, is_robot, 0)
                 # The bytes are also released if the requests are dropped without an answer, as
                 # those of an ended connection.
@@ -202,8 +126,6 @@ class Sender:
             overloaded = error
 
         message.admission = admission
-        if is_observed:
-            message.observed = sent
         message.expect(len(requests) + len(refused), receiver, self)
 
         index = 0
@@ -224,7 +146,8 @@ class Sender:
             sent.append(pending)
             index += 1
 
-        if is_observed:
+        if engine.observers.any:
+            message.observed = sent
             for pending in sent:
                 pending.files, pending.observer_data = (admission and admission.files) or {}, {}
                 engine.observers.on_request(pending)
@@ -235,34 +158,36 @@ class Sender:
         elif self._caller is None:
             engine.intake.submit(sent)
         else:
-            engine.intake.submit(
-                self._admitted(self._caller, sent, admission is not None or self._counted)
-            )
+            engine.intake.submit(self._charged(self._caller, charge, sent))
 
         for index, reply in refused.items():
             message.answer(index, reply)
         return sent
 
-    def _admitted(
-        self, caller: Caller, requests: list[PendingRequest], counted: bool
+    def _charged(
+        self, caller: Caller, charge: Charge, requests: list[PendingRequest]
     ) -> list[PendingRequest]:
         """Return the requests that the caller's key allows, with its priority; finish the others
         with their errors.
-
-        The guard of the HTTP server has already counted the first request of a message.
         """
-        allowed = []
+        allowed: list[PendingRequest] = []
+        charged = 0  # number of requests that are not free
         for pending in requests:
             request = pending.request
+            is_free = request.op == "close"
             try:
-                if not self._count(caller, request.op, counted or self._paid):
-                    pending.priority = Priority.SIMULATION
+                # The key may have been revoked while the message arrived or was decoded.
+                charge.require_valid()
+                if not is_free:
+                    charge.cover(charged + 1)
+                    charged += 1
             except VLAgentsError as error:
                 pending.fail(error)
                 continue
+            if not charge.is_robot:
+                pending.priority = Priority.SIMULATION
             if request.op == "reset":
                 caller.note("reset session", repr(request.session or self._session_id))
-            self._paid = False
             allowed.append(pending)
         return allowed
 
@@ -352,21 +277,24 @@ class Sender:
             # The sessions are copied, since a migrator's thread may add one.
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
 
-    def _count(self, caller: Caller, op: object, counted: bool) -> bool:
-        """Charge a request to the key unless it is `counted` or a close; return False if the key
-        is for simulations.
-        """
-        caller.admit(free=counted or op == "close")
-        return caller.priority != "simulation"
 
-    def _count_message(self, caller: Caller) -> bool:
-        try:
-            caller.admit()
-        except TooManyRequests:
-            self._refused += 1
-            raise
-        self._refused = 0
-        return caller.priority != "simulation"
+def message_admission(
+    engine: Engine, charge: Charge, limits: MessageLimits, size: int = 0, priority: str = "robot"
+) -> MessageAdmission:
+    """Return the admission of a message of `size` bytes that has arrived at `engine`.
+
+    Args:
+        charge: The charge of the message.
+        priority: The highest priority of its requests.
+    """
+    return MessageAdmission(
+        engine.admission,
+        limits,
+        charge,
+        size,
+        robot=priority != "simulation",
+        keep_files=engine.observers.any,
+    )
 
 
 class WaitingTask:

@@ -31,6 +31,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.ray_tools.private import gpus_here, http_options, replica_is_ending
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
+from vlagents_ray.serve.access.charges import free
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import answers
@@ -44,7 +45,7 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.shutdown import Shutdown
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -437,9 +438,10 @@ def hide_gpus(assigned: Sequence[str]) -> None:
 async def answer_frame(engine: Engine, limits: MessageLimits, session_id: str, frame: Any) -> bytes:
     """Execute a frame of requests from inside the cluster, and return the frame of the replies."""
     sender = Sender(engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
-    message, decoded = sender.message(), Decoded([], {})
+    charge = free(NoKey.INSIDE)
+    message, decoded = sender.message(charge), Decoded([], {})
     try:
-        admission = sender.admission(limits)  # the frame is in plasma
+        admission = message_admission(engine, charge, limits)  # the frame is in plasma
         decoded = await admission.decoded(partial(decode_requests, memoryview(frame)))
         message.decoded(decoded)
         await sender.ask(message, decoded, admission)

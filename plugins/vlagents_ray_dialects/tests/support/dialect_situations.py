@@ -12,7 +12,9 @@ from typing import Any
 from endpoint_situations import (
     NO_FRAME,
     NO_HTTP,
+    PING,
     WRONG_KEY,
+    Cost,
     Endpoint,
     finishes,
     handshake,
@@ -76,7 +78,9 @@ def _websocket(
     *,
     metadata: Sequence[bytes] = (),
     reset: list[Steps],
+    reset_requests: int = 1,
     acts: Sequence[bytes],
+    several: bytes | None = None,
     wrong: bytes,
     greets: bool = False,
 ) -> Endpoint:
@@ -85,7 +89,9 @@ def _websocket(
     Args:
         metadata: The messages that ask for it, if the server does not send it unasked.
         reset: The steps of a client that is connected.
+        reset_requests: What these steps cost.
         acts: Two messages.
+        several: A message with two observations, if there is one.
         wrong: A message whose picture has a wrong shape.
         greets: Whether the server sends the first message, and ends the connection after an error.
     """
@@ -123,8 +129,23 @@ def _websocket(
         ],
         "stop of the server": [connect(), says(acts[0]), server("stops"), gets(), finishes()],
     }
+
+    def costs_with(requests: int, *steps: Steps) -> Cost:
+        return Cost(requests, [connect("a", KEY), *steps])
+
+    several_cost: Cost | str = "a message has one observation"
+    if several is not None:
+        several_cost = costs_with(2, says(several))
+    costs: dict[str, Cost | str] = {
+        "reset": costs_with(reset_requests, reset),
+        "act": costs_with(2, says(*acts)),  # with the reset that the server adds
+        "close": _SESSION_IS_CONNECTION,
+        "several requests": several_cost,
+        "malformed message": costs_with(1, says(RUBBISH)),
+        "control frame": costs_with(0, asks((PING,))),
+    }
     dialects = {"dialects": {name: settings}}
-    return Endpoint(name, path + EACH_BYTE, situations, NOT_APPLICABLE[name], dialects)
+    return Endpoint(name, path + EACH_BYTE, situations, NOT_APPLICABLE[name], dialects, costs)
 
 
 def _openpi() -> Endpoint:
@@ -140,6 +161,7 @@ def _openpi() -> Endpoint:
         settings,
         reset=reset,
         acts=[openpi.encode(LIBERO), openpi.encode(LIBERO | {"prompt": "place it"})],
+        several=openpi.encode({"batch": [LIBERO, LIBERO]}),
         wrong=openpi.encode(LIBERO | {"observation/image": PIXELS[0]}),
         greets=True,
     )
@@ -183,6 +205,7 @@ def _vla_eval() -> Endpoint:
         {"observation_params": {"send_state": True}},
         metadata=[message("hello", 0, protocol_version=1), message("hello", 1, protocol_version=9)],
         reset=reset,
+        reset_requests=2,
         acts=[observation(3), observation(4)],
         wrong=observation(3, PIXELS[0]),
     )
@@ -224,8 +247,21 @@ def _openvla() -> Endpoint:
         ],
         "stop of the server": [asks(post()), server("stops"), asks(post()), finishes()],
     }
+
+    def costs_with(requests: int, *posts: tuple[bytes]) -> Cost:
+        return Cost(requests, asks(*posts))
+
+    key = {"authorization": f"Bearer {KEY}"}
+    costs: dict[str, Cost | str] = {
+        "reset": NOT_APPLICABLE["openvla"]["reset"],
+        "act": costs_with(3, post(**key), post(session="s-1", **key), post(session="s-1", **key)),
+        "close": "the protocol has none: a session ends when it is idle",
+        "several requests": "a message has one observation",
+        "malformed message": costs_with(1, post(b"garbage", **key)),
+        "control frame": "HTTP/1.1 has none",
+    }
     dialects = {"dialects": {"openvla": {}}}
-    return Endpoint("openvla", "http", situations, NOT_APPLICABLE["openvla"], dialects)
+    return Endpoint("openvla", "http", situations, NOT_APPLICABLE["openvla"], dialects, costs)
 
 
 # Dialects with a port of their own.
@@ -236,6 +272,8 @@ _READY = (
     b"\x0bSocket-Type\0\0\0\x03REQ"
     b"\x08Identity\0\0\0\0"
 )  # fmt: skip
+# The command PING, which is answered: the time to live is 0, and the context is "hi".
+_PING = b"\x04\x09\x04PING\0\0hi"
 
 
 def _zmtp_message(payload: bytes) -> bytes:
@@ -246,9 +284,9 @@ def _zmtp_message(payload: bytes) -> bytes:
 
 
 def _gr00t() -> Endpoint:
-    def observed(picture: Any = PIXELS) -> dict[str, Any]:
+    def observed(picture: Any = PIXELS, robots: int = 1) -> dict[str, Any]:
         robot = {"video": {"ego": picture}, "state": {"arm": JOINTS}, "language": {"task": "pick"}}
-        return gr00t.batch([robot], "task")
+        return gr00t.batch([robot] * robots, "task")
 
     def get_action(picture: Any = PIXELS, key: str | None = None) -> bytes:
         data = {"observation": observed(picture), "options": None}
@@ -294,8 +332,24 @@ def _gr00t() -> Endpoint:
         ],
         "stop of the server": [connect(), says(get_action()), server("stops"), finishes()],
     }
+
+    def costs_with(requests: int, *payloads: bytes) -> Cost:
+        return Cost(requests, [connect(), says(*payloads)])
+
+    both = {"observation": observed(robots=2), "options": None}
+    two_robots = gr00t.write("get_action", both, KEY)
+    ping_with_key = gr00t.write("ping", None, KEY)
+    costs: dict[str, Cost | str] = {
+        "reset": costs_with(1, gr00t.write("reset", {"options": None}, KEY)),
+        "act": costs_with(2, get_action(key=KEY), get_action(key=KEY)),
+        "close": _SESSION_IS_CONNECTION,
+        "several requests": costs_with(2, two_robots),
+        "malformed message": costs_with(1, gr00t.write("jump", None, KEY)),
+        "control frame": Cost(1, [connect(), says(ping_with_key), asks((_PING,))]),
+    }
     dialects = {"dialects": {"gr00t": {}}}
-    return Endpoint("gr00t", "gr00t" + EACH_BYTE, situations, NOT_APPLICABLE["gr00t"], dialects)
+    line = "gr00t" + EACH_BYTE
+    return Endpoint("gr00t", line, situations, NOT_APPLICABLE["gr00t"], dialects, costs)
 
 
 def _vlagents() -> Endpoint:
