@@ -6,11 +6,13 @@ could keep its client waiting forever.
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import io
 import math
 import socket
 import time
+from collections.abc import Iterator
 from typing import IO, Any, cast
 
 from vlagents_ray.protocol.frame_layout import Buffer
@@ -24,6 +26,7 @@ class DeadlineSocket:
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
         self._deadline = math.inf  # time.monotonic()
+        self._pieces: list[Buffer] | None = None  # of a request, until it is sent at once
 
     @classmethod
     def install(cls, connection: http.client.HTTPConnection) -> DeadlineSocket:
@@ -47,11 +50,29 @@ class DeadlineSocket:
             raise TimeoutError("timed out")
         self._socket.settimeout(None if math.isinf(left_s) else left_s)
 
+    @contextlib.contextmanager
+    def sending_at_once(self) -> Iterator[None]:
+        """Send the data of all calls of `sendall` within the context together, at its end.
+
+        `http.client` sends the head of a request and its body one after the other, which would
+        wake up the server twice.
+        """
+        pieces: list[Buffer] = []
+        self._pieces = pieces
+        try:
+            yield
+        finally:
+            self._pieces = None
+        self.sendall(b"".join(pieces))
+
     def sendall(self, data: Buffer) -> None:
         """Send all of the data within the time limit of the exchange.
 
         A TLS socket's `sendall` would apply the limit to each record.
         """
+        if self._pieces is not None:
+            self._pieces.append(data)
+            return
         remaining = memoryview(data).cast("B")
         while remaining:
             self.apply_deadline()

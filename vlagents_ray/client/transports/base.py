@@ -33,7 +33,7 @@ FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is
 def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
     """Return the error for a request without an answer, with likely causes."""
     return DeadlineExceeded(
-        f"{address}: no answer within {timeout_s:g} s; the policy may need longer (raise "
+        f"{address}: no answer within {round(timeout_s, 3):g} s; the policy may need longer (raise "
         "timeout_s) or hang in a call (the server's log then names the line)"
     )
 

@@ -253,9 +253,9 @@ class _Link:
         connection, deadline_socket = self.open(timeout_s)
         deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
         try:
-            connection.request(
-                method, self.url.path.rstrip("/") + path, body, headers | self._credentials.headers
-            )
+            target = self.url.path.rstrip("/") + path
+            with deadline_socket.sending_at_once():
+                connection.request(method, target, body, headers | self._credentials.headers)
             self._await_answer(connection.sock, begun + timeout_s)
             answer = connection.getresponse()
 

@@ -224,11 +224,10 @@ class PolledConnection(ABC):
                 raise NeedsDecodingThread
             decoded = read(admission)
         except NeedsDecodingThread:
-            self._pause(DECODING)
             then = partial(self._decoded, submit, refuse)
-            admission.decode_on_thread(read).add_done_callback(
-                lambda done: self._call_soon(partial(then, done.result))
-            )
+            decoding = admission.decode_on_thread(read)
+            self._pause(DECODING)
+            decoding.add_done_callback(lambda done: self._call_soon(partial(then, done.result)))
         else:
             submit(decoded)
 
