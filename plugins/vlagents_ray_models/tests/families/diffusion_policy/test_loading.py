@@ -37,7 +37,7 @@ def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
             r"expected .* \['image'\], got \['image', 'top'\]",
         ),
         ({"cameras": {}}, r"expected .* \['image'\], got \[\]"),
-        ({"device": "nowhere"}, "not here"),
+        ({"device": "nowhere"}, "device 'nowhere': not available"),
         ({"dtype": "bfloat16"}, "dtype"),
         ({"checkpoint_step": 3}, "checkpoint_step"),
     ],
