@@ -16,7 +16,7 @@ import typer
 from pydantic import BaseModel
 
 from benchmarks.console import Out, save
-from vlagents_ray import RemoteAgent
+from vlagents_ray import RemoteAgent, TrainableAgent
 from vlagents_ray.cli.console import out
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
@@ -36,7 +36,7 @@ class TrainedConfig(BaseModel, extra="forbid"):
     base_ms: float
 
 
-class Trained(Agent):
+class Trained(TrainableAgent):
     """Returns zeros after `base_ms` a batch, and has parameters that a learner may replace."""
 
     Config = TrainedConfig

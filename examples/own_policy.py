@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, Contract
+from vlagents_ray import Act, ActionSpec, CameraSpec, Contract, TrainableAgent
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
@@ -48,7 +48,7 @@ def offset(picture):
     return (mark - hook) / picture.shape[1]
 
 
-class Servo(Agent):
+class Servo(TrainableAgent):
     """Moves the hook along the offset in the picture, rotated by the mounting angle of the
     camera.
     """

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         VLAgentsError,
     )
     from vlagents_ray.images.codecs import ImageCodec
-    from vlagents_ray.interface import Act, Agent, Obs
+    from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
     from vlagents_ray.ray_tools.session import LocalServer, join
 
 __all__ = [
@@ -54,6 +54,7 @@ __all__ = [
     "RemoteAgent",
     "StateSpec",
     "TooManyRequests",
+    "TrainableAgent",
     "Unauthorized",
     "UnknownSession",
     "VLAgentsError",

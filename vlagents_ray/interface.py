@@ -18,7 +18,7 @@ Each session has its own copy of the initialized agent, and all copies share the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -101,7 +101,7 @@ class Obs:
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
     # The values are None, bool, int, float, str, bytes, arrays, or lists and dicts of these.
     info: dict[str, Any] = field(default_factory=dict)
-    # The server's result of `Agent.prepare`, or None.
+    # The server's result of `Prepares.prepare` (`vlagents_ray.abilities`), or None.
     prepared: Any = field(default=None, repr=False, compare=False)
 
 
@@ -124,7 +124,8 @@ class Agent:
     """The interface of a policy, which local policies, `RemoteAgent` and `ChunkPlayer` implement.
 
     A subclass defines `act`, or `act_batch` if one forward pass can serve several sessions.
-    Everything else has a default.
+    Everything else has a default. An agent that can do more, such as prepare observations or load
+    new weights, defines the methods of a protocol in `vlagents_ray.abilities`.
     """
 
     Config: ClassVar[type | None] = None
@@ -135,42 +136,6 @@ class Agent:
     shared: ClassVar[tuple[str, ...]] = ()
     """Names of the attributes that all sessions of a replica share (weights, processors,
     clients).
-    """
-
-    trainable: ClassVar[str | None] = None
-    """Optional: the name of the attribute that a learner trains, so that new weights can be pushed
-    into a server.
-
-    It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all
-    sessions. "a.b" is the attribute b of the attribute a, which is then shared as a whole.
-    """
-
-    weights_id: dict[str, Any] | None = None
-    """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`,
-    and more for metadata.
-
-    A server reports them, and an evaluation separates results of different digests. If this is
-    None, the digest is that of the files that `initialize` found by
-    `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
-    """
-
-    statistics: dict[str, Any] | None = None
-    """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min":
-    …, "max": …}, …}.
-
-    They are in the robot's units; None stands for a number that is not known. "parts" names the
-    parts of the state in their order. A server's metadata have them among the `weights`, and
-    `vlagents-ray robot` compares them with the robot before its first motion.
-    """
-
-    check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None
-    """Optional: a check that every action from `act` has passed, given the action and the
-    previous one, (D,) each.
-    """
-
-    control: Any = None
-    """Optional: the `vlagents_ray.chunking.control.RobotControl` of the robot, which `act` reads at
-    each tick.
     """
 
     @classmethod
@@ -199,50 +164,7 @@ class Agent:
         """Return the objects that `shared` names; an agent that wraps another one adds that
         agent's objects.
         """
-        names = list(self.shared)
-        if self.trainable is not None:
-            names.append(self.trainable.partition(".")[0])
-        return [getattr(self, name, None) for name in dict.fromkeys(names)]
-
-    def parameters(self) -> dict[str, Any]:
-        """Return references to the values that a learner trains, by name.
-
-        Names of a torch module are those of its `state_dict`; those of nested dicts are their keys,
-        joined with "/".
-
-        Raises:
-            NotTrainable: The agent has none, i.e. `trainable` is None.
-        """
-        return named_values(self._trainable())
-
-    def load_parameters(self, values: Mapping[str, Any]) -> None:
-        """Act with these values from now on; a server calls this between two batches.
-
-        The default replaces the values in `trainable` by reference, and copies those on a GPU to
-        the addresses of the old ones, so that CUDA graphs stay valid. An agent that derives other
-        values from its parameters overrides this, computes them again, and calls the default.
-
-        Args:
-            values: A value for each name of `parameters`, of the same shape, type and device. They
-                have been checked, and do not change later; the agent must not change them either.
-
-        Raises:
-            NotTrainable: The agent has none, i.e. `trainable` is None.
-        """
-        set_values(self._trainable(), values)
-
-    def _trainable(self) -> Any:
-        if self.trainable is None:
-            raise NotTrainable(
-                f"{type(self).__name__}: names no parameters to train; set `trainable` to the name "
-                "of the attribute with its torch module or its dicts of arrays"
-            )
-        try:
-            return attrgetter(self.trainable)(self)
-        except AttributeError as error:
-            raise NotTrainable(
-                f"trainable: {error}; call initialize() first, or correct the name"
-            ) from error
+        return [getattr(self, name, None) for name in dict.fromkeys(self.shared)]
 
     @property
     def contract(self) -> Contract | None:
@@ -250,13 +172,6 @@ class Agent:
         nothing.
         """
         return None
-
-    @property
-    def continues_plans(self) -> bool:
-        """Whether a chunk continues the plan in `Obs.info` (`LEFTOVER`); if not, the plan is
-        ignored.
-        """
-        return False
 
     def initialize(self) -> None:
         """Load the weights and everything else that takes long; called once in a replica, before
@@ -280,37 +195,6 @@ class Agent:
             empty.
         """
         return {}
-
-    def observe(self, obs: Obs) -> None:
-        """Add an observation to the history without computing an action.
-
-        Policies with a history override this. When a session is resumed on another replica, it is
-        `reset` with its first observation, and this is then called with the last observations on
-        which it had acted.
-
-        Args:
-            obs: The observation.
-        """
-
-    def prepare(self, obs: Obs) -> Any:
-        """Compute values that depend only on one observation and the instruction, such as resized
-        images and tokens.
-
-        A server may call this on a session's copy while other sessions, or an earlier request of
-        this one, are acted on, on several threads at once, and sets `obs.prepared` to the result
-        before `act`. The call is optional: `act` computes the same if `obs.prepared` is None. An
-        error fails the request of that observation. Override this if it takes a noticeable part of
-        the time of `act`.
-
-        Args:
-            obs: The observation to act on next; it must not be changed.
-
-        Returns:
-            Any object that does not share memory with the observation. The agent and its shared
-            objects must not be changed (for instance the padding of a tokenizer); read only values
-            that `initialize` and `reset` have set and that new weights do not change.
-        """
-        return None
 
     def act(self, obs: Obs) -> Act:
         """Compute an action, or a chunk of actions.
@@ -359,31 +243,6 @@ class Agent:
                 acts.append(error)
         return acts
 
-    def interrupt(self) -> None:
-        """Drop the planned actions: the robot was stopped or moved, and did not execute the last
-        action of `act`.
-        """
-
-    def sleep(self) -> None:
-        """Free the memory of an accelerator that is not that of `parameters`, such as of CUDA
-        graphs, until `wake`.
-
-        A server calls this when a learner needs the memory, and moves the parameters to the host
-        itself.
-        """
-
-    def wake(self) -> None:
-        """Make what `sleep` freed; torch tensors of `parameters` are the same objects at other
-        addresses.
-        """
-
-    def check_health(self) -> None:
-        """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
-
-        A server calls this every few seconds, also while a batch runs, and replaces the replica if
-        it raises.
-        """
-
     def close(self) -> None:
         """Free the resources that `initialize` acquired; a server calls this once, when the
         replica stops.
@@ -394,6 +253,69 @@ class Agent:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+class TrainableAgent(Agent):
+    """An agent whose weights a learner trains, so that new ones can be pushed into a server.
+
+    A subclass names the attribute with the weights; see `vlagents_ray.abilities.Trainable`.
+    """
+
+    trainable: ClassVar[str | None] = None
+    """The name of the attribute that a learner trains.
+
+    It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all
+    sessions. "a.b" is the attribute b of the attribute a, which is then shared as a whole.
+    """
+
+    def shared_objects(self) -> list[Any]:
+        """Return the objects that `shared` and `trainable` name."""
+        objects = super().shared_objects()
+        if self.trainable is not None:
+            name = self.trainable.partition(".")[0]
+            if name not in self.shared:
+                objects.append(getattr(self, name, None))
+        return objects
+
+    def parameters(self) -> dict[str, Any]:
+        """Return references to the values that a learner trains, by name.
+
+        Names of a torch module are those of its `state_dict`; those of nested dicts are their keys,
+        joined with "/".
+
+        Raises:
+            NotTrainable: The agent has none, i.e. `trainable` is None.
+        """
+        return named_values(self._trainable())
+
+    def load_parameters(self, values: Mapping[str, Any]) -> None:
+        """Act with these values from now on; a server calls this between two batches.
+
+        It replaces the values in `trainable` by reference, and copies those on a GPU to the
+        addresses of the old ones, so that CUDA graphs stay valid. An agent that derives other
+        values from its parameters overrides this, computes them again, and calls this method.
+
+        Args:
+            values: A value for each name of `parameters`, of the same shape, type and device. They
+                have been checked, and do not change later; the agent must not change them either.
+
+        Raises:
+            NotTrainable: The agent has none, i.e. `trainable` is None.
+        """
+        set_values(self._trainable(), values)
+
+    def _trainable(self) -> Any:
+        if self.trainable is None:
+            raise NotTrainable(
+                f"{type(self).__name__}: names no parameters to train; set `trainable` to the name "
+                "of the attribute with its torch module or its dicts of arrays"
+            )
+        try:
+            return attrgetter(self.trainable)(self)
+        except AttributeError as error:
+            raise NotTrainable(
+                f"trainable: {error}; call initialize() first, or correct the name"
+            ) from error
 
 
 def copied(obs: Obs) -> Obs:

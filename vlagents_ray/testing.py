@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.abilities import Prepares, ability
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, kind_of
 from vlagents_ray.errors import InvalidAction, InvalidObservation, VLAgentsError
@@ -236,7 +237,7 @@ def check_agent(
             )
 
     # Prepared observations, also from several threads.
-    if type(agent).prepare is not Agent.prepare:
+    if ability(agent, Prepares) is not None:
         because = "`prepare` must compute what `act` computes without it"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
             for step in range(steps):
@@ -362,8 +363,14 @@ class _AgentSuite:
 
     def prepare(self, i: int, session: Agent) -> Any:
         """Return what session `i` prepares of its observation."""
+        prepares = ability(session, Prepares)
+        if prepares is None:
+            raise ContractViolation(
+                f"prepare: expected it in the copy of session {i}, as in the agent; define it in "
+                "the class"
+            )
         with self._calling("prepare", i):
-            return session.prepare(self._views[i])
+            return prepares.prepare(self._views[i])
 
     def act_batch(self, sessions: list[Agent]) -> list[Act]:
         """Act once in the first sessions, in one batch."""

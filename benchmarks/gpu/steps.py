@@ -306,7 +306,8 @@ def pushes(lab: Lab) -> None:
 
     torch = require("torch")
     with lab.engine() as engine:
-        live = engine.models.own_weights._agent.parameters()
+        agent: Any = engine.models.own_weights._trainable
+        live = agent.parameters()
         first = {name: own_copy(value) for name, value in live.items()}
         model_mib = sum(value.nbytes for value in first.values()) / 2**20
         robots = [Session(engine, seed, weights="follow") for seed in range(lab.size(8, 2))]
@@ -614,7 +615,7 @@ def destruction(lab: Lab) -> None:
     """
     torch, largest = require("torch"), lab.size(16, 2)
     with lab.engine(compile=False, batch_sizes=None, max_rows=largest) as engine:
-        agent: Any = engine.models.own_weights._agent
+        agent: Any = engine.models.own_weights._trainable
         robots = [Session(engine, seed) for seed in range(largest)]
         run, hogs = agent.predict, []
 

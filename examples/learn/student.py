@@ -17,7 +17,7 @@ from torch import nn
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState
-from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
+from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs, TrainableAgent
 
 ACTION = 4  # numbers of an action: x, y, z, gripper
 STATE = 4  # of the robot's own state: x, y, z, gripper
@@ -100,7 +100,7 @@ def seeded(make: Callable[[], nn.Module], seed: int) -> Any:
         return make()
 
 
-class Student(Agent):
+class Student(TrainableAgent):
     """Acts by the mean of a normal distribution, or draws from it if a log-probability is
     requested.
     """

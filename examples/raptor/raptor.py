@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
+from vlagents_ray import Act, ActionSpec, Contract, StateSpec, TrainableAgent
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.registry import require
 
@@ -23,7 +23,7 @@ INPUTS = {  # in the order of the network's 22 inputs
 }
 
 
-class Raptor(Agent):
+class Raptor(TrainableAgent):
     """A gated recurrent unit (GRU) between dense layers; an action sets the motors clockwise
     from front right.
     """

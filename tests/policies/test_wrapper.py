@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from vlagents_ray import Act, Agent, Obs
+from vlagents_ray import Act, Agent, Obs, TrainableAgent
+from vlagents_ray.abilities import (
+    ChecksHealth,
+    HasStatistics,
+    HasWeightsId,
+    Observes,
+    ability,
+)
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -18,7 +25,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     UnknownPolicy,
 )
-from vlagents_ray.policies.wrapper import Wrapper, build_agent
+from vlagents_ray.policies.wrapper import Wrapper, build_agent, require_trainable
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
@@ -95,7 +102,9 @@ def test_each_call_shows_the_policy_the_changed_observation() -> None:
     agent.initialize()
     session = AgentCopies(agent).make()
     assert session.reset(seen(100), None) == {"first": 89}
-    session.observe(seen(100))
+    observes = ability(session, Observes)
+    assert observes is not None
+    observes.observe(seen(100))
     assert session.act(seen(100)).action.tolist() == [87, 2]
 
 
@@ -150,23 +159,31 @@ def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> 
         def check_health(self) -> None:
             raise PolicyFailed("the device is lost")
 
+    checks = ability(Dim(Lost(), DimConfig()), ChecksHealth)
+    assert checks is not None
     with pytest.raises(PolicyFailed, match="the device is lost"):
-        Dim(Lost(), DimConfig()).check_health()
+        checks.check_health()
 
 
 def test_what_an_agent_says_of_its_weights_is_said_through_a_wrapper() -> None:
-    agent = Bright()
-    agent.weights_id = {"digest": "x", "revision": None}
-    agent.statistics = {"action": {"min": [0.0], "max": [1.0]}}
-    wrapped = Dim.around(agent, {})
-    assert wrapped.weights_id is None
+    class Described(Bright):
+        def initialize(self) -> None:
+            super().initialize()
+            self.weights_id = {"digest": "x", "revision": None}
+            self.statistics = {"action": {"min": [0.0], "max": [1.0]}}
+
+    wrapped = Dim.around(Described(), {})
+    assert ability(wrapped, HasWeightsId) is None
     wrapped.initialize()
-    assert wrapped.weights_id == {"digest": "x", "revision": None}
-    assert wrapped.statistics == {"action": {"min": [0.0], "max": [1.0]}}
+    has_id, has_statistics = ability(wrapped, HasWeightsId), ability(wrapped, HasStatistics)
+    assert has_id is not None
+    assert has_id.weights_id == {"digest": "x", "revision": None}
+    assert has_statistics is not None
+    assert has_statistics.statistics == {"action": {"min": [0.0], "max": [1.0]}}
 
 
 def test_what_a_learner_trains_is_that_of_the_policy() -> None:
-    class Trained(Bright):
+    class Trained(TrainableAgent, Bright):
         trainable = "tree"
 
         def initialize(self) -> None:
@@ -175,8 +192,9 @@ def test_what_a_learner_trains_is_that_of_the_policy() -> None:
 
     agent = Dim(Trained(), DimConfig())
     agent.initialize()
-    agent.load_parameters({"gain": np.ones(2)})
-    assert agent.parameters()["gain"] is agent.agent.tree["gain"]  # type: ignore[attr-defined]
-    assert agent.parameters()["gain"].tolist() == [1, 1]
+    trainable = require_trainable(agent)
+    trainable.load_parameters({"gain": np.ones(2)})
+    assert trainable.parameters()["gain"] is agent.agent.tree["gain"]  # type: ignore[attr-defined]
+    assert trainable.parameters()["gain"].tolist() == [1, 1]
     with pytest.raises(NotTrainable, match="Bright: names no parameters"):
-        Dim(Bright(), DimConfig()).parameters()
+        require_trainable(Dim(Bright(), DimConfig()))

@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.serve.weights import WeightsVersion
 from vlagents_ray.weights import trainable
 
 
-class Gain(Agent):
+class Gain(TrainableAgent):
     """Acts with its one parameter, and what a session has drawn."""
 
     trainable: ClassVar[str | None] = "tree"
@@ -71,7 +71,7 @@ class Counting(Doubled):
         return super().reset(obs, instruction, **kwargs) | {"versions": len(held)}
 
 
-class OnSharedMemory(Agent):
+class OnSharedMemory(TrainableAgent):
     """Has a torch layer in memory of the CPU that takes the place of a GPU's."""
 
     trainable: ClassVar[str | None] = "layer"

@@ -18,7 +18,7 @@ from eval_fakes import ToZero, wait_for
 from process_resources import unpooled_threads
 from shared_cpu_memory import SharedCpuMemory
 
-from vlagents_ray import Act, Agent, Obs
+from vlagents_ray import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.scripted import Scripted
@@ -51,7 +51,7 @@ class Reacher(Agent):
         )
 
 
-class Trainable(Agent):
+class Trainable(TrainableAgent):
     """Acts with its one parameter, large enough for Ray's object store."""
 
     trainable = "tree"
@@ -63,7 +63,7 @@ class Trainable(Agent):
         return Act(self.tree["gain"][:2].copy())
 
 
-class OnOneGpu(Agent):
+class OnOneGpu(TrainableAgent):
     """A torch policy that has a GPU in common with its learner; or, on the CPU, memory in the
     place of that GPU's.
     """
@@ -381,7 +381,7 @@ class Hesitant(Scripted):
         return [Act(row) for row in actions]
 
 
-class Proportional(ToZero):
+class Proportional(TrainableAgent, ToZero):
     """Steps to zero with a gain that a learner trains."""
 
     trainable = "tree"

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import (
     accepted,
@@ -26,7 +26,7 @@ from vlagents_ray.weights.trainable import (
 )
 
 
-class Linear(Agent):
+class Linear(TrainableAgent):
     """Acts by a tree of numpy arrays."""
 
     trainable: ClassVar[str | None] = "tree"

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
+from vlagents_ray.abilities import HasStatistics, Observes, ability
 from vlagents_ray.chunking.buffer import (
     ENSEMBLE,
     ENSEMBLE_M,
@@ -208,6 +209,9 @@ class ChunkPlayer(Agent):
     raised.
     """
 
+    statistics: dict[str, Any] | None = None
+    """The ranges of the policy's training, once it is initialized; see `HasStatistics`."""
+
     control: RobotControl
     """The state of the robot, which selects the source of motion at each `act`."""
 
@@ -274,7 +278,8 @@ class ChunkPlayer(Agent):
         if self._caller is not None:
             self._caller.settle()
         self._agent.initialize()
-        self.statistics = self._agent.statistics
+        trained_on = ability(self._agent, HasStatistics)
+        self.statistics = None if trained_on is None else trained_on.statistics
         self._choose_safe()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
@@ -324,7 +329,9 @@ class ChunkPlayer(Agent):
         """
         if self._caller is not None:
             self._caller.settle()
-        self._agent.observe(obs)
+        observes = ability(self._agent, Observes)
+        if observes is not None:
+            observes.observe(obs)
         if action is not None and self._tick is not None:
             self._record_replacement(self._motion.move(action, obs))
             self._plan.advance()

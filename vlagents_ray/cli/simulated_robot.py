@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 import typer
 
+from vlagents_ray.abilities import HasControl, ability
 from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
@@ -132,7 +133,8 @@ class RobotRun:
                 soft_start_s=self.options.soft_start_s,
             )
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
-            self._control = agent.control
+            has_control = ability(agent, HasControl)
+            self._control = None if has_control is None else has_control.control
 
             if self.options.record is not None:
                 opened = Recorder(self.options.record, hz, interventions=leader is not None)

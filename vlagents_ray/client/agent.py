@@ -229,11 +229,14 @@ class RemoteAgent(Agent):
     When the replica stops, crashes or has more sessions than others, the session continues on
     another replica within `timeout_s`. If the old replica still runs, the session moves with all
     its state. Otherwise the client resumes it with the same instruction and options and sends the
-    last observations (`Contract.history` of them; see `Agent.observe`); `act.info["resumed"]` is
+    last observations (`Contract.history` of them; see `Observes.observe`); `act.info["resumed"]` is
     then set. If a replica has not answered for 5 s (in one call, or in several that reached their
     deadlines), the next call uses another replica, if one answers. A session never acts twice on
     one observation.
     """
+
+    statistics: dict[str, Any] | None = None
+    """The ranges of the policy's training, once it is initialized; see `HasStatistics`."""
 
     def __init__(
         self,
@@ -504,7 +507,7 @@ class RemoteAgent(Agent):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether the policy's chunks continue the executed plan; see `Agent.continues_plans`."""
+        """Whether the policy's chunks continue the executed plan; see `ContinuesPlans`."""
         return bool((self.metadata or {}).get("continues_plans"))
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.outcomes import attempt
-from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.policies.wrapper import Wrapper, unwrapped
 
 
 class AbsoluteActionsConfig(BaseModel, extra="forbid"):
@@ -62,16 +62,16 @@ class AbsoluteActions(Wrapper):
     """
 
     Config: ClassVar[type] = AbsoluteActionsConfig
+    repeatable: ClassVar[bool] = True
     config: AbsoluteActionsConfig
 
     def __init__(self, agent: Agent, config: AbsoluteActionsConfig) -> None:
         super().__init__(agent, config)
-        while isinstance(agent, Wrapper):
-            agent = agent.agent
-        if isinstance(agent, ModelPolicy) and agent.config.actions != "chunk":
+        policy = unwrapped(agent)
+        if isinstance(policy, ModelPolicy) and policy.config.actions != "chunk":
             raise ConfigError(
                 "absolute_actions: expected a policy with actions: chunk, got "
-                f"{agent.config.actions}, whose rows belong to chunks of earlier states; let the "
+                f"{policy.config.actions}, whose rows belong to chunks of earlier states; let the "
                 "chunk player or the evaluation execute the chunks"
             )
 

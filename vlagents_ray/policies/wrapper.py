@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, TypeVar, cast
 
+from vlagents_ray.abilities import (
+    Ahead,
+    Trainable,
+    ability,
+    bind,
+    is_marked,
+    observation_arguments,
+)
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, UnknownPolicy
+from vlagents_ray.errors import ConfigError, NotTrainable, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.outcomes import compute_valid
 from vlagents_ray.registry import find_entry, policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
+
+T = TypeVar("T")
 
 
 class Wrapper(Agent):
     """An agent that passes changed observations to an inner agent.
 
     `Config` and `shared` have the same meaning as for any agent. Each session has a copy of the
-    wrapper and of the inner agent.
+    wrapper and of the inner agent. All abilities of the inner agent (`vlagents_ray.abilities`) are
+    also the wrapper's, unless it defines them itself.
 
     Args:
         agent: The inner agent.
         config: An instance of `Config`, if the class has one.
+    """
+
+    repeatable: ClassVar[bool] = False
+    """Whether `change_batch` may change an observation twice, and on any thread: it reads nothing
+    that another observation sets, and takes little time. Then observations are prepared through
+    the wrapper (`vlagents_ray.abilities.Prepares`).
     """
 
     def __init__(self, agent: Agent, config: Any = None) -> None:
@@ -70,32 +87,34 @@ class Wrapper(Agent):
         """The contract of the inner agent, unless the wrapper changes it."""
         return self.agent.contract
 
-    @property
-    def continues_plans(self) -> bool:
-        return self.agent.continues_plans
-
     def shared_objects(self) -> list[Any]:
         return [*super().shared_objects(), *self.agent.shared_objects()]
 
-    def parameters(self) -> dict[str, Any]:
-        return self.agent.parameters()
+    def forwarded(self, protocol: type[T]) -> T | None:
+        """Return an ability of the inner agent, whose observations the wrapper changes.
 
-    def load_parameters(self, values: Mapping[str, Any]) -> None:
-        self.agent.load_parameters(values)
+        Args:
+            protocol: The protocol of the ability.
+
+        Returns:
+            The inner agent's ability; None if it has none, or if the wrapper would have to change
+            an observation twice for it, but is not `repeatable`.
+        """
+        inner = ability(self.agent, protocol)
+        if inner is None or type(self).change_batch is Wrapper.change_batch:
+            return inner
+        declared: type = protocol
+        if not observation_arguments(declared):
+            return inner
+        if is_marked(protocol, Ahead) and not self.repeatable:
+            return None
+        return cast(T, _ChangesObservations(self, inner, protocol))
 
     def initialize(self) -> None:
         self.agent.initialize()
-        self.weights_id, self.statistics = self.agent.weights_id, self.agent.statistics
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         return self.agent.reset(self.begin(obs, instruction), instruction, **kwargs)
-
-    def observe(self, obs: Obs) -> None:
-        """Pass the changed observation to the inner agent."""
-        [changed] = self.change_batch([obs], [self])
-        if isinstance(changed, Exception):
-            raise changed
-        self.agent.observe(changed)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Change the observations, and compute the inner agent's actions.
@@ -104,8 +123,9 @@ class Wrapper(Agent):
         """
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         inner_sessions = []
-        for session_obs, session in zip(changed, sessions, strict=True):
-            if not isinstance(session_obs, Exception):
+        for original, changed_obs, session in zip(obs, changed, sessions, strict=True):
+            if not isinstance(changed_obs, Exception):
+                changed_obs.prepared = original.prepared
                 inner_sessions.append(session.agent)  # type: ignore[attr-defined]
 
         def act(observations: list[Obs]) -> list[Act | Exception]:
@@ -113,17 +133,56 @@ class Wrapper(Agent):
 
         return compute_valid(changed, act)
 
-    def sleep(self) -> None:
-        self.agent.sleep()
-
-    def wake(self) -> None:
-        self.agent.wake()
-
-    def check_health(self) -> None:
-        self.agent.check_health()
-
     def close(self) -> None:
         self.agent.close()
+
+
+class _ChangesObservations:
+    """An ability of the inner agent of a wrapper, with the methods of its protocol, whose
+    observations the wrapper changes.
+    """
+
+    def __init__(self, wrapper: Wrapper, inner: Any, protocol: type) -> None:
+        self._wrapper, self._inner, self._protocol = wrapper, inner, protocol
+
+    def __getattr__(self, name: str) -> Any:
+        member = getattr(self._inner, name)
+        argument = observation_arguments(self._protocol).get(name)
+        if argument is None:
+            return member
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            bound = bind(self._protocol, name, args, kwargs)
+            [changed] = self._wrapper.change_batch([bound.arguments[argument]], [self._wrapper])
+            if isinstance(changed, Exception):
+                raise changed
+            bound.arguments[argument] = changed
+            return member(*bound.args[1:], **bound.kwargs)
+
+        return call
+
+
+def unwrapped(agent: Agent) -> Agent:
+    """Return the policy in all of its wrappers."""
+    while isinstance(agent, Wrapper):
+        agent = agent.agent
+    return agent
+
+
+def require_trainable(agent: Agent) -> Trainable:
+    """Return an agent's ability to get new weights.
+
+    Raises:
+        NotTrainable: It has none.
+    """
+    trainable = ability(agent, Trainable)
+    if trainable is None:
+        raise NotTrainable(
+            f"{type(unwrapped(agent)).__name__}: names no parameters to train; derive it from "
+            "vlagents_ray.TrainableAgent, and set `trainable` to the name of the attribute with "
+            "its torch module or its dicts of arrays"
+        )
+    return trainable
 
 
 def build_agent(

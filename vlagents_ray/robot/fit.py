@@ -81,7 +81,7 @@ class Trained:
     @classmethod
     def from_statistics(cls, statistics: Mapping[str, Any]) -> Trained:
         """Return the ranges in statistics, such as those in a server's metadata
-        (`Agent.statistics`).
+        (`vlagents_ray.abilities.HasStatistics`).
 
         Args:
             statistics: The ranges by the names "observation.state" or "state", and "action" or

@@ -18,6 +18,7 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from vlagents_ray.abilities import HasCheck, HasControl, HasStatistics, Interruptible, ability
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
@@ -117,7 +118,7 @@ def fit_of(
         agent: The policy, after `initialize`.
         robot: The robot.
         limits: The limits of the robot.
-        trained: The ranges of the policy's training; default: the ranges in `agent.statistics`.
+        trained: The ranges of the policy's training; default: the agent's `HasStatistics`.
             A simulated robot without a contract is not compared with them, as it follows numbers of
             any unit.
         accept: Whether numbers that do not fit are only logged.
@@ -133,7 +134,10 @@ def fit_of(
     if trained is None:
         is_simulated = getattr(robot, "simulated", False)
         has_units = not is_simulated or getattr(robot, "contract", None) is not None
-        trained = Trained.from_statistics(agent.statistics or {}) if has_units else Trained()
+        trained_on = ability(agent, HasStatistics)
+        trained = Trained()
+        if has_units and trained_on is not None:
+            trained = Trained.from_statistics(trained_on.statistics or {})
 
     contract = agent.contract or Contract()
     state_names = list(contract.state or {})
@@ -489,11 +493,16 @@ def run_loop(
     agent.initialize()
     guard = _guard_of(agent, options.guard, hz)
     fit = options.fit or fit_of(agent, robot, guard.limits)
+    has_control = ability(agent, HasControl)
+    has_check = ability(agent, HasCheck)
     run = _Run(
         robot=robot,
         agent=agent,
+        interruptible=ability(agent, Interruptible),
         control=control,
+        agent_has_control=has_control is not None and has_control.control is control,
         guard=guard,
+        agent_has_guard=has_check is not None and has_check.check is guard,
         watchdog=watchdog,
         recorder=recorder,
         commands=options.commands,
@@ -537,7 +546,8 @@ def _shared_control(
     """Return the control of a robot that agent, watchdog and commands share from now on: the
     agent's, else the watchdog's, else the control of the commands.
     """
-    control: RobotControl | None = agent.control
+    has_control = ability(agent, HasControl)
+    control: RobotControl | None = None if has_control is None else has_control.control
     if control is None and watchdog is not None:
         control = watchdog.control
     if control is None and commands is not None:
@@ -559,7 +569,10 @@ def _guard_of(agent: Agent, guard: Guard | None, hz: float) -> Guard:
     Raises:
         ConfigError: There are two guards, or the guard has limits for another rate.
     """
-    agent_guard = agent.check if isinstance(agent.check, Guard) else None
+    has_check = ability(agent, HasCheck)
+    agent_guard = None
+    if has_check is not None and isinstance(has_check.check, Guard):
+        agent_guard = has_check.check
     if guard is not None and agent_guard is not None and agent_guard is not guard:
         raise ConfigError(
             "guard: expected either `guard` or the agent's own check=, got both; leave one out"
@@ -580,8 +593,11 @@ class _Run:
 
     robot: Robot
     agent: Agent
+    interruptible: Interruptible | None  # the agent, if it has a plan to drop
     control: RobotControl
+    agent_has_control: bool  # whether `act` updates the control
     guard: Guard
+    agent_has_guard: bool  # whether `act` checks its action with the guard
     watchdog: Watchdog | None
     recorder: Recorder | None
     commands: CommandInbox | None
@@ -612,7 +628,7 @@ class _Run:
                     break
 
                 obs = _observed(self.robot)
-                if self.agent.control is not self.control:  # else `act` updates it
+                if not self.agent_has_control:
                     self.control.update()
 
                 act = self.agent.act(obs)
@@ -718,7 +734,8 @@ class _Run:
             # Stop it again, as the watchdog may have stopped it just before the last action.
             self.robot.stop()
         self.standing = True
-        self.agent.interrupt()
+        if self.interruptible is not None:
+            self.interruptible.interrupt()
         self.report.count(hold)
 
     def _apply_act(self, obs: Obs, act: Act) -> tuple[np.ndarray | None, Held | None]:
@@ -739,7 +756,7 @@ class _Run:
             self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
             self.fit = None
 
-        if self.agent.check is not self.guard:  # else it was checked before `act` returned
+        if not self.agent_has_guard:
             last = self.guard.reference(obs, self.last) if self.standing else self.last
             action = self.guard(action, last)
 

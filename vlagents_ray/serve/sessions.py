@@ -14,6 +14,7 @@ from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+from vlagents_ray.abilities import Prepares, ability
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.requests import NOWHERE, Answer, Origin, PendingRequest
@@ -45,7 +46,8 @@ class Session(Generic[M]):
     """The state of a policy for one robot or env."""
 
     id: str
-    agent: Agent | None = None  # None until the first `reset` succeeded
+    agent: Agent | None = None  # None until the first `reset` succeeded; see `set_agent`
+    prepares: Prepares | None = None  # ability of its agent, which is asked for once in an episode
     # Model of which `agent` is a copy; only the model manager and its cache set it.
     model: M | None = None
     weights: WeightsVersion | None = None  # version of the weights that it acts with
@@ -72,6 +74,11 @@ class Session(Generic[M]):
     def version(self) -> Version:
         """Version of the session's state; a reset in progress counts as completed."""
         return max((self.steps, self.moves), (self.expected, 0))
+
+    def set_agent(self, agent: Agent | None) -> None:
+        """Act with this agent from now on; None without an episode."""
+        self.prepares = None if agent is None else ability(agent, Prepares)
+        self.agent = agent
 
     def wrong_step(self, step: int) -> UnknownSession:
         """Return the error for an act at another step, which would repeat or skip an act."""
@@ -226,7 +233,7 @@ class SessionTable(Generic[M]):
         at the step `first`.
         """
         with self._lock:
-            session.agent = None
+            session.set_agent(None)
             session.steps = session.first = first
             session.moves = 0
             session.expected = max(session.expected, first)

@@ -25,6 +25,7 @@ from weakref import WeakValueDictionary, ref
 
 import numpy as np
 
+from vlagents_ray.abilities import Sleeps, Trainable, ability
 from vlagents_ray.errors import (
     InvalidInput,
     MessageTooLarge,
@@ -35,10 +36,10 @@ from vlagents_ray.errors import (
     VLAgentsError,
     WeightsNotStaged,
 )
-from vlagents_ray.interface import POLICY, Agent
+from vlagents_ray.interface import POLICY, Agent, TrainableAgent
 from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
-from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.policies.wrapper import require_trainable
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
@@ -146,24 +147,26 @@ class ModelWeights:
         """
         self.model = model
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
-        self._agent, self._busy = agent, busy
+        self._busy = busy
         self._device: Any = "cpu"  # the GPU of its values, if they are on one
         # The agent's values, if other versions are loaded into the same memory.
         self._live_values: Mapping[str, Any] = {}
         self._lock = threading.Lock()
+        self._sleeps = ability(agent, Sleeps)
+        # None if the policy names no parameters.
+        self._trainable: Trainable | None = None
         try:
-            values: dict[str, Any] | None = agent.parameters()
+            trained = require_trainable(agent)
+            values: dict[str, Any] | None = trained.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
             first, self._in_place, self._swaps = WeightsVersion(0, digest, None), False, False
         else:
             self._refusal = None
+            self._trainable = trained
             # An agent with its own `load_parameters` may copy values instead of keeping references
             # to them.
-            policy: Any = agent
-            while type(policy).load_parameters is Wrapper.load_parameters:
-                policy = policy.agent
-            loads_itself = type(policy).load_parameters is not Agent.load_parameters
+            loads_itself = type(trained).load_parameters is not TrainableAgent.load_parameters
             is_copied = trainable.is_copied(values or {})
             self._in_place = loads_itself or is_copied
             self._swaps = is_copied and not loads_itself and trainable.are_apart(values or {})
@@ -275,18 +278,19 @@ class ModelWeights:
                 and self._swaps
                 and not version.on_host
             ):
-                trainable.swap(self._agent.parameters(), version.values)
+                trainable.swap(self._own_values(), version.values)
                 kept.values = version.values
             else:
                 if kept is not None:
-                    kept.values = trainable.mapped(trainable.own_copy, self._agent.parameters())
-                if version.values is not None:  # otherwise the agent still has its own values
-                    self._agent.load_parameters(version.values)
+                    kept.values = trainable.mapped(trainable.own_copy, self._own_values())
+                # Without values, the agent still has its own.
+                if version.values is not None and self._trainable is not None:
+                    self._trainable.load_parameters(version.values)
         self._live = version
         if self._in_place:
             version.values, version.on_host = None, False
             if not self._swaps:  # otherwise the parameters are the same objects
-                self._live_values = self._agent.parameters()
+                self._live_values = self._own_values()
         self._switches += 1
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
@@ -482,11 +486,12 @@ class ModelWeights:
         with CAPTURES.pushes, self._busy:
             if offload:
                 self._asleep = True
-                self._agent.sleep()
+                if self._sleeps is not None:
+                    self._sleeps.sleep()
                 values = [
                     version.values for version in self._alive.values() if version.values is not None
                 ]
-                trainable.to_host([self._agent.parameters(), *values], self._moved)
+                trainable.to_host([self._own_values(), *values], self._moved)
         free_memory()
 
     def wake(self) -> None:
@@ -500,7 +505,8 @@ class ModelWeights:
                 return
             try:
                 trainable.from_host(self._moved)
-                self._agent.wake()
+                if self._sleeps is not None:
+                    self._sleeps.wake()
             except RuntimeError as error:
                 if not is_out_of_memory(error):
                     raise
@@ -528,6 +534,10 @@ class ModelWeights:
             with beside_acts(self._device):
                 yield
 
+    def _own_values(self) -> dict[str, Any]:
+        """Return references to the agent's values, by name; empty if it names none."""
+        return {} if self._trainable is None else self._trainable.parameters()
+
     def _forget_staged(self) -> None:
         self._staged = None
         if self._timer is not None:
@@ -547,7 +557,7 @@ class ModelWeights:
         """
         if not self._live_values:
             with self._busy:
-                self._live_values = self._agent.parameters()
+                self._live_values = self._own_values()
         return self._live_values
 
     def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:

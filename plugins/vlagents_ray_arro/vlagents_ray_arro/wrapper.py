@@ -24,7 +24,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, weights_of
+from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, identify_weights
 from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray_arro.parts import (
     Detection,
@@ -454,7 +454,7 @@ class Arro(Wrapper):
             self.tracking.load()
         with used_checkpoints() as policy_files:
             super().initialize()
-        self.weights_id = with_parts(self.weights_id or weights_of(policy_files), part_files)
+        self.weights_id = with_parts(identify_weights(self.agent, policy_files), part_files)
 
         policy_cameras = self._policy_cameras()
         unused = sorted(set(self.config.cameras or ()) - set(policy_cameras or ()))
@@ -592,7 +592,7 @@ class Arro(Wrapper):
 
 
 def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the `Agent.weights_id` of a policy that also uses files of other models.
+    """Return the `weights_id` of a policy that also uses files of other models.
 
     Args:
         policy: The policy's own `weights_id`.

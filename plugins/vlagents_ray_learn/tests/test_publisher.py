@@ -11,14 +11,14 @@ import pytest
 from in_flight import submit
 
 from vlagents_ray.errors import ConfigError, InvalidInput, InvalidWeights, UnchangedWeights
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.weights.trainable import fingerprint
 from vlagents_ray_learn import Publisher
 
 
-class Linear(Agent):
+class Linear(TrainableAgent):
     """Acts with two named arrays."""
 
     trainable: ClassVar[str | None] = "tree"
@@ -75,7 +75,7 @@ def test_a_part_of_the_weights_leaves_the_rest(engine: Engine) -> None:
 def test_mistakes_are_refused_by_name(engine: Engine) -> None:
     weights = Publisher(engine)
     with pytest.raises(UnchangedWeights):
-        weights.push(engine.models.own_weights._agent.parameters())
+        weights.push(engine.models.own_weights._trainable.parameters())
     with pytest.raises(InvalidWeights, match=r"expected values by name, .*got list"):
         weights.push([np.zeros(2)])  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match=r"mode: expected .*, got 'abort'"):

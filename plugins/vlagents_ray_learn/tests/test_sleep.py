@@ -22,7 +22,7 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     UnchangedWeights,
 )
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -180,7 +180,7 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
 ) -> None:
     import torch
 
-    class OnGpu(Agent):
+    class OnGpu(TrainableAgent):
         """A layer whose CPU takes the place of a GPU, with tied weights and views of one memory."""
 
         trainable: ClassVar[str | None] = "layer"

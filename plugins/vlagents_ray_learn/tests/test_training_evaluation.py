@@ -19,7 +19,7 @@ from vlagents_ray.errors import ConfigError, NotTrainable, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import PushedWeights
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.weights.trainable import fingerprint
 from vlagents_ray_learn import Publisher, TrainingEvaluation, training_evaluation
 
@@ -254,7 +254,7 @@ def test_mistakes_are_refused_before_the_training_begins(
 def test_a_module_is_evaluated_without_dropout_and_trained_on_with_it(plan: EvalConfig) -> None:
     torch = pytest.importorskip("torch")
 
-    class Module(Agent):
+    class Module(TrainableAgent):
         trainable: ClassVar[str | None] = "module"
 
         def initialize(self) -> None:

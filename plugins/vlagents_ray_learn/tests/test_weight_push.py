@@ -19,7 +19,7 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     UnchangedWeights,
 )
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
@@ -33,7 +33,7 @@ from vlagents_ray_learn.weight_push import (
 )
 
 
-class Gain(Agent):
+class Gain(TrainableAgent):
     """Acts with its one parameter, whose length may differ between replicas."""
 
     trainable: ClassVar[str | None] = "tree"

@@ -35,7 +35,7 @@ from vlagents_ray.errors import (
     UnchangedWeights,
     VLAgentsError,
 )
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import MessageLimits
 from vlagents_ray.serve import weights as versions
@@ -60,7 +60,7 @@ from vlagents_ray_learn.weights_part import WeightsPart
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
 
 
-class Gain(Agent):
+class Gain(TrainableAgent):
     trainable: ClassVar[str | None] = "tree"
 
     def initialize(self) -> None:
@@ -127,7 +127,7 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
             0,
         )
         assert weights.push(gains(1), version=500, allow_same=True) == 500
-    held = server.engine.models.own_weights._agent.tree
+    held = server.engine.models.own_weights._trainable.tree
     assert server.engine.weights.describe()["newest"]["version"] == 500
     assert held["offset"].tolist() == [0, 0]  # no session has begun since
     newest = server.engine.models.own_weights.newest.values

@@ -12,7 +12,7 @@ import pytest
 from in_flight import answered
 
 from vlagents_ray.errors import Overloaded, PolicyUnavailable, UnchangedWeights
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.parts import PartArgs
@@ -27,7 +27,7 @@ from vlagents_ray_learn.weights_endpoint import PART
 from vlagents_ray_learn.weights_part import WeightsPart
 
 
-class Gain(Agent):
+class Gain(TrainableAgent):
     trainable: ClassVar[str | None] = "tree"
 
     def initialize(self) -> None:

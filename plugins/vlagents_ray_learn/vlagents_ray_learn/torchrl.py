@@ -29,7 +29,7 @@ from typing_extensions import Self
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Agent, Obs
+from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Obs, TrainableAgent
 from vlagents_ray.policies.base.model_inputs import camera_images, state_vector
 from vlagents_ray.policies.outcomes import attempt, compute_valid
 from vlagents_ray.registry import named_class, require
@@ -160,7 +160,7 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         return {**self.__dict__, "_sessions": []}
 
 
-class TorchRLPolicy(Agent):
+class TorchRLPolicy(TrainableAgent):
     """A VLA policy of TorchRL (`VLAWrapperBase`).
 
     It returns chunks, or tokens if it has a head of tokens and no `action_tokenizer`. The session's

@@ -18,6 +18,7 @@ from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.run import evaluate
 from vlagents_ray.interface import POLICY, Act, Agent, Obs
+from vlagents_ray.policies.wrapper import require_trainable, unwrapped
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.weights.trainable import evaluation_mode, fingerprint
 
@@ -148,11 +149,15 @@ class TrainingEvaluation:
 
     def _evaluate_agent(self, agent: Agent, version: int) -> Summary:
         """Evaluate an agent of this process with its current weights."""
-        pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
+        pushed = PushedWeights(
+            version=version, fingerprint=fingerprint(require_trainable(agent).parameters())
+        )
         session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
         module = None
-        if agent.trainable is not None:
-            module = attrgetter(agent.trainable)(agent)
+        policy = unwrapped(agent)
+        trainable: str | None = getattr(policy, "trainable", None)
+        if trainable is not None:
+            module = attrgetter(trainable)(policy)
         with evaluation_mode(module):
             plan = self._plan_for(pushed).model_copy(update={"workers": 0})
             return evaluate(plan, agent_factory=lambda: session, progress=self._progress)

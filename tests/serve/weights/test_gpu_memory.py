@@ -13,7 +13,7 @@ import pytest
 import torch
 from fake_cuda import FakeCuda
 
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import are_apart, copy, fingerprint, portable, set_values
@@ -47,7 +47,7 @@ class Module(torch.nn.Module):
         self.tied = self.a
 
 
-class OnGpu(Agent):
+class OnGpu(TrainableAgent):
     """Holds its parameters on a GPU."""
 
     trainable: ClassVar[str | None] = "module"

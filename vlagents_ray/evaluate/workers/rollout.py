@@ -49,7 +49,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, TimeLimits
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import PriorityName
@@ -302,7 +302,7 @@ class Rollout:
             agent.close()
             raise
 
-        weights = agent.weights_id or weights_of(checkpoints)
+        weights = identify_weights(agent, checkpoints)
         is_local = not hasattr(agent, "metadata")
         self._local_metadata = {"weights": weights} if weights and is_local else {}
         self._policy = policy.name

@@ -16,7 +16,10 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from vlagents_ray.abilities import HasWeightsId, ability
+from vlagents_ray.interface import Agent
 
 # Names that trainers give to unfinished files: orbax' folders, and the usual suffixes.
 TEMPORARY = (
@@ -143,8 +146,22 @@ _CHECKS: dict[str, Callable[[Path], str | None]] = {
 }
 
 
+def identify_weights(agent: Agent, paths: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the identity of the weights that a policy has loaded, for the metadata.
+
+    Args:
+        agent: The policy, after `initialize`.
+        paths: The files and folders that it has found meanwhile.
+
+    Returns:
+        The policy's own `HasWeightsId.weights_id`, or that of the files; None if there is neither.
+    """
+    has_id = ability(agent, HasWeightsId)
+    return (has_id.weights_id if has_id is not None else None) or weights_of(paths)
+
+
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
-    """Return `Agent.weights_id` of a policy.
+    """Return the identity of a policy's files, as `HasWeightsId` describes it.
 
     The digest covers all files. The revision is that of the first path, since the others, such as
     that of an encoder, may come from another repository.

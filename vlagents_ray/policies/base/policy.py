@@ -39,6 +39,7 @@ from vlagents_ray.interface import (
     Act,
     Agent,
     Obs,
+    TrainableAgent,
 )
 from vlagents_ray.policies.adapters import ADAPTER, DIGITS, LoraAdapters
 from vlagents_ray.policies.base.accelerator import (
@@ -107,7 +108,7 @@ class PolicyEpisode:
     prompt: Any = None
 
 
-class ModelPolicy(Agent, abc.ABC):
+class ModelPolicy(TrainableAgent, abc.ABC):
     """The base class of the model families.
 
     A family defines `load`, `perceive`, `predict` and its contract. The model computes one row for
@@ -208,8 +209,8 @@ class ModelPolicy(Agent, abc.ABC):
     def perceive(self, obs: Obs) -> Any:
         """Convert and resize an observation for the history.
 
-        The rules of `Agent.prepare` apply. `self` is the copy of a session that is in an episode.
-        An error is the result of that session's request alone.
+        The rules of `Prepares.prepare` apply. `self` is the copy of a session that is in an
+        episode. An error is the result of that session's request alone.
         """
 
     @abc.abstractmethod

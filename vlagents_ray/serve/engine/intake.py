@@ -96,7 +96,7 @@ class Intake:
                 model.check(request)
             preparation = None
             if self._preparations is not None and self._queue.window.overlaps:
-                preparation = self._preparations.begin(session.agent, request.obs)
+                preparation = self._preparations.begin(session.prepares, request.obs)
             return ReservedAct(session, model, episode, preparation)
 
         if request.op == "reset":

@@ -107,7 +107,7 @@ class SessionMoves:
                 arriving.weights = model.parameters.restore(number, fingerprint, weights)
             arriving.weights = model.parameters.find(number, fingerprint, follows=state["follows"])
             with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
-                arriving.agent = model.copies.load(state["agent"])
+                arriving.set_agent(model.copies.load(state["agent"]))
             arriving.follows, arriving.instruction = state["follows"], state["instruction"]
         except BaseException:
             self.abandon(arriving)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
+from vlagents_ray.abilities import Observes, ability
 from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
@@ -282,13 +283,16 @@ class Runner:
                 raise PolicyFailed(
                     f"reset: expected a dict from the policy, got {type(info).__name__}"
                 )
-            for obs in request.history:
-                agent.observe(obs)
+            observes = ability(agent, Observes) if request.history else None
+            if observes is not None:
+                for obs in request.history:
+                    observes.observe(obs)
 
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
-        session.agent, session.instruction = agent, request.instruction or ""
+        session.set_agent(agent)
+        session.instruction = request.instruction or ""
         model.padding.record_reset(request, opening.kwargs)
         request.drop_observations()
 
@@ -386,7 +390,9 @@ class Runner:
             with model.busy, model.uncaptured, model.call("observe"):
                 model.require_open()
                 model.parameters.use(weights)
-                session.agent.observe(pending.request.obs)
+                observes = ability(session.agent, Observes)
+                if observes is not None:
+                    observes.observe(pending.request.obs)
         pending.request.drop_observations()
 
     def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
@@ -400,7 +406,7 @@ class Runner:
         for pending, session in acting:
             reserved = pending.reserved
             preparation = reserved.preparation if isinstance(reserved, ReservedAct) else None
-            preparations.append((preparation, session.agent))
+            preparations.append((preparation, session.prepares))
         if all(preparation is None for preparation, _ in preparations):
             return acting, 0.0
         with model.busy, model.uncaptured, model.call("act", "prepare") as call:

@@ -14,16 +14,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
 
+from vlagents_ray.abilities import HasStatistics, ability
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.adapters import DIGITS
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.base.checkpoint_files import identify_weights
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.loading import LoadingReport, loading_report
-from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.policies.wrapper import unwrapped
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
@@ -120,7 +121,7 @@ class LoadedModel:
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    # Digest and revision, see `Agent.weights_id`, and `Agent.statistics`.
+    # Digest and revision, see `HasWeightsId`, and those of `HasStatistics`.
     weights: dict[str, Any] | None
     files: Program  # digests of the files named in its settings
     # Equal in replicas that can take over each other's sessions of this model.
@@ -289,24 +290,21 @@ class Loader:
                 ) as report,
             ):
                 agent.initialize()
-            weights = agent.weights_id or weights_of(checkpoints)
-
-            policy = agent
-            while isinstance(policy, Wrapper):
-                policy = policy.agent
-            full_settings = with_defaults(type(policy), settings)
+            weights = identify_weights(agent, checkpoints)
+            full_settings = with_defaults(type(unwrapped(agent)), settings)
             files = files_named(
                 {**full_settings, CHOICE: resolved(full_settings)}, folders=not weights
             )
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
             # The statistics are compared with a robot. They may exist for weights without a digest.
-            if agent.statistics is not None:
+            trained_on = ability(agent, HasStatistics)
+            if trained_on is not None:
                 weights = {
                     "digest": None,
                     "revision": None,
                     **(weights or {}),
-                    "statistics": agent.statistics,
+                    "statistics": trained_on.statistics,
                 }
 
             contract = agent.contract

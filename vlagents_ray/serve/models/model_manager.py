@@ -23,6 +23,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from vlagents_ray.abilities import ChecksHealth, ContinuesPlans, ability
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     CheckpointFailed,
@@ -350,7 +351,9 @@ class ModelManager:
         with self._changed:
             loaded = list(self._cache.loaded.values())
         for model in loaded:
-            model.agent.check_health()
+            checks = ability(model.agent, ChecksHealth)
+            if checks is not None:
+                checks.check_health()
 
     @property
     def version(self) -> tuple[str, str]:
@@ -521,7 +524,8 @@ class ModelManager:
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
-        self.continues_plans = model.agent.continues_plans
+        plans = ability(model.agent, ContinuesPlans)
+        self.continues_plans = plans is not None and plans.continues_plans
         self.weights, self.files, self.devices = model.weights, model.files, model.report.devices
 
     def _loop(self) -> None:

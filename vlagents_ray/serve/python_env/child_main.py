@@ -32,7 +32,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
+from vlagents_ray.policies.wrapper import build_agent, require_trainable, unloaded_contract
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -162,7 +162,7 @@ def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     """
     values = {}
     try:
-        for name, value in agent.parameters().items():
+        for name, value in require_trainable(agent).parameters().items():
             values[name] = [dtype_name(value), list(value.shape)]
     except NotTrainable as error:
         return {"refusal": str(error)}

@@ -12,16 +12,17 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+from vlagents_ray.abilities import Prepares
 from vlagents_ray.images import thread_map
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Obs
 
 _THREADS = 4  # maximum number of threads; images are resized without Python's lock
 
 
 class Preparation(NamedTuple):
-    """The call of `Agent.prepare` for one observation."""
+    """The call of `Prepares.prepare` for one observation."""
 
-    agent: Agent
+    prepares: Prepares
     obs: Obs
     future: Future[Any]
 
@@ -32,33 +33,47 @@ class Preparations:
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(min(_THREADS, thread_map.allowed()), "prepare")
 
-    def begin(self, agent: Agent | None, obs: Obs | None) -> Preparation | None:
-        """Begin to prepare an observation for a session's agent; None if there is nothing to do."""
-        if agent is None or obs is None or type(agent).prepare is Agent.prepare:
+    def begin(self, prepares: Prepares | None, obs: Obs | None) -> Preparation | None:
+        """Begin to prepare an observation.
+
+        Args:
+            prepares: The ability of the session's agent; None if it prepares nothing.
+            obs: The observation.
+
+        Returns:
+            The preparation; None if there is nothing to do.
+        """
+        if prepares is None or obs is None:
             return None
         try:
-            return Preparation(agent, obs, self._threads.submit(agent.prepare, obs))
+            return Preparation(prepares, obs, self._threads.submit(prepares.prepare, obs))
         except RuntimeError:  # the threads have ended
             return None
 
     @staticmethod
     def finish(
-        preparations: Sequence[tuple[Preparation | None, Agent | None]],
+        preparations: Sequence[tuple[Preparation | None, Prepares | None]],
     ) -> dict[int, Exception]:
-        """Finish the preparations of a batch; return their errors by their indices in the batch.
+        """Finish the preparations of a batch; called on the policy's thread.
 
-        Called on the policy's thread.
+        Args:
+            preparations: Of each request, what `begin` returned, and the present ability of the
+                session's agent, which is another one if the session has been reset since.
+
+        Returns:
+            The errors of preparations by their indices in the batch.
         """
         errors: dict[int, Exception] = {}
 
         def finish_at(index: int, *, begun: bool) -> None:
             """Finish one preparation, on this thread unless another one has begun it."""
-            preparation, agent = preparations[index]
-            if preparation is None or agent is not preparation.agent:  # the session has been reset
+            preparation, prepares = preparations[index]
+            # The session may have been reset.
+            if preparation is None or prepares is not preparation.prepares:
                 return
             obs, future = preparation.obs, preparation.future
             try:
-                obs.prepared = future.result() if begun else preparation.agent.prepare(obs)
+                obs.prepared = future.result() if begun else preparation.prepares.prepare(obs)
             except Exception as error:  # noqa: BLE001 - fails the request of that observation
                 errors[index] = error
 

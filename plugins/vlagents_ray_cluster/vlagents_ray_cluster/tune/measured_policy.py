@@ -27,7 +27,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.wrapper import Wrapper, build_agent
+from vlagents_ray.policies.wrapper import build_agent, unwrapped
 from vlagents_ray.protocol.frames import decode_requests, encode_requests
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
@@ -338,10 +338,8 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
         batch_sizes=settings.batch_sizes,
         on_step=lambda step: answer({"step": step}),
     )
-    while isinstance(agent, Wrapper):
-        agent = agent.agent
     with measured:
-        answer(_report(measured, getattr(agent, "config", None)))
+        answer(_report(measured, getattr(unwrapped(agent), "config", None)))
         for line in sys.stdin:
             try:
                 result = _result(measured, json.loads(line))

@@ -11,7 +11,7 @@ import numpy as np
 from shared_cpu_memory import SharedCpuMemory, files_of_torch
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Act, Obs, TrainableAgent
 from vlagents_ray.serve.weights import (
     FollowingSession,
     HeldVersion,
@@ -44,7 +44,7 @@ def model(device: str) -> Any:
     return found
 
 
-class Served(Agent):
+class Served(TrainableAgent):
     """Replaces its weights where they are, as on a GPU."""
 
     trainable: ClassVar[str | None] = "model"

@@ -20,6 +20,7 @@ from asgi_server import served
 from in_memory_keys import ChangingKeys
 
 from vlagents_ray import Agent
+from vlagents_ray.abilities import HasStatistics, ability
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -57,8 +58,9 @@ def serving(policy: Agent) -> Iterator[Server]:
     key = known.add("robot")
     metadata = {"contract": policy.contract.to_json() if policy.contract else None, "version": "0"}
     metadata |= {"policy": type(policy).__name__, "protocol": PROTOCOL_VERSION}
-    if policy.statistics is not None:
-        metadata["weights"] = {"statistics": policy.statistics}
+    trained_on = ability(policy, HasStatistics)
+    if trained_on is not None:
+        metadata["weights"] = {"statistics": trained_on.statistics}
 
     def describe() -> dict[str, object]:
         return metadata | {"continues_plans": engine.models.continues_plans}
