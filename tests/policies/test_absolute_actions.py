@@ -21,6 +21,7 @@ from vlagents_ray import (
     Obs,
     PlayerSettings,
 )
+from vlagents_ray.abilities import ContinuesPlans, ability
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER
@@ -147,7 +148,9 @@ def test_a_plan_comes_back_as_it_was_given_from_another_pose() -> None:
     np.testing.assert_array_equal(act.info[DISTRIBUTION]["mean"], act.action)
     assert (act.info[DISTRIBUTION]["std"] == 1).all()
     assert obs.info[LEFTOVER] is plan
-    assert agent.continues_plans
+    plans = ability(agent, ContinuesPlans)
+    assert plans is not None
+    assert plans.continues_plans
 
 
 def test_the_contract_says_that_actions_are_absolute_and_what_state_they_need() -> None:

@@ -402,8 +402,7 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
         ({"history": {"a": 1}}, MalformedMessage),
         ({"history": [{}] * 300}, MessageTooLarge),
         *(
-            ({"op": of_a_replica}, MalformedMessage)
-            for of_a_replica in ("observe", "export", "adopt")
+            ({"op": of_a_replica}, MalformedMessage) for of_a_replica in ("call", "export", "adopt")
         ),  # two carry pickles
     ],
 )

@@ -6,18 +6,35 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import inspect
 import json
 import os
 import platform
 import sys
 import weakref
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
+from vlagents_ray.abilities import members
 from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
+from vlagents_ray.registry import named_class
+
+
+class Dances(Protocol):
+    """An ability that the package does not know."""
+
+    tempo: float
+
+    def dance(self, obs: Obs, times: int, *, fast: bool = False) -> str:
+        """Dance to an observation."""
+
+    def rest(self, seconds: float) -> str:
+        """Rest."""
+
 
 ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds
 
@@ -130,3 +147,42 @@ class Dying(Telling):
     def initialize(self) -> None:
         print("the driver is too old", file=sys.stderr, flush=True)
         os._exit(3)
+
+
+class Able(Agent):
+    """Has the abilities whose protocols its config names; each method returns its name, the
+    episode's instruction and its arguments.
+    """
+
+    def __new__(cls, protocols: Sequence[str] = ()) -> Able:
+        body: dict[str, Any] = {}
+        for name in protocols:
+            protocol = named_class(name)
+            for member in members(protocol):
+                is_method = inspect.isfunction(getattr(protocol, member, None))
+                body[member] = _described(member) if is_method else value_of(member)
+        able: Able = object.__new__(type("Able", (cls,), body) if body else cls)
+        return able
+
+    def __init__(self, protocols: Sequence[str] = ()) -> None:
+        self.instruction: str | None = None
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction = instruction
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1, np.float32))
+
+
+def value_of(member: str) -> dict[str, Any]:
+    """The value of an attribute of `Able`, which a server takes for an id of weights."""
+    return {"digest": f"value of {member}", "revision": None}
+
+
+def _described(member: str) -> Callable[..., Any]:
+    def method(self: Able, *args: Any, **kwargs: Any) -> list[Any]:
+        seen = [value.info if isinstance(value, Obs) else value for value in args]
+        return [member, self.instruction, seen, kwargs]
+
+    return method

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
+from vlagents_ray.policies.wrapper import require_trainable
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import (
     accepted,
@@ -75,7 +76,9 @@ def test_what_is_trainable_may_be_inside_of_what_sessions_share() -> None:
 
 def test_an_agent_that_names_nothing_to_train_says_how_to() -> None:
     with pytest.raises(NotTrainable, match="set `trainable`"):
-        Agent().parameters()
+        TrainableAgent().parameters()
+    with pytest.raises(NotTrainable, match="set `trainable` to the name"):
+        require_trainable(Agent())
     with pytest.raises(NotTrainable, match=r"expected .*, got tuple"):
         named_values({"layers": (np.zeros(1),)})
 

@@ -48,7 +48,7 @@ _OPTIONAL: dict[str, Any] = {
     "priority": "robot",
     "deadline_ms": None,
 }
-_WITH_OBS = ("reset", "act", "observe")
+_WITH_OBS = ("reset", "act")
 _RESET_PARAMETERS = {"self", "obs", "instruction"}  # names that options of a reset may not have
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)

@@ -45,11 +45,11 @@ def is_name(text: str) -> bool:
     )
 
 
-Op = Literal["reset", "act", "close", "observe", "export", "adopt", "weights", "release"]
+Op = Literal["reset", "act", "close", "call", "export", "adopt", "weights", "release"]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
 # Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain
 # pickles.
-INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt", "weights")
+INNER_OPS: tuple[Op, ...] = (*OPS, "call", "export", "adopt", "weights")
 PriorityName = Literal["robot", "simulation"]
 
 
@@ -76,9 +76,10 @@ class Request:
     """
 
     op: Op
-    obs: Obs | None = None  # for reset, act and observe
+    obs: Obs | None = None  # for reset and act; for call: its argument that is an observation
     instruction: str | None = None  # reset only
-    # For reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`.
+    # For reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`;
+    # for call: see `AbilityCall`.
     kwargs: dict[str, Any] = field(default_factory=dict)
     # Reset only: the contract of the robot or the environment, which the server compares with the
     # policy's contract.

@@ -224,7 +224,7 @@ def test_a_document_with_any_value_in_any_field_is_answered(
 
 
 @pytest.mark.parametrize(
-    "op", ["reset", "act", "close", "observe", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []]
+    "op", ["reset", "act", "close", "call", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []]
 )
 def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None:
     """At the endpoints without status codes: own port, shared memory and plasma."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import psutil
@@ -19,10 +20,22 @@ from gain_policies import gains, in_child
 from in_flight import checked, submit
 from in_process_replicas import export
 from pushed_weights import push
+from python_env_agents import Dances, value_of
 from shared_cpu_memory import GPU, SharedCpuMemory
 from virtual_environments import ended
 
-from vlagents_ray import Act, Obs
+from vlagents_ray import Act, Obs, abilities
+from vlagents_ray.abilities import (
+    ContinuesPlans,
+    HasWeightsId,
+    InProcess,
+    Observes,
+    Prepares,
+    ability,
+    is_marked,
+    members,
+    observation_arguments,
+)
 from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
@@ -34,11 +47,13 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.ability_call import is_method, name_of
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.queue.call_limits import CallLimits
+from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, shared
@@ -310,6 +325,73 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
         wait_for(lambda: ended(pid))
 
 
+ABILITIES = [value for value in vars(abilities).values() if isinstance(value, type)]
+# Those whose values can be sent, and one that only this test knows.
+SENT = [
+    protocol
+    for protocol in (*ABILITIES, Dances)
+    if Protocol in protocol.__mro__[1:]  # type: ignore[comparison-overlap]
+    and members(protocol)
+    and not is_marked(protocol, InProcess)
+]
+
+
+@pytest.fixture(scope="module")
+def able() -> Iterator[Engine]:
+    """A policy in a child process with all abilities whose values can be sent."""
+    engine = Engine(agent("Able", protocols=[name_of(protocol) for protocol in SENT]))
+    engine.start()
+    yield engine
+    engine.close()
+
+
+@pytest.mark.parametrize("protocol", SENT, ids=lambda protocol: protocol.__name__)
+def test_an_ability_of_the_policy_is_used_through_its_process(able: Engine, protocol: type) -> None:
+    assert (ask(able, protocol.__name__, "reset", instruction="go")).error is None
+    session = able.sessions.get(protocol.__name__).agent
+    assert session is not None
+    found: Any = ability(session, protocol)
+    assert found is not None
+    for member in members(protocol):
+        if not is_method(protocol, member):
+            assert getattr(found, member) == value_of(member)
+            continue
+        parameters = inspect.signature(getattr(protocol, member)).parameters
+        arguments: dict[str, Any] = {name: f"value of {name}" for name in [*parameters][1:]}
+        observing = observation_arguments(protocol).get(member)
+        expected = dict(arguments)
+        if observing is not None:
+            arguments[observing] = observation(3.0)
+            expected[observing] = {"value": 3.0}
+        named = {
+            name: expected.pop(name)
+            for name, parameter in parameters.items()
+            if parameter.kind is parameter.KEYWORD_ONLY
+        }
+        answer = getattr(found, member)(**arguments)
+        assert answer == [member, "go", list(expected.values()), named]
+
+
+@pytest.mark.parametrize("protocol", SENT, ids=lambda protocol: protocol.__name__)
+def test_a_policy_without_an_ability_has_none_in_its_process(
+    engine: Engine, protocol: type
+) -> None:
+    assert ask(engine, "without", "reset").error is None
+    session = engine.sessions.get("without").agent
+    assert session is not None
+    found = ability(session, protocol)
+    assert (found is not None) == (protocol in (Observes, HasWeightsId))
+    assert ability(session, Prepares) is None, "the child prepares its observations"
+
+
+def test_an_ability_of_the_loaded_policy_is_used_while_it_acts(able: Engine) -> None:
+    loaded = able.models.loaded(DEFAULT).agent
+    found: Any = ability(loaded, Dances)
+    assert found.rest(2.5) == ["rest", None, [2.5], {}]
+    with pytest.raises(NotReset, match="dance before reset"):
+        found.dance(observation(), 1)
+
+
 def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engine) -> None:
     with pytest.raises(NotTrainable, match="Telling: names no parameters to train"):
         engine.weights.stage(1, {"w": np.zeros(1)}, PushOptions())
@@ -380,9 +462,11 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
 def test_a_policy_in_a_child_process_says_whether_its_chunks_go_on_from_a_plan() -> None:
     settings = Settings("mirror_policy:CountingPolicy", {}, 16, "1")
     policy = ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))
-    assert not policy.continues_plans
+    assert ability(policy, ContinuesPlans) is None
     policy.initialize()
     try:
-        assert policy.continues_plans
+        plans = ability(policy, ContinuesPlans)
+        assert plans is not None
+        assert plans.continues_plans is True
     finally:
         policy.close()

@@ -11,6 +11,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,14 @@ from in_flight import answered, asked, pending
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
+from vlagents_ray.abilities import Observes
 from vlagents_ray.errors import InvalidObservation, OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.call_limits import (
@@ -93,8 +96,16 @@ def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
     engine.close()
 
 
+def request_of(op: Any, **kwargs: Any) -> Request:
+    """A request of a client, or the call of `observe` by another process."""
+    if op == "observe":
+        call, obs = AbilityCall.from_arguments(Observes, "observe", (Obs(),), {})
+        return Request("call", obs, kwargs=asdict(call))
+    return Request(op, Obs(), kwargs=kwargs)
+
+
 def put(engine: Engine, session: str, op: Any, **kwargs: Any) -> queue.SimpleQueue[Reply]:
-    return asked(engine, session, Request(op, Obs(), kwargs=kwargs))
+    return asked(engine, session, request_of(op, **kwargs))
 
 
 def ask(engine: Engine, session: str, op: Any, **kwargs: Any) -> Reply:
@@ -347,7 +358,7 @@ def failing(
     """An engine, its policy, and how it is asked."""
     policy = Failing()
     engine = serving(policy)
-    return engine, policy, lambda op: answered(engine, "a", Request(op, Obs())).error
+    return engine, policy, lambda op: answered(engine, "a", request_of(op)).error
 
 
 @pytest.mark.parametrize("op", ["reset", "observe", "act", "act_batch"])

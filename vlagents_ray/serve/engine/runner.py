@@ -24,6 +24,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.messages import Priority, Reply
+from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.intake import Intake
 from vlagents_ray.serve.engine.moves import SessionMoves
 from vlagents_ray.serve.engine.parts import EngineParts
@@ -346,8 +347,9 @@ class Runner:
             # not held here.
             state = {**request.kwargs, "parameters": self._weights.acting()}
             self._moves.adopt(session_id, state)
-        elif request.op == "observe":
-            self._observe(pending)
+        elif request.op == "call":
+            info = {"result": self._call(pending)}
+            require_serializable(info, self._reply_bytes)
         elif request.op == "weights":
             self._weights.obey(**request.kwargs)
         else:
@@ -383,17 +385,18 @@ class Runner:
             model.check(pending.request)
         return session, model, weights
 
-    def _observe(self, pending: PendingRequest) -> None:
+    def _call(self, pending: PendingRequest) -> Any:
+        """Use an ability of a session's agent, for the process in whose place it acts."""
         session, model, weights = self._ready(pending)
-        # `_ready` and the decoder ensure both conditions.
-        if session.agent is not None and pending.request.obs is not None:
-            with model.busy, model.uncaptured, model.call("observe"):
-                model.require_open()
-                model.parameters.use(weights)
-                observes = ability(session.agent, Observes)
-                if observes is not None:
-                    observes.observe(pending.request.obs)
+        if session.agent is None:  # `_ready` ensures that there is one
+            raise NotReset(f"session {pending.session_id!r}: has no agent; reset it")
+        call = AbilityCall(**pending.request.kwargs)
+        with model.busy, model.uncaptured, model.call(call.member):
+            model.require_open()
+            model.parameters.use(weights)
+            result = call.execute(session.agent, pending.request.obs)
         pending.request.drop_observations()
+        return result
 
     def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
         """Finish the preparations of observations, and answer the requests whose preparation

@@ -13,16 +13,18 @@ import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO, ClassVar, TypeVar, cast
 from weakref import WeakKeyDictionary, finalize
 
 import numpy as np
 
+from vlagents_ray.abilities import InProcess, is_marked
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
+    NotReset,
     NotTrainable,
     PolicyFailed,
     PolicyUnavailable,
@@ -34,12 +36,15 @@ from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.engine.ability_call import AbilityCall, is_method, name_of
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.weights import HoldsWeights, ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights.safetensors import ValueSpec, read_values, write_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 from vlagents_ray.weights.trainable import portable, require_fit
+
+T = TypeVar("T")
 
 # Calls have no time limit here: as for any policy, Serve replaces a replica with an overdue call.
 _FOREVER_S = 1e6
@@ -64,6 +69,8 @@ class Child:
         # The process's description of the loaded policy, see `child_main`.
         self.loaded: dict[str, Any] = {}
         self.sessions: set[str] = set()  # names of the sessions in the child
+        # Whether the policy has an ability, by the name of its protocol.
+        self._abilities: dict[str, bool] = {}
         self._python = python
         self._settings = settings
         self._env_vars = env_vars
@@ -154,9 +161,27 @@ class Child:
         """
         self._dropped.put(name)
 
+    def has(self, protocol: type) -> bool:
+        """Return whether the loaded policy has an ability; the process is asked once for each."""
+        if self._process is None:
+            return False
+        name = name_of(protocol)
+        if name not in self._abilities:
+            self._abilities[name] = self.call_beside_acts(protocol=name)["has"]
+        return self._abilities[name]
+
     def call_for_weights(self, **call: Any) -> dict[str, Any]:
+        """Let the process execute a call for its weights, as `call_beside_acts` does."""
+        try:
+            return self.call_beside_acts(**call)
+        except ConnectionLost as error:
+            raise PolicyUnavailable(
+                f"weights: {error}, so that nothing was changed; push again"
+            ) from error
+
+    def call_beside_acts(self, **call: Any) -> dict[str, Any]:
         """Let the process execute a call (see `child_main`) while it acts, and return the result
-        or raise its error.
+        or raise its error; raise `ConnectionLost` if the process ends meanwhile.
         """
         with self._calling:
             process = self._process
@@ -165,9 +190,7 @@ class Child:
             _write(process, json.dumps(call).encode() + b"\n")
             line = process.stdout.readline()
         if not line:
-            raise PolicyUnavailable(
-                f"weights: {self._describe_end()}, so that nothing was changed; push again"
-            )
+            raise ConnectionLost(self._describe_end())
 
         answer: dict[str, Any] = json.loads(line)
         if "code" in answer:
@@ -334,11 +357,6 @@ class ChildAgent(Agent, HoldsWeights):
         self._child.start()
         self.weights_id = self._child.loaded["weights"]
 
-    def parameters(self) -> dict[str, Any]:
-        raise NotTrainable(
-            "the weights are in the policy's own process; a server replaces them there"
-        )
-
     def model_weights(
         self, busy: threading.Lock, digest: str, model: tuple[str, str]
     ) -> ModelWeights:
@@ -348,9 +366,6 @@ class ChildAgent(Agent, HoldsWeights):
         if self._session is None:
             self._session = self._child.open_session()
         return self._ask(Request("reset", obs, instruction, kwargs)).info or {}
-
-    def observe(self, obs: Obs) -> None:
-        self._ask(Request("observe", obs))
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Send the observations in one message; return the action or the error of each."""
@@ -362,11 +377,33 @@ class ChildAgent(Agent, HoldsWeights):
         missing = PolicyFailed("act: the policy's process answered without an action")
         return [reply.error or reply.act or missing for reply in self._child.call(requests)]
 
-    @property
-    def continues_plans(self) -> bool:
-        return bool(self._child.loaded.get("continues_plans"))
+    def forwarded(self, protocol: type[T]) -> T | None:
+        """Return an ability of the policy in the child, whose arguments and results are sent.
+
+        An ability whose values cannot be sent (`InProcess`) is used by the child itself: it
+        prepares observations, replaces weights and checks its health.
+        """
+        if is_marked(protocol, InProcess) or not self._child.has(protocol):
+            return None
+        return cast(T, _AbilityInChild(self, protocol))
+
+    def use_ability(self, call: AbilityCall, obs: Obs | None) -> Any:
+        """Let the child use an ability of this session's agent, or of the loaded policy before the
+        first reset, and return the result.
+
+        Raises:
+            NotReset: There is an observation, but no session.
+        """
+        if self._session is not None:
+            return (self._ask(Request("call", obs, kwargs=asdict(call))).info or {}).get("result")
+        if obs is not None:
+            raise NotReset(f"{call.member} before reset; reset first")
+        return self._child.call_beside_acts(**asdict(call))["result"]
 
     def check_health(self) -> None:
+        """Raise `PolicyUnavailable` if the child has ended, as it does if its policy is not
+        healthy.
+        """
         self._child.require_alive()
 
     def close(self) -> None:
@@ -395,6 +432,24 @@ class ChildAgent(Agent, HoldsWeights):
         session = getattr(self, "_session", None)  # missing if `__init__` did not run
         if session is not None:
             self._child.drop(session)
+
+
+class _AbilityInChild:
+    """An ability of the policy in a child process, with the members of its protocol."""
+
+    def __init__(self, agent: ChildAgent, protocol: type) -> None:
+        self._agent, self._protocol = agent, protocol
+
+    def __getattr__(self, name: str) -> Any:
+        if not is_method(self._protocol, name):
+            return self._agent.use_ability(AbilityCall(name_of(self._protocol), name), None)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            return self._agent.use_ability(
+                *AbilityCall.from_arguments(self._protocol, name, args, kwargs)
+            )
+
+        return call
 
 
 class ChildWeights(ModelWeights):

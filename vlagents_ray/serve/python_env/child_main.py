@@ -7,9 +7,9 @@ It needs the light install and pydantic, not Ray. The first line of its standard
 `Settings`, as JSON. It writes a line of JSON for each step of a long load and, when the policy is
 loaded, a line with the contract and the address of its `ShmServer`, which receives all requests; if
 the policy does not load, that line contains the error. Each further line of input is a call for new
-weights (see `_execute`), which is answered with a line of output while the policy acts; an empty
-line makes it close the policy and end. The end of its input, or the death of its parent, ends it at
-once.
+weights (see `_execute`) or of an ability of the loaded policy (`AbilityCall`), which is answered
+with a line of output while the policy acts; an empty line makes it close the policy and end. The
+end of its input, or the death of its parent, ends it at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from vlagents_ray.errors import (
     ConfigError,
     NotTrainable,
     PolicyFailed,
-    PolicyUnavailable,
     VLAgentsError,
 )
 from vlagents_ray.interface import Agent
@@ -37,6 +36,7 @@ from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
@@ -103,6 +103,8 @@ def run() -> None:
         answer({"step": step})
 
     def execute(call: dict[str, Any]) -> dict[str, Any]:
+        if "protocol" in call:
+            return _use_ability(agent, AbilityCall(**call))
         return _execute(engine.weights, **call)
 
     threading.Thread(target=_read_calls, args=[calls, execute, answer, over], daemon=True).start()
@@ -136,7 +138,6 @@ def run() -> None:
             "local": asdict(server.address),
             "contract": contract,
             "weights": models.weights,
-            "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
             "devices": models.devices,
             "trained": _describe_trained(agent, engine.weights),
@@ -146,7 +147,8 @@ def run() -> None:
     while not over.wait(_CHECK_S):
         try:
             engine.calls.require_device()
-        except PolicyUnavailable:
+            models.check_health()
+        except Exception:
             logging.getLogger(__name__).exception(
                 "the process ends, so that the replica is replaced"
             )
@@ -154,6 +156,25 @@ def run() -> None:
 
     engine.close()
     server.close()
+
+
+def _use_ability(agent: Agent, call: AbilityCall) -> dict[str, Any]:
+    """Return whether the loaded policy has an ability, or the result of a call, while it acts.
+
+    Raises:
+        PolicyFailed: The call failed; the cause is in the log.
+    """
+    if not call.member:
+        return {"has": call.is_available(agent)}
+    try:
+        return {"result": call.execute(agent, None)}
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        logging.getLogger(__name__).exception("%s failed", call.member)
+        raise PolicyFailed(
+            f"{call.member}: the policy raised {type(error).__name__}; see the server's log"
+        ) from error
 
 
 def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from in_process_replicas import Replicas
 from upstream_servers import CLOSED, SLOW, answer, upstream
 from websockets.exceptions import ConnectionClosedError
 
+from vlagents_ray.abilities import ChecksHealth, ability
 from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
@@ -160,7 +161,7 @@ def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(
     for error in agent.act_batch([seen(0), seen(1)], acting):
         assert isinstance(error, NoReplica)
         assert f"ws://127.0.0.1:{port}" in str(error)
-    agent.check_health()  # another replica would not help
+    assert ability(agent, ChecksHealth) is None  # another replica would not help
 
 
 @pytest.mark.parametrize(
