@@ -38,6 +38,24 @@ import numpy as np
 
 from vlagents_ray.interface import Agent, Obs
 
+__all__ = [
+    "Ahead",
+    "ChecksHealth",
+    "ContinuesPlans",
+    "Forwards",
+    "HasCheck",
+    "HasControl",
+    "HasStatistics",
+    "HasWeightsId",
+    "InProcess",
+    "Interruptible",
+    "Observes",
+    "Prepares",
+    "Sleeps",
+    "Trainable",
+    "ability",
+]
+
 T = TypeVar("T")
 
 
@@ -251,7 +269,7 @@ class Forwards(InProcess, Protocol):
 def ability(agent: Agent, protocol: type[T]) -> T | None:
     """Return the object whose methods are an ability of an agent.
 
-    It takes some microseconds: call it when a session begins, not at each action.
+    It takes about ten microseconds: call it when a session begins, not at each action.
 
     Args:
         agent: The agent.

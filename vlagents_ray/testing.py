@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.abilities import Prepares, ability
+from vlagents_ray.abilities import Prepares, Sleeps, Trainable, ability, members
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, kind_of
 from vlagents_ray.errors import InvalidAction, InvalidObservation, VLAgentsError
@@ -236,6 +236,9 @@ def check_agent(
                 alone[i][step], suite.act(i, session), f"act {step} of session {i}", because
             )
 
+    for protocol in (Trainable, Sleeps):
+        _require_whole(agent, protocol)
+
     # Prepared observations, also from several threads.
     if ability(agent, Prepares) is not None:
         because = "`prepare` must compute what `act` computes without it"
@@ -254,6 +257,18 @@ def check_agent(
                 where = f"act {step} of session {i} in a batch of {size}"
                 require_same(alone[i][step], act, where, because, atol)
     check_close(agent)
+
+
+def _require_whole(agent: Agent, protocol: type) -> None:
+    """Raise `ContractViolation` if an agent has only some methods of an ability, so that a server
+    uses none of them.
+    """
+    missing = [name for name in members(protocol) if getattr(agent, name, None) is None]
+    if missing and len(missing) < len(members(protocol)):
+        raise ContractViolation(
+            f"{type(agent).__name__}: expected all of {list(members(protocol))}, the methods of "
+            f"{protocol.__name__}, got none named {missing}; define both, or neither"
+        )
 
 
 def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/surface.txt"
 MODULES = (
     "vlagents_ray",
+    "vlagents_ray.abilities",
     "vlagents_ray.robot",
     "vlagents_ray.robot.leaders",
     "vlagents_ray.viewers",

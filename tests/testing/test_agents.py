@@ -219,6 +219,11 @@ class ParsesItInAct(ParsesItsInstruction):
         return super().act(obs)
 
 
+class SleepsForEver(GoodAgent):
+    def sleep(self) -> None:
+        """Free memory that nothing allocates again."""
+
+
 class AgentClosesOnce(GoodAgent):
     closed = False
 
@@ -288,6 +293,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (with_contract({}), "contract: expected a Contract or None, got dict"),
     (with_reset(lambda *_: None), "reset: expected a dict, got NoneType"),
     (with_reset(lambda agent, _: {"agent": agent}), r"info\['agent'\]"),
+    (SleepsForEver, r"expected all of \['sleep', 'wake'\].*got none named \['wake'\]"),
     (AgentClosesOnce, "the second call raised"),
 ]
 

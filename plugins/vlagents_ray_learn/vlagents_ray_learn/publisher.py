@@ -105,7 +105,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Push new weights to the policy, and return their version once all replicas hold them.
 
         Args:
-            values: The values by the names of `Agent.parameters`: numpy or JAX arrays or torch
+            values: The values by the names of `Trainable.parameters`: numpy or JAX arrays or torch
                 tensors, e.g. a `state_dict`. They are copied before this returns, so that the
                 learner can continue.
             mode: When sessions change to the version: at their next reset ("next_episode"), or

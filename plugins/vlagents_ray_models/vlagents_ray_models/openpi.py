@@ -257,7 +257,7 @@ class Transforms:
         return np.asarray(self.forward(data)["actions"], np.float32)
 
     def ranges(self, robot: RobotConvention) -> dict[str, Any] | None:
-        """Return `Agent.statistics` in the robot's units.
+        """Return `HasStatistics.statistics` in the robot's units.
 
         openpi's statistics are those of transformed numbers: some of ALOHA's joints change their
         sign, and most actions are relative to the state. Random numbers show which of the robot's

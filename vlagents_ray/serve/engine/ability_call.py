@@ -58,7 +58,7 @@ class AbilityCall:
             Exception: Any error of the method.
         """
         protocol: type = named_class(self.protocol)
-        able = ability(agent, protocol)
+        able: Any = ability(agent, protocol)
         if able is None or self.member not in members(protocol):
             raise PolicyFailed(
                 f"{type(agent).__name__}: expected the ability {self.protocol}, with "

@@ -321,7 +321,7 @@ def _is_set(config: LeRobotConfig, name: str) -> bool:
 
 
 def _ranges(model: LoadedLeRobot) -> dict[str, Any] | None:
-    """Return `Agent.statistics`, the ranges of the state and the actions in training.
+    """Return `HasStatistics.statistics`, the ranges of the state and the actions in training.
 
     The state is left out if its angles are wrapped, and the actions if they are relative to it.
     """
