@@ -234,7 +234,12 @@ def test_health_answers_at_once_though_the_policys_own_check_hangs(
     engine: Engine, agent: Hanging, monkeypatch: pytest.MonkeyPatch, hangs: bool
 ) -> None:
     monkeypatch.setattr("vlagents_ray.serve.endpoints.http._HEALTH_S", 0.05 if hangs else 30.0)
-    monkeypatch.setattr(Hanging, "check_health", lambda self: self.over.wait(60) if hangs else None)
+
+    def check_health(agent: Hanging) -> None:
+        if hangs:
+            agent.over.wait(60)
+
+    monkeypatch.setattr(Hanging, "check_health", check_health, raising=False)
     with TestClient(build_http_app(engine, dict, MessageLimits())) as client:
         assert client.get("/healthz").status_code == (503 if hangs else 200)
         agent.over.set()
