@@ -803,6 +803,7 @@ class OpenPi(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
+        """Whether a chunk continues the executed plan: that of a flow, with `actions: chunk`."""
         is_flow = self.model is not None and self.model.model.noise_shape is not None
         return is_flow and self.config.actions == "chunk"
 

@@ -138,6 +138,7 @@ class Pi0(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
+        """Whether a chunk continues the executed plan, as it does with `actions: chunk`."""
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedPi0:

@@ -112,6 +112,7 @@ class Reference(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
+        """Whether a chunk continues the executed plan, as it does with `actions: chunk`."""
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedReference:

@@ -75,6 +75,7 @@ class LeRobot(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
+        """Whether a chunk continues the executed plan: that of a flow, with `actions: chunk`."""
         model: LoadedLeRobot | None = self.model
         if model is None or not isinstance(model.sampler, samplers.FlowSampler):
             return False
