@@ -43,7 +43,7 @@ export RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S=86400
 export RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S=0.5
 # How often HAProxy asks a replica whether it lives, and how long that may take; after three failures in a row it gets no
 # new connections.
-export RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER=1s
+export RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER=500ms
 export RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL=3
 # s that a replica waits before it stops, for HAProxy to hear of it.
 export RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S=1

@@ -238,7 +238,7 @@ class KeyedReplica:
             frames=[],
         )
         way = _Near(self.local.address, Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
-        agent._connection = Connection(agent.url, lambda: way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
+        agent._connection = Connection(agent.url, lambda _: way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
         return agent
 
     def _on_own_port(

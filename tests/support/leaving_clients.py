@@ -293,7 +293,7 @@ class StoppableServer:
             frames=[],
         )
         transport = InProcess(engines)
-        agent._connection = Connection(agent.url, lambda: transport, CodecChoice("raw"), 5.0, 5.0)
+        agent._connection = Connection(agent.url, lambda _: transport, CodecChoice("raw"), 5.0, 5.0)
         return agent
 
 

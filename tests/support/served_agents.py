@@ -123,7 +123,7 @@ class Ledger(Agent):
         return super().act_batch(obs, sessions)
 
     def act(self, obs: Obs) -> Act:
-        time.sleep(0.002)
+        time.sleep(obs.info.get("slow_s", 0.002))
         self.acts += 1
         info = {
             "episode": self.episode,

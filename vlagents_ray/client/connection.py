@@ -10,9 +10,15 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
+from vlagents_ray.client.transports.base import (
+    CodecChoice,
+    ReplicaSilent,
+    ReplicaWatch,
+    Transport,
+)
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -33,9 +39,6 @@ from vlagents_ray.protocol.messages import (
     read_address,
 )
 
-if TYPE_CHECKING:
-    from vlagents_ray.client.transports.base import CodecChoice, Transport
-
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
@@ -44,22 +47,29 @@ _CLOSE_S = 2.0
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
 # The time limit for finding another replica, and the pause between two attempts, s.
 _LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0
+# The same while the present replica is silent: the load balancer may still choose that one, so the
+# first attempt, a third of this time, is short.
+_SILENT_LOOK_UP_S = 2.25
 # The time without any answer, s, over one or several calls, after which the next call uses another
-# replica.
+# replica, although the replica answers pings or cannot be pinged.
 SILENT_S = 5.0
+# The time for which a ping is unanswered, s, after which another replica is looked up, and after
+# which that one is used.
+_LOOK_UP_AFTER_S, FROZEN_S = 0.75, 2.0
 
 
 class Connection:
     """Connects on first use, and again after the connection is lost or the replica asks for it.
 
     A replica that asks for a reconnection still answers, so its connection is used until another
-    replica has answered. Only one thread may use a connection at a time.
+    replica has answered. So is that of a replica that answers no ping, since it may continue. Only
+    one thread may use a connection at a time.
     """
 
     def __init__(
         self,
         url: str,
-        new_transport: Callable[[], Transport],
+        new_transport: Callable[[ReplicaWatch], Transport],
         codec: CodecChoice,
         timeout_s: float,
         connect_timeout_s: float,
@@ -70,7 +80,8 @@ class Connection:
 
         Args:
             url: The URL of the server.
-            new_transport: Makes a transport to the server.
+            new_transport: Makes a transport to the server, which gives up a frozen replica by this
+                watch.
             codec: The choice of the codec of this connection.
             timeout_s: The default time limit of a call.
             connect_timeout_s: The default time limit of `open`.
@@ -81,8 +92,8 @@ class Connection:
         self.timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
         self._leaves_silent = leaves_silent
-        self._new_transport = new_transport
-        self.transport = new_transport()
+        self._make_transport = new_transport
+        self.transport = self._new_transport()
 
         # The server sends both when a transport connects; they are None before.
         self.metadata: dict[str, Any] | None = None
@@ -108,6 +119,9 @@ class Connection:
 
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
+
+    def _new_transport(self) -> Transport:
+        return self._make_transport(ReplicaWatch(self._on_silence if self._leaves_silent else None))
 
     def request_id(self) -> str:
         """Return a new id for a request."""
@@ -167,7 +181,8 @@ class Connection:
         """Switch to the next transport once it is connected. If it fails, keep the current one and
         retry later.
         """
-        if self._next is None or not self._next.ended:
+        is_due = self._asked_to_move or self._must_reconnect
+        if self._next is None or not self._next.ended or not is_due:
             return
         next_transport, self._next = self._next, None
         if next_transport.metadata is None:
@@ -180,6 +195,32 @@ class Connection:
         self.reconnects += 1
         self._must_reconnect = self._asked_to_move = False
         self._connected(next_transport.metadata)
+
+    def _on_silence(self, silent_s: float) -> None:
+        """Look for another replica while the present one does not answer a ping, and leave it when
+        another one has answered; called by the transport, see `ReplicaWatch`.
+
+        If there is no other one, the call goes on to wait.
+
+        Raises:
+            ReplicaSilent: Another replica is connected.
+        """
+        if silent_s < _LOOK_UP_AFTER_S:
+            return
+        if self._next is None and time.monotonic() >= self._look_up_at:
+            self._next = _NextTransport(self._new_transport(), _SILENT_LOOK_UP_S)
+        if silent_s < FROZEN_S or self._next is None or not self._next.ended:
+            return
+
+        next_metadata = self._next.metadata
+        if next_metadata is None or _is_same_replica(self.metadata, next_metadata):
+            self._drop_next()
+            self._look_up_at = time.monotonic() + _LOOK_UP_PAUSE_S
+            return
+        raise ReplicaSilent(
+            f"{self.url}: the replica has not answered a ping for {silent_s:.1f} s, while another "
+            "one answers; its process is frozen, or holds the interpreter's lock"
+        )
 
     def _drop_next(self) -> None:
         if self._next is not None:
@@ -211,6 +252,8 @@ class Connection:
             self._silent_since = None
             if self._old_transport is not None:
                 self._close_old_transport()
+            if self._next is not None and not self._asked_to_move:
+                self._drop_next()  # the replica was silent, and has answered after all
         except VLAgentsError as error:
             if isinstance(error, DeadlineExceeded):
                 self._silent_since = begun if self._silent_since is None else self._silent_since
@@ -250,7 +293,7 @@ class Connection:
         elif any(reply.draining for reply in replies):
             self._asked_to_move = True
             if self._next is None and time.monotonic() >= self._look_up_at:
-                self._next = _NextTransport(self._new_transport())
+                self._next = _NextTransport(self._new_transport(), _LOOK_UP_S)
         return replies
 
     def end_session(self, user: object, session: str) -> None:
@@ -284,11 +327,19 @@ class Connection:
             self._old_transport = None
 
 
+def _is_same_replica(metadata: dict[str, Any] | None, other: dict[str, Any]) -> bool:
+    """Return whether both metadata come from the same replica, whose addresses no other one has."""
+    names = ("local", "stream")
+    addresses = [None if metadata is None else metadata.get(name) for name in names]
+    return any(addresses) and addresses == [other.get(name) for name in names]
+
+
 class _NextTransport:
     """A transport that connects once, on its own thread."""
 
-    def __init__(self, transport: Transport) -> None:
+    def __init__(self, transport: Transport, timeout_s: float) -> None:
         self.transport = transport
+        self._timeout_s = timeout_s
         self.metadata: dict[str, Any] | None = None  # of the replica; None if there was no answer
         self.ended = False
         self._dropped = False
@@ -298,7 +349,7 @@ class _NextTransport:
     def _connect(self) -> None:
         metadata = None
         try:
-            metadata = self.transport.connect(_LOOK_UP_S)
+            metadata = self.transport.connect(self._timeout_s)
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 metadata = None
         except VLAgentsError as error:

@@ -177,6 +177,9 @@ class LocalAddress:
     # A flag: the frame of the reply is in the memory file that is sent with the message.
     IN_FILE: ClassVar[int] = 1
     COMPACT: ClassVar[int] = 2  # a flag: the content is in compact form, not a frame
+    # A client sends a ping as a message of one byte, which the server answers by another one.
+    PING: ClassVar[bytes] = b"?"
+    PONG: ClassVar[bytes] = b"!"
     # Maximum number of memory files of a client. A policy that keeps observations needs more than
     # one.
     FILES: ClassVar[int] = 16

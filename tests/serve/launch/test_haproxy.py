@@ -25,7 +25,7 @@ from ray.serve._private.constants import (
     RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER,
 )
 
-from vlagents_ray.client.connection import SILENT_S
+from vlagents_ray.client.connection import FROZEN_S
 from vlagents_ray.client.transports.http import refusal
 from vlagents_ray.errors import NoReplica, PolicyUnavailable
 from vlagents_ray.serve.launch.haproxy import (
@@ -231,7 +231,9 @@ def test_a_frozen_replica_is_out_of_the_way_when_its_clients_leave_it() -> None:
         seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_DOWNINTER),
     )
     every, failures = seconds(ROBOTS[_CHECK_INTERVAL]), int(ROBOTS[_CHECK_FAILURES])
-    assert every + every + (failures - 1) * (between + every) < SILENT_S
+    left_s = every + every + (failures - 1) * (between + every)
+    # Clients ping after half a second, and leave when a ping is not answered for `FROZEN_S`.
+    assert left_s <= 0.5 + FROZEN_S
 
 
 @needs_haproxy

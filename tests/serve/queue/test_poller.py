@@ -19,6 +19,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import PriorityName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
+from vlagents_ray.serve.queue import batch_queue
 from vlagents_ray.serve.queue.poller import Poller
 
 SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
@@ -149,13 +150,36 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(
     ours.close()
 
 
-def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None:
+def test_nobody_listens_beside_a_lone_session(
+    slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless a batch is long, as each may be on a busy machine."""
+    monkeypatch.setattr(batch_queue, "_LONG_BATCH_S", 60.0)
     one, before = slow(), threading.enumerate()
     one.start()
     one.learn("robot")
     assert "policy-reader" not in {
         thread.name for thread in threading.enumerate() if thread not in before
     }
+
+
+def test_another_thread_listens_beside_a_long_batch_of_a_lone_session(
+    slow: Callable[..., Slow],
+) -> None:
+    one, heard = slow(), threading.Event()
+    ours, theirs = socket.socketpair()
+    one.queue.poller.watch(ours, lambda: (ours.recv(1), heard.set()))
+    one.start()
+    one.learn("robot")
+    one.hold("robot")
+    theirs.send(b"x")
+    assert heard.wait(60)
+    one.open.set()
+    wait_for(lambda: one.called("answer robot"))
+    one.put("robot")  # the policy's thread polls again
+    theirs.close()
+    one.engine.close()
+    ours.close()
 
 
 def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(

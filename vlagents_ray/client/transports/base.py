@@ -8,7 +8,7 @@ import os
 import select
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol, get_args
 
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, InvalidInput
@@ -29,6 +29,10 @@ SPIN_S = 150e-6  # s to poll for an answer before sleeping
 DIRECT_S = 1.0
 FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is polled for
 
+# The time without an answer after which a replica is pinged, the shortest time between two pings of
+# a connection, and the time between two checks, s. A server permits one ping each second.
+_PING_AFTER_S, _PING_PERIOD_S, _CHECK_PERIOD_S = 0.5, 1.25, 0.25
+
 
 def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
     """Return the error for a request without an answer, with likely causes."""
@@ -46,6 +50,90 @@ def connection_lost(address: str, reason: object) -> ConnectionLost:
     )
 
 
+class ReplicaSilent(ConnectionLost):
+    """The client has left a replica that does not even answer pings: its process is frozen, or its
+    machine cannot be reached.
+
+    The connection is closed, so that the replica does not act on the request later.
+    """
+
+
+class ReplicaWatch:
+    """Finds out whether a replica that has not answered yet is alive, on one connection.
+
+    The replica is pinged. Something in its process answers even while the policy's thread runs a
+    long batch or a checkpoint is loaded, but nothing does while the process is frozen.
+    """
+
+    def __init__(self, on_silence: Callable[[float], None] | None = None) -> None:
+        """Watch a replica.
+
+        Args:
+            on_silence: Called several times a second while the replica does not answer a ping, with
+                the time since the first such ping, s. It raises `ReplicaSilent` to end the call. If
+                None, the replica is not pinged.
+        """
+        self._on_silence = on_silence
+        self._check_at = float("inf")  # time of the next check, time.monotonic()
+        self._pinged_at = float("-inf")  # time of the latest ping
+        # Time of the first ping since the last sign of life; None if none is unanswered.
+        self._silent_since: float | None = None
+
+    def begin(self) -> None:
+        """Begin to wait for an answer."""
+        if self._on_silence is not None:
+            self._check_at = time.monotonic() + _PING_AFTER_S
+
+    def received(self) -> None:
+        """Record a sign of life: the replica has sent or taken bytes."""
+        self._silent_since = None
+
+    def wait(
+        self,
+        connection: socket.socket,
+        event: int,
+        deadline: float,
+        ping: Callable[[], None] | None = None,
+    ) -> None:
+        """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`, and check the replica
+        meanwhile.
+
+        Args:
+            ping: Sends a ping, without waiting. None within a message, of which the replica has to
+                take bytes instead.
+
+        Raises:
+            TimeoutError: The deadline has passed.
+            ReplicaSilent: The replica is given up.
+        """
+        while True:
+            try:
+                wait(connection, event, min(deadline, self._check_at))
+            except TimeoutError:
+                if time.monotonic() >= deadline:
+                    raise
+            else:
+                return
+            self._check(connection, event, ping)
+
+    def _check(
+        self, connection: socket.socket, event: int, ping: Callable[[], None] | None
+    ) -> None:
+        now = time.monotonic()
+        self._check_at = now + _CHECK_PERIOD_S
+        if now - self._pinged_at >= _PING_PERIOD_S:
+            if ping is not None:
+                ping()
+            self._pinged_at = now
+            if self._silent_since is None:
+                self._silent_since = now
+
+        # This process may have been paused itself, with the answer waiting in the socket.
+        is_silent = self._silent_since is not None and not _is_ready(connection, event)
+        if is_silent and self._silent_since is not None and self._on_silence is not None:
+            self._on_silence(now - self._silent_since)
+
+
 class Transport(Protocol):
     """Sends requests, one frame at a time, to the replica of a server that `connect` chooses.
 
@@ -55,7 +143,8 @@ class Transport(Protocol):
 
     Raises:
         PolicyUnavailable: The server cannot be reached or is not ready.
-        ConnectionLost: The connection broke after the request was sent.
+        ConnectionLost: The connection broke after the request was sent, or its replica was given up
+            (`ReplicaSilent`).
         DeadlineExceeded: There was no answer in time.
     """
 
@@ -135,10 +224,22 @@ def wait(connection: socket.socket, event: int, deadline: float) -> None:
         raise TimeoutError
 
 
+def _is_ready(connection: socket.socket, event: int) -> bool:
+    """Return whether the socket is ready for `event` now."""
+    poller = select.poll()
+    poller.register(connection, event)
+    return bool(poller.poll(0))
+
+
 def await_answer(
-    poller: select.poll, connection: socket.socket, spin_until: float, deadline: float
+    poller: select.poll,
+    connection: socket.socket,
+    spin_until: float,
+    deadline: float,
+    watch: ReplicaWatch,
+    ping: Callable[[], None],
 ) -> None:
-    """Wait for `connection`, which `poller` polls, as `wait` does, but sleep only after
+    """Wait for `connection`, which `poller` polls, as `watch.wait` does, but sleep only after
     `spin_until`, s of `perf_counter`.
     """
     while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
@@ -146,7 +247,7 @@ def await_answer(
             # Other processes can use the core; waking up from a sleep would double the latency.
             os.sched_yield()
         else:
-            wait(connection, select.POLLIN, deadline)
+            watch.wait(connection, select.POLLIN, deadline, ping)
 
 
 class CodecChoice:

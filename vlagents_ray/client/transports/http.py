@@ -7,11 +7,13 @@ of a firewall, a tunnel of one port, or TLS, which ends at the proxy), the clien
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import select
 import socket
 import ssl
+import threading
 import time
 import uuid
 from collections.abc import Sequence
@@ -32,6 +34,8 @@ from vlagents_ray.client.transports.base import (
     SPIN_S,
     CodecChoice,
     ConnectReport,
+    ReplicaSilent,
+    ReplicaWatch,
     await_answer,
     connection_lost,
     first_timeout_s,
@@ -63,6 +67,7 @@ from vlagents_ray.protocol.messages import (
     read_address,
 )
 
+_PROBE_S = 5.0  # time limit of a ping
 _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
 
 
@@ -75,11 +80,21 @@ class HttpTransport:
     holds_sessions = False
 
     def __init__(
-        self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = ""
+        self,
+        url: str,
+        codec: CodecChoice,
+        credentials: Credentials = ANONYMOUS,
+        machine: str = "",
+        watch: ReplicaWatch | None = None,
     ) -> None:
-        """Set the server. With `machine` (see `MACHINE_HEADER`), the least loaded replica on that
-        machine is preferred.
+        """Set the server.
+
+        Args:
+            machine: The least loaded replica on this machine is preferred; see `MACHINE_HEADER`.
+            watch: Finds out whether a replica is frozen that is called at its own port. Through the
+                server's port, another replica might answer a ping.
         """
+        self._watch = watch
         self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
         self._codec = codec
@@ -191,7 +206,7 @@ class HttpTransport:
         host = self._url.hostname or ""
         name = f"[{host}]" if ":" in host else host
         url = self._url._replace(netloc=f"{name}:{address.port}", path=address.path)
-        self._direct = _Link(url, self._credentials)
+        self._direct = _Link(url, self._credentials, self._watch)
 
     def _call_direct(
         self, op: str, frame: bytes, headers: dict[str, str], deadline: float
@@ -232,8 +247,11 @@ class HttpTransport:
 class _Link:
     """A persistent connection to one address."""
 
-    def __init__(self, url: SplitResult, credentials: Credentials) -> None:
+    def __init__(
+        self, url: SplitResult, credentials: Credentials, watch: ReplicaWatch | None = None
+    ) -> None:
         self.url = url
+        self._watch = watch or ReplicaWatch()
         self._credentials = credentials
         self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
         self._poller = select.poll()  # polls the connection
@@ -246,7 +264,7 @@ class _Link:
 
         Raises:
             NoReplica: Nothing was sent, as the address cannot be reached.
-            ConnectionLost: The connection broke.
+            ConnectionLost: The connection broke, or the replica was given up.
             DeadlineExceeded: There was no answer in time.
         """
         begun = time.monotonic()
@@ -267,6 +285,9 @@ class _Link:
                     f"{DEFAULT_LIMITS.body_bytes} bytes; check the URL"
                 )
             return answer.status, answer.headers.get("content-type", ""), content
+        except ReplicaSilent:
+            self.close()
+            raise
         except TimeoutError as error:
             self.close()
             raise no_answer(self.url.geturl(), timeout_s) from error
@@ -321,8 +342,24 @@ class _Link:
         immediate.
         """
         begun = time.perf_counter()
-        await_answer(self._poller, sock, begun + (SPIN_S if self._answers_fast else 0.0), deadline)
+        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
+        self._watch.begin()
+        await_answer(self._poller, sock, spin_until, deadline, self._watch, self._ping)
+        self._watch.received()
         self._answers_fast = time.perf_counter() - begun < FAST_S
+
+    def _ping(self) -> None:
+        """Send a request over another connection, on another thread, since one connection carries
+        one request at a time. Whatever its answer, the process at the address is alive.
+        """
+        threading.Thread(target=self._probe, name="ping", daemon=True).start()
+
+    def _probe(self) -> None:
+        probe = http.client.HTTPConnection(self.url.hostname or "", self.url.port, timeout=_PROBE_S)
+        with contextlib.closing(probe), contextlib.suppress(OSError, http.client.HTTPException):
+            probe.request("GET", f"{self.url.path}/ping", headers=self._credentials.headers)
+            probe.getresponse()
+            self._watch.received()
 
 
 def _is_executed(answer: tuple[int, str, bytes]) -> bool:

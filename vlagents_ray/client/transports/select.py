@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.base import CodecChoice, Transport
+from vlagents_ray.client.transports.base import CodecChoice, ReplicaWatch, Transport
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
@@ -32,9 +32,16 @@ class AutoTransport:
     """
 
     def __init__(
-        self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool
+        self,
+        url: str,
+        codec: CodecChoice,
+        credentials: Credentials,
+        watch: ReplicaWatch | None = None,
+        *,
+        only_shm: bool,
     ) -> None:
         self._url = url
+        self._watch = watch
         self._codec = codec
         self._credentials = credentials
         self._only_shm = only_shm
@@ -87,14 +94,14 @@ class AutoTransport:
         if shm is not None:
             self._chosen = shm
         elif handle is not None:
-            channel = PlasmaTransport(parts.netloc)
+            channel = PlasmaTransport(parts.netloc, self._watch)
             try:
                 channel.connect_to(handle, metadata, left_s)
                 self._chosen, self._handle = channel, handle
             except (ConfigError, PolicyUnavailable):  # the replica is on another node
                 self._chosen, self._handle = handle, None
         else:
-            stream = WebSocketTransport(self._url, self._codec, self._credentials)
+            stream = WebSocketTransport(self._url, self._codec, self._credentials, self._watch)
             stream.connect_to(metadata, left_s)
             self._chosen = stream
         return metadata
@@ -127,7 +134,7 @@ class AutoTransport:
                     "one on another; use transport 'auto'"
                 )
             return None
-        transport = ShmTransport(local, self._credentials)
+        transport = ShmTransport(local, self._credentials, self._watch)
         try:
             transport.connect(timeout_s)
         except PolicyUnavailable:
@@ -139,9 +146,14 @@ class AutoTransport:
 
 
 def select_transport(
-    url: str, transport: str, codec: CodecChoice, credentials: Credentials
+    url: str,
+    transport: str,
+    codec: CodecChoice,
+    credentials: Credentials,
+    watch: ReplicaWatch | None = None,
 ) -> Transport:
-    """Return the transport for a URL.
+    """Return the transport for a URL. The `watch` finds out whether its replica is frozen, if the
+    transport can ping it.
 
     Raises:
         ConfigError: The URL does not support the transport.
@@ -161,10 +173,11 @@ def select_transport(
     credentials.use_at(url)
     if transport in ("handle", "plasma"):
         app = urlsplit(url).netloc
-        return HandleTransport(app) if transport == "handle" else PlasmaTransport(app)
+        return HandleTransport(app) if transport == "handle" else PlasmaTransport(app, watch)
     if transport in ("http", "websocket"):
-        kind = HttpTransport if transport == "http" else WebSocketTransport
-        return kind(url, codec, credentials)
+        if transport == "http":
+            return HttpTransport(url, codec, credentials, watch=watch)
+        return WebSocketTransport(url, codec, credentials, watch)
     if not is_in_cluster:
         http_url(url)  # raises for an invalid URL before anything is tried
-    return AutoTransport(url, codec, credentials, only_shm=transport == "shm")
+    return AutoTransport(url, codec, credentials, watch, only_shm=transport == "shm")

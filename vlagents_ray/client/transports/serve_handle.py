@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Protocol
 
 from vlagents_ray.client.transports.base import (
     ConnectReport,
+    ReplicaWatch,
     connection_lost,
     first_timeout_s,
     no_answer,
@@ -268,8 +269,8 @@ class PlasmaTransport(UnixTransport):
 
     name: ClassVar[str] = "plasma"
 
-    def __init__(self, app: str) -> None:
-        super().__init__()
+    def __init__(self, app: str, watch: ReplicaWatch | None = None) -> None:
+        super().__init__(watch)
         self._app = app
         self._handle = HandleTransport(app, must_be_near=True)
         self._channel: Any = None  # the ObjectRef of the channel

@@ -6,6 +6,7 @@ observations are in the object store instead.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import mmap
 import os
@@ -24,6 +25,8 @@ from vlagents_ray.client.credentials import ANONYMOUS, Credentials
 from vlagents_ray.client.transports.base import (
     FAST_S,
     SPIN_S,
+    ReplicaSilent,
+    ReplicaWatch,
     await_answer,
     connection_lost,
     no_answer,
@@ -48,7 +51,8 @@ class UnixTransport(ABC):
     name: ClassVar[str]
     holds_sessions = True
 
-    def __init__(self) -> None:
+    def __init__(self, watch: ReplicaWatch | None = None) -> None:
+        self._watch = watch or ReplicaWatch()
         self._server = ""  # the address of the server's socket
         self._key: str | None = None  # the API key, sent first
         self._socket: socket.socket | None = None
@@ -87,9 +91,13 @@ class UnixTransport(ABC):
         """
         deadline = time.monotonic() + timeout_s
         connection = self._socket or self._open(timeout_s)
+        self._watch.begin()
         try:
             self._send(connection, requests, deadline)
             return self._await(connection, requests, deadline)
+        except ReplicaSilent:
+            self.close()
+            raise
         except TimeoutError as error:
             raise no_answer(self.name, timeout_s) from error
         except OSError as error:
@@ -117,7 +125,7 @@ class UnixTransport(ABC):
                 try:
                     self._receive(connection)
                 except BlockingIOError:
-                    wait(connection, select.POLLIN, deadline)
+                    self._watch.wait(connection, select.POLLIN, deadline, self._ping)
             message, descriptor = self._write(requests, deadline)
             try:
                 _send_message(connection, message, deadline, descriptor)
@@ -135,9 +143,9 @@ class UnixTransport(ABC):
         begun = time.perf_counter()
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         while True:
-            await_answer(self._poller, connection, spin_until, deadline)
+            await_answer(self._poller, connection, spin_until, deadline, self._watch, self._ping)
             replies = self._receive(connection)
-            if replies[0].answers(requests[0]):
+            if replies and replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # the message was rejected before it was parsed
                     self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < FAST_S
@@ -165,10 +173,17 @@ class UnixTransport(ABC):
             self._poller = select.poll()
             self._poller.register(connection, select.POLLIN)
             self._socket = connection
+            self._watch.received()
         return self._socket
 
+    def _ping(self) -> None:
+        """Ping the server, unless the socket is full of messages that it has not read."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # the next read reports it
+                self._socket.send(LocalAddress.PING)
+
     def _receive(self, connection: socket.socket) -> list[Reply]:
-        """Return the next replies, to any requests.
+        """Return the next replies, to any requests; none if the next message answers a ping.
 
         Raises:
             BlockingIOError: There are none yet.
@@ -176,6 +191,9 @@ class UnixTransport(ABC):
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
             raise ConnectionResetError("the server closed the connection")
+        self._watch.received()
+        if size == len(LocalAddress.PONG):
+            return []
         freed, flags = LocalAddress.REPLY.unpack_from(self._buffer)
         if flags & LocalAddress.IN_FILE:
             descriptor = int.from_bytes(control[0][2][:4], sys.byteorder)
@@ -243,9 +261,14 @@ class ShmTransport(UnixTransport):
 
     name: ClassVar[str] = "shm"
 
-    def __init__(self, address: LocalAddress, credentials: Credentials = ANONYMOUS) -> None:
+    def __init__(
+        self,
+        address: LocalAddress,
+        credentials: Credentials = ANONYMOUS,
+        watch: ReplicaWatch | None = None,
+    ) -> None:
         """Set the server by its address, `local` in its metadata."""
-        super().__init__()
+        super().__init__(watch)
         self._server = f"\0{address.socket}"
         self._key = (credentials.api_key or "-") if address.keyed else None
         self._memories: list[_Memory] = []

@@ -37,6 +37,8 @@ from vlagents_ray.client.transports.base import (
     FAST_S,
     SPIN_S,
     CodecChoice,
+    ReplicaSilent,
+    ReplicaWatch,
     await_answer,
     connection_lost,
     first_timeout_s,
@@ -69,6 +71,7 @@ logger = logging.getLogger(__name__)
 # restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
+_PING_SENT_S = 1.0  # s for the rest of a ping of which the kernel has taken a part
 _READ_BYTES = 256 * 1024
 # The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
 _MAX_PIECES = 64
@@ -147,7 +150,8 @@ class Stream:
     """A connection to a replica's own port. The thread that waits for the answer reads and writes
     it.
 
-    No thread answers pings, so the server must rely on the kernel's keep-alive.
+    It pings the server while it waits for an answer. Nothing answers the server's pings meanwhile,
+    so the server must rely on the kernel's keep-alive.
     """
 
     def __init__(
@@ -157,6 +161,7 @@ class Stream:
         path: str,
         timeout_s: float,
         headers: Mapping[str, str] | None = None,
+        watch: ReplicaWatch | None = None,
     ) -> None:
         """Connect to `port` on the host of `base`.
 
@@ -166,6 +171,7 @@ class Stream:
         """
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
+        self._watch = watch or ReplicaWatch()
         self._protocol = ClientProtocol(
             parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"),
             max_size=DEFAULT_LIMITS.body_bytes,
@@ -196,6 +202,7 @@ class Stream:
                 if self._protocol.handshake_exc is not None:
                     raise self._protocol.handshake_exc
             self._received.attach(self._protocol)
+            self._watch.received()
         except BaseException:
             self._socket.close()
             raise
@@ -210,8 +217,12 @@ class Stream:
         Raises the errors of `recv`, and `OSError` if the server does not read all of it in time.
         """
         self._check_open()
+        self._watch.begin()
         try:
             self._send_message(pieces, time.monotonic() + timeout_s)
+        except ReplicaSilent:
+            self._silent = True
+            raise
         except TimeoutError as error:
             self._silent = True
             raise ConnectionAbortedError(
@@ -225,15 +236,18 @@ class Stream:
             ConnectionClosed: The server has closed the connection.
             OSError: The connection broke.
             TimeoutError: No message arrived in time.
+            ReplicaSilent: The server is given up.
         """
         begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         try:
             while not self._messages:
                 self._check_open()
-                await_answer(self._poller, self._socket, spin_until, deadline)
+                await_answer(
+                    self._poller, self._socket, spin_until, deadline, self._watch, self._ping
+                )
                 self._read(self._received.parse, deadline)
-        except TimeoutError:
+        except (TimeoutError, ReplicaSilent):
             self._silent = True
             raise
         self._silent = False
@@ -271,6 +285,7 @@ class Stream:
 
     def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
         count = self._socket.recv_into(self._read_memory)
+        self._watch.received()
         if count:
             parse(self._read_memory[:count])
         else:
@@ -279,6 +294,14 @@ class Stream:
             if isinstance(event, Frame) and event.opcode is Opcode.BINARY:
                 self._messages.append(bytes(event.data))
         self._flush(deadline)
+
+    def _ping(self) -> None:
+        """Ping the server, unless the socket is full of bytes that it has not read."""
+        self._protocol.send_ping(b"")
+        for piece in self._protocol.data_to_send():
+            with contextlib.suppress(BlockingIOError):
+                sent = self._socket.send(piece)
+                self._send(memoryview(piece)[sent:], time.monotonic() + _PING_SENT_S)
 
     def _flush(self, deadline: float) -> None:
         for piece in self._protocol.data_to_send():
@@ -303,7 +326,8 @@ class Stream:
             try:
                 data = data[self._socket.send(data) :]
             except BlockingIOError:
-                wait(self._socket, select.POLLOUT, deadline)
+                self._watch.wait(self._socket, select.POLLOUT, deadline)
+                self._watch.received()
 
 
 class WebSocketTransport:
@@ -312,8 +336,15 @@ class WebSocketTransport:
     name = "websocket"
     holds_sessions = True
 
-    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> None:
+    def __init__(
+        self,
+        url: str,
+        codec: CodecChoice,
+        credentials: Credentials = ANONYMOUS,
+        watch: ReplicaWatch | None = None,
+    ) -> None:
         self._credentials = credentials
+        self._watch = watch
         self._base = base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
         self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + "/v1/stream").geturl()
@@ -359,6 +390,9 @@ class WebSocketTransport:
                 replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
                 if replies[0].answers(requests[0]):
                     return replies
+        except ReplicaSilent:
+            self.close()
+            raise
         except TimeoutError as error:
             raise no_answer(self._url, timeout_s) from error
         except (ConnectionClosed, OSError) as error:
@@ -387,6 +421,7 @@ class WebSocketTransport:
                 self._address.path,
                 limit_s,
                 self._credentials.headers,
+                self._watch,
             )
         except TimeoutError:  # a firewall drops the packets: do not try again
             self._unreachable = True

@@ -60,6 +60,8 @@ _STAMP = struct.Struct("@qq")  # wall clock, s and ns
 STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a message's control data
 ANSWERS_S = 1.0  # maximum time for clients to receive their last answers when a server ends
 _POLL_MS = 2
+# Time in a socket after which the client of a message may have left, s. Clients wait longer.
+_LONG_WAIT_S = 0.25
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 AncillaryData = Sequence[tuple[int, int, bytes]]
@@ -487,6 +489,15 @@ def time_in_socket_s(control: AncillaryData) -> float:
             waited: float = time.time() - (seconds + nanoseconds * 1e-9)
             return waited if waited > LEAST_WAIT_S else 0.0
     return 0.0
+
+
+def is_abandoned(connection: socket.socket, waited_s: float) -> bool:
+    """Return whether a message that has waited in its socket for `waited_s` is not to be executed,
+    since its client has closed the connection meanwhile.
+
+    That is what a client does whose replica was frozen: its session goes on at another one.
+    """
+    return waited_s >= _LONG_WAIT_S and _has_hung_up(connection)
 
 
 def accept_open(listener: socket.socket) -> socket.socket | None:

@@ -26,6 +26,7 @@ from vlagents_ray.serve.endpoints.connection import (
     PolledConnection,
     ReadBuffer,
     has_unread,
+    is_abandoned,
     time_in_socket_s,
     wait_delivered,
 )
@@ -183,7 +184,10 @@ class MessageConnection(PolledConnection):
         try:
             size = _DISCARD_BYTES if is_over else self._bytes_to_read()
             data, control = read_buffer.receive(self._connection, size)
-            self._arrived = time.perf_counter() - time_in_socket_s(control)
+            waited_s = time_in_socket_s(control)
+            self._arrived = time.perf_counter() - waited_s
+            if is_abandoned(self._connection, waited_s):
+                data = b""
         except BlockingIOError:
             return False
         except OSError as error:

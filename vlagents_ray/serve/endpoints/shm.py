@@ -39,6 +39,7 @@ from vlagents_ray.protocol.messages import (
     boot_id,
     peer_process,
 )
+from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.access.charges import REFUSALS, REFUSED
 from vlagents_ray.serve.endpoints import answers
@@ -56,12 +57,14 @@ from vlagents_ray.serve.endpoints.connection import (
     ReadBuffer,
     enable_timestamps,
     has_unread,
+    is_abandoned,
     time_in_socket_s,
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.requests import IncomingMessage
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
@@ -168,6 +171,7 @@ class UnixConnection(PolledConnection):
         self._refused_keys = 0  # number of messages whose key was refused
         self._unanswered = 0  # number of unanswered messages
         self._paused = False  # whether too many messages are unanswered
+        self._pings = TokenBucket(CONTROL_FRAMES_PER_S, self._connected_at, CONTROL_FRAMES)
         if isinstance(server.admit, NoKey):
             self.account.identify(server.admit)
             self._sender = Sender(server.engine, server.name, caller=server.admit)
@@ -186,9 +190,9 @@ class UnixConnection(PolledConnection):
             data, control = memoryview(b""), []
 
         descriptors = _descriptors_in(control)
+        waited_s = time_in_socket_s(control)
         try:
-            if not data:
-                self.disconnect()
+            if self._is_end_or_ping(data, waited_s):
                 return
             with self._sending:
                 self._unanswered += 1
@@ -197,7 +201,7 @@ class UnixConnection(PolledConnection):
                 with self._sending:
                     self._unanswered -= 1  # a valid key is not answered
             else:
-                self._receive(sender, message, time_in_socket_s(control), data, descriptors)
+                self._receive(sender, message, waited_s, data, descriptors)
         except VLAgentsError as error:
             self._refuse(message, error)
             if self._sender is None:
@@ -217,6 +221,25 @@ class UnixConnection(PolledConnection):
             self._paused = self._unanswered >= MOST_UNANSWERED and not self._ended
         if self._paused:
             self._pause(BACKLOGGED)
+
+    def _is_end_or_ping(self, data: memoryview, waited_s: float) -> bool:
+        """Handle the end of the connection, or a ping; return False for any other message."""
+        if not data or is_abandoned(self._connection, waited_s):
+            self.disconnect()
+            return True
+        is_ping = self._sender is not None and data == LocalAddress.PING
+        if is_ping:
+            self._answer_ping()
+        return is_ping
+
+    def _answer_ping(self) -> None:
+        """Answer a ping; end a connection that sends more pings than a WebSocket may send."""
+        if self._pings.take(time.monotonic()) > 0:
+            self.end(f"more than {CONTROL_FRAMES} pings at once")
+            return
+        with self._sending, contextlib.suppress(OSError):  # the client is gone, or does not read
+            if not self._ended:
+                self._connection.send(LocalAddress.PONG)
 
     def _receive(
         self,

@@ -27,6 +27,7 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelCache, ModelManager
+from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.call_limits import PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
@@ -126,6 +127,7 @@ class Engine:
             raise self.health.fail_loading(error) from error
         if self.settings.threaded:
             self.pauses.start()
+            each_half_second.add(self.queue.lend_poller)
         self.health.finish_loading()
 
     @property
@@ -162,6 +164,7 @@ class Engine:
     def close(self) -> None:
         """Answer waiting requests with 503, finish the running batch, and close the agents."""
         self.pauses.stop()
+        each_half_second.remove(self.queue.lend_poller)
         self.admission.close()
         self.stop(timeout_s=30)
         self.intake.close()

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+# Wait of a message in a pause of the process, s, in which its caller may have left, and the time in
+# which the event loop notices that, s.
+_LONG_WAIT_S, _NOTICE_S = 0.25, 0.02
+
 
 class Sender:
     """Submits the requests of a connection, whose end also ends its sessions, or of a caller
@@ -228,6 +232,9 @@ class Sender:
         loop = asyncio.get_running_loop()
         waiting = WaitingTask()
         waited_s = self._engine.pauses.waited_s()
+        if waited_s > _LONG_WAIT_S:
+            # The caller may have left during the pause; this lets the loop read that, and cancel.
+            await asyncio.sleep(_NOTICE_S)
         sent = self.send(message, decoded, waiting, admission=admission, waited_s=waited_s)
 
         timer = None

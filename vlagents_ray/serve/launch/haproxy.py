@@ -65,10 +65,10 @@ ROBOTS = {
     # Period of the health check of HAProxy and its actor; after three failures Serve restarts them,
     # in about 2 s.
     "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "0.5",
-    # A replica that does not reply within 1 s, three times in a row, gets no new connections and
-    # sessions: within 5 s after it froze, when its clients reconnect
-    # (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15 s.
-    _CHECK_INTERVAL: "1s",  # also the time limit of a reply
+    # A replica that does not reply within 0.5 s, three times in a row, gets no new connections and
+    # sessions: 2 to 2.5 s after it froze, when its clients reconnect
+    # (`vlagents_ray.client.connection.FROZEN_S`). Serve's defaults take 15 s.
+    _CHECK_INTERVAL: "500ms",  # also the time limit of a reply
     _CHECK_FAILURES: "3",
     # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
     "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",

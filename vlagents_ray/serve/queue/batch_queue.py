@@ -28,6 +28,7 @@ from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.requests import PendingRequest
 
 _SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
+_LONG_BATCH_S = 0.5  # duration of a batch after which another thread polls in any case
 _DENSE_S = 500e-6  # interval between two requests below which the next one is expected as quickly
 
 
@@ -170,6 +171,14 @@ class BatchQueue:
         self._running = batch
         if self.window.overlaps:
             self.poller.hand_to_reader()
+
+    def lend_poller(self) -> None:
+        """Let another thread poll if the running batch takes long, so that clients' pings are
+        answered meanwhile; called periodically, on another thread.
+        """
+        with self._lock:
+            if self._running and self._clock() - self._begun > _LONG_BATCH_S:
+                self.poller.hand_to_reader()
 
     def end(self) -> None:
         """Record that the batch has ended."""

@@ -1,0 +1,225 @@
+"""The longest time without an action when a replica is killed or frozen, or HAProxy is killed.
+
+Robots act at 20 Hz over each transport, with time limits far above these times: nothing here is
+recovered because a call has timed out.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from eval_fakes import wait_for
+
+from tests.integration.conftest import serving, states
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.serve.launch.server import Server
+
+REPLICAS, ROBOTS = 2, 6
+TIMEOUT_S = 60.0
+FROZEN_S = 12.0  # time after which a frozen replica continues
+FRAME = np.zeros((8, 8, 3), np.uint8)
+FAULTS = ("kill", "freeze", "kill of HAProxy")
+
+# The longest time without an action, s: about twice what two shared cores need. Clients find out in
+# 2.5 s that a replica is frozen. HAProxy is back about 3 s after its end.
+BOUNDS_S: dict[tuple[TransportName, str], float] = {
+    ("shm", "kill"): 4.0,
+    ("websocket", "kill"): 4.0,
+    ("http", "kill"): 4.0,
+    ("shm", "freeze"): 6.0,
+    ("websocket", "freeze"): 6.0,
+    ("http", "freeze"): 6.0,
+    ("shm", "kill of HAProxy"): 2.0,
+    ("websocket", "kill of HAProxy"): 2.0,
+    ("http", "kill of HAProxy"): 12.0,
+}
+
+
+@dataclass
+class Robot:
+    """A session that acts at 20 Hz, and notes each answer."""
+
+    agent: RemoteAgent
+    name: str
+    pid: int = 0  # the process of its replica
+    number: int = 0  # of the latest observation
+    answered: list[float] = field(default_factory=list)  # time.monotonic(), s
+    error: BaseException | None = None
+
+    def begin(self) -> None:
+        """Begin the episode."""
+        self.pid = self.agent.reset(self.observation(-1), self.name)["pid"]
+
+    def observation(self, number: int) -> Obs:
+        return Obs({"front": FRAME}, info={"episode": self.name, "number": number})
+
+    def act_until(self, stop: threading.Event) -> None:
+        """Act until then."""
+        try:
+            while not stop.wait(0.05):
+                info = self.agent.act(self.observation(self.number)).info
+                assert (info["episode"], info["number"]) == (self.name, self.number), "crossed"
+                self.pid = info["pid"]
+                self.number += 1
+                self.answered.append(time.monotonic())
+        except BaseException as error:  # noqa: BLE001 - the test raises it
+            self.error = error
+
+    def longest_gap_s(self, since: float) -> float:
+        """Return the longest time between two answers after `since`, or around it."""
+        before = [moment for moment in self.answered if moment <= since][-1:]
+        after = [moment for moment in self.answered if moment > since]
+        moments = [*before, *after]
+        return max(later - earlier for earlier, later in pairwise(moments))
+
+
+@pytest.fixture(scope="module")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("ledger")
+
+
+@pytest.fixture(scope="module")
+def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
+    with serving(
+        "served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS
+    ) as server:
+        yield server
+
+
+def executed(ledger: Path, name: str) -> list[tuple[int, int, float]]:
+    """Which observations of a robot replicas acted on: number, process, time.monotonic()."""
+    acts = []
+    for file in ledger.iterdir():
+        for line in file.read_text().splitlines():
+            at, session, episode, number = line.split()
+            assert session == episode, "crossed"
+            if episode == name:
+                acts.append((int(number), int(file.name), int(at) / 1e9))
+    return acts
+
+
+def haproxy_processes() -> list[int]:
+    """The HAProxy in front of this process's Ray."""
+    folder = Path(os.environ["RAY_SERVE_HAPROXY_CONFIG_FILE_LOC"]).parent
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        words = process.info["cmdline"] or []
+        is_ours = any(word.startswith(f"{folder}/") for word in words)
+        if is_ours and Path(words[0]).name == "haproxy":
+            found.append(process.pid)
+    return found
+
+
+@contextmanager
+def acting(server: Server, transport: TransportName) -> Iterator[list[Robot]]:
+    """Robots that act, some at each replica."""
+    names = [f"{transport}-{time.monotonic_ns()}-{number}" for number in range(ROBOTS)]
+    robots = [
+        Robot(RemoteAgent(server.url, transport=transport, timeout_s=TIMEOUT_S), name)
+        for name in names
+    ]
+
+    def are_spread() -> bool:
+        for robot in robots:
+            robot.agent.close()
+            robot.begin()
+        return len({robot.pid for robot in robots}) == REPLICAS
+
+    wait_for(are_spread, 120)
+    stop = threading.Event()
+    threads = [threading.Thread(target=robot.act_until, args=(stop,)) for robot in robots]
+    for thread in threads:
+        thread.start()
+    try:
+        wait_for(lambda: all(len(robot.answered) > 20 or robot.error for robot in robots), 60)
+        yield robots
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+        for robot in robots:
+            robot.agent.close()
+
+
+def have_acted_since(robots: list[Robot], moment: float) -> Callable[[], bool]:
+    """Whether each has acted on an observation that was made after that."""
+    return lambda: all(
+        robot.error is not None or len([at for at in robot.answered if at > moment]) > 5
+        for robot in robots
+    )
+
+
+@pytest.mark.alone
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("transport", ["shm", "websocket", "http"])
+def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
+    server: Server, ledger: Path, transport: TransportName, fault: str
+) -> None:
+    wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
+    with acting(server, transport) as robots:
+        hit = robots[0].pid
+        victims = haproxy_processes() if fault == "kill of HAProxy" else [hit]
+        assert victims
+        began = time.monotonic()
+        for pid in victims:
+            os.kill(pid, signal.SIGSTOP if fault == "freeze" else signal.SIGKILL)
+        try:
+            left = robots if fault == "kill of HAProxy" else [r for r in robots if r.pid == hit]
+            wait_for(have_acted_since(robots, began + 0.2), TIMEOUT_S)
+            if fault != "kill of HAProxy":
+                wait_for(lambda: all(robot.error or robot.pid != hit for robot in left), TIMEOUT_S)
+            gap_s = max(robot.longest_gap_s(began) for robot in robots)
+            if fault == "freeze":
+                time.sleep(max(0.0, began + FROZEN_S - time.monotonic()))
+        finally:
+            with suppress(ProcessLookupError):
+                os.kill(hit, signal.SIGCONT)
+        time.sleep(2.0)  # the acts of a frozen replica are late now
+
+    print(f"{transport}, {fault}: {len(left)} robots hit, no action for {gap_s:.1f} s")
+    assert not [robot.error for robot in robots if robot.error is not None]
+    for robot in robots:
+        acts = executed(ledger, robot.name)
+        late = [act for act in acts if act[1] == hit and fault != "kill of HAProxy"]
+        late = [act for act in late if act[2] > began + 0.5 and robot in left]
+        assert not late, f"{robot.name}: executed after its robot had left: {late}"
+        for process in {pid for _, pid, _ in acts}:
+            numbers = [number for number, pid, _ in acts if pid == process]
+            assert len(set(numbers)) == len(numbers), f"{robot.name}: doubled"
+    assert gap_s < BOUNDS_S[transport, fault]
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.parametrize("transport", ["shm", "websocket", "http"])
+def test_a_session_stays_at_a_replica_whose_policy_is_slow(
+    server: Server, transport: TransportName
+) -> None:
+    """Its first slow act, after fast ones: something else in its process answers."""
+    wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
+    with RemoteAgent(server.url, transport=transport, timeout_s=TIMEOUT_S) as agent:
+        robot = Robot(agent, f"slow-{transport}")
+        robot.begin()
+        for _ in range(20):
+            agent.act(robot.observation(0))
+        observation = robot.observation(1)
+        observation.info["slow_s"] = 8.0
+        act = agent.act(observation)
+        assert act.info["pid"] == robot.pid
+        assert act.info["acts"] == 21
+        assert "resumed" not in act.info
+        assert agent.act(robot.observation(2)).info["acts"] == 22
