@@ -30,8 +30,8 @@ from vlagents_ray import (
     RemoteAgent,
     UnknownSession,
 )
-from vlagents_ray.client import agent as client_agent
-from vlagents_ray.client import connection
+from vlagents_ray.client import connection, recovery
+from vlagents_ray.client.transports.base import ReplicaSilent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import NoReplica, UnknownApp, VLAgentsError
 from vlagents_ray.serve.scaling import session_migration
@@ -41,7 +41,7 @@ from vlagents_ray.serve.scaling import session_migration
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
     """The client's."""
     clock = SimulatedTime()
-    for module in (connection, client_agent):
+    for module in (connection, recovery):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
@@ -498,6 +498,35 @@ def test_a_replica_that_has_fallen_silent_is_left(
     assert act.action.tolist() == [1, 2, 3]
     assert "resumed" not in agent.act(obs(4)).info
     agent.close()
+
+
+def test_a_session_that_has_left_a_silent_replica_begins_again_without_a_search(
+    begun: Begun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too late for its own call, whose error says so; the next one begins with a reset."""
+    served, agent = begun(2)
+    agent.act(obs(2))
+    call, ops = InProcess.call, []
+
+    def silent(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        ops.append((self._number, requests[0].op))
+        if self._number == 0:
+            self.close()
+            raise ReplicaSilent("no answer to a ping")
+        return call(self, requests, timeout_s)
+
+    monkeypatch.setattr(InProcess, "call", silent)
+    with monkeypatch.context() as patch:
+        patch.setattr(recovery, "_RESERVE_SHARE", 1.0)  # no time is left for a second attempt
+        patch.setattr(recovery, "_RESERVE_S", 60.0)
+        with pytest.raises(ReplicaSilent):
+            agent.act(obs(3))
+    served.dead.add(0)
+    act = agent.act(obs(4))
+    assert ops == [(0, "act"), (1, "reset"), (1, "act")]
+    assert act.info["resumed"]
+    assert act.action.tolist() == [1, 2, 4]
+    assert "resumed" not in agent.act(obs(5)).info
 
 
 def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_the_connection(

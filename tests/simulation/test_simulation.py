@@ -20,7 +20,7 @@ from tests.simulation.world import Replica, World
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
 from vlagents_ray.serve.scaling import session_migration
-from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.sessions import Session, SessionState
 
 # It finds each bug below within so many.
 SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "2000"))
@@ -104,14 +104,13 @@ def export_at_once(replica: Replica) -> None:
     """To copy a session is to give it up, whether or not the one who asked still waits."""
     held = replica.migrator.sessions
 
-    async def copy(session_id: str, offered: bool = False) -> dict[str, Any] | None:
-        asked = replica.engine.clock()
-        state = await held._ask(session_id, "export", None)
-        if state is not None:
-            state["age_s"] = asked - state.pop("began")
-            replica.engine.sessions.close(session_id)
-            replica.engine.sessions._left.clear()
-        return state
+    async def copy(session_id: str, offered: bool = False) -> SessionState | None:
+        info = await held._ask(session_id, "export", None, asked=replica.engine.clock())
+        if info is None:
+            return None
+        replica.engine.sessions.close(session_id)
+        replica.engine.sessions._left.clear()
+        return SessionState.from_info(info)
 
     async def release(*_: Any) -> bool:
         return True

@@ -14,7 +14,7 @@ from in_flight import Calls, answered
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
-from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, ReplicaWatch
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
 from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.frames import (
@@ -37,6 +37,7 @@ from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
+from vlagents_ray.serve.sessions import SessionState
 
 
 class Replicas:
@@ -109,7 +110,7 @@ class InProcess:
     name = "in process"
     holds_sessions = True
 
-    def __init__(self, replicas: Replicas) -> None:
+    def __init__(self, replicas: Replicas, watch: ReplicaWatch) -> None:
         self._replicas = replicas
         self._sender: Sender | None = None
         self._number = -1
@@ -183,18 +184,12 @@ class _Peer(Peer):
         return await getattr(sessions, method.__name__)(*args)
 
 
-def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
+def export(engine: Engine, session_id: str) -> SessionState | None:
     """Take a session out of a replica, as another one does that adopts it; None if it stays."""
     copied = answered(engine, session_id, Request("export"))
     if copied.info is None:
         return None
-    released = answered(
-        engine, session_id, Request("release", kwargs={"version": version_of(copied.info)})
-    )
+    state = SessionState.from_info(copied.info)
+    released = answered(engine, session_id, Request("release", kwargs={"version": state.version}))
     assert released.info == {"released": True}
-    return copied.info
-
-
-def version_of(state: dict[str, Any]) -> tuple[int, int]:
-    """The version of what was exported."""
-    return state["steps"], state["moves"]
+    return state

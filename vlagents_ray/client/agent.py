@@ -6,30 +6,23 @@ import copy
 import math
 import os
 import time
-import uuid
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.recovery import ClientSession, ResumePoint, call_with_recovery
 from vlagents_ray.client.transports.base import CodecChoice, CodecName
 from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
-    ConnectionLost,
-    DeadlineExceeded,
     InvalidObservation,
-    NoReplica,
-    NotReset,
     PolicyFailed,
-    PolicyUnavailable,
-    UnknownSession,
-    VLAgentsError,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
@@ -41,187 +34,6 @@ from vlagents_ray.tracing import TRACEPARENT, tracer
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Errors after which no replica has the session; it is `NotReset` if the session could not be
-# resumed in time.
-_LOST = (NotReset, UnknownSession)
-# Errors after which another replica may answer; a running replica refuses a reset if it is full,
-# for instance.
-_RETRYABLE = {
-    "reset": (ConnectionLost, NoReplica),
-    "act": (ConnectionLost, PolicyUnavailable, *_LOST),
-}
-_FIRST_PAUSE_S = 0.02
-_LONGEST_PAUSE_S = 0.5
-# No attempt begins with less time left than the smaller of these, in s and as a share of the time
-# limit: a late request would be executed after its caller has given up.
-_RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
-
-
-@dataclass(slots=True)
-class EpisodeState:
-    """The arguments with which an episode was begun, and what is needed to resume it."""
-
-    obs: Obs  # the first observation
-    instruction: str | None
-    kwargs: dict[str, Any]
-    contract: dict[str, Any] | None
-    # The last observations that were answered.
-    recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))
-    step: int | None = 0  # the server's count of acts; None if an answer may be lost
-
-
-class ClientSession:
-    """One session of a connection, and its requests."""
-
-    def __init__(self, connection: Connection, priority: PriorityName) -> None:
-        self.id = uuid.uuid4().hex
-        # None before the first reset and after the end of an episode.
-        self.episode: EpisodeState | None = None
-        self.step: int | None = None  # the server's count in its last reply, of any episode
-        self.resumed = False  # whether the episode was resumed and no action has reported it yet
-        self._connection = connection
-        self._priority: PriorityName = priority
-
-    def reset(self, episode: EpisodeState) -> Request:
-        """Return the request that begins `episode`, or resumes it at its current step."""
-        return Request(
-            "reset",
-            episode.obs,
-            episode.instruction,
-            episode.kwargs,
-            episode.contract,
-            history=list(episode.recent),
-            session=self.id,
-            priority=self._priority,
-            step=self.step,
-            request_id=self._connection.request_id(),
-        )
-
-    def act(self, obs: Obs) -> Request:
-        """Return the request for an action; raises `NotReset` outside an episode."""
-        if self.episode is None:
-            raise NotReset(
-                "expected a reset before act: this agent has no session, or lost it; reset it"
-            )
-        return Request(
-            "act",
-            obs,
-            session=self.id,
-            priority=self._priority,
-            step=self.episode.step,
-            request_id=self._connection.request_id(),
-        )
-
-    def begun(self, reply: Reply) -> None:
-        """Record the reply that began, resumed or continued the episode."""
-        self.step = reply.step
-        if self.episode is not None:
-            self.episode.step = reply.step
-
-    def is_lost(self, reply: Reply) -> bool:
-        """Return whether the session must be resumed; if not, its replica checks that no answer
-        was lost.
-        """
-        return isinstance(reply.error, _LOST) or self.episode is None or self.episode.step is None
-
-    def begin_again(self, request: Request) -> Request:
-        """Return the reset that resumes the session under a new id; `request` follows it, with that
-        id.
-
-        With a new id, any later reply to `request` comes from the new session, even if the reply to
-        the reset is late.
-        """
-        if self.episode is None:
-            raise NotReset("act before reset; reset first")
-        self.id = request.session = uuid.uuid4().hex
-        self.resumed = True
-        return self.reset(self.episode)
-
-
-def call_with_recovery(
-    connection: Connection,
-    sessions: Sequence[ClientSession],
-    requests: Sequence[Request],
-    timeout_s: float,
-) -> list[Reply]:
-    """Return the reply to one request of each session, from another replica if the session's
-    replica is gone.
-
-    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded`
-    for a session that is not resumed yet. The first action after an episode was resumed has
-    `info["resumed"]`.
-    """
-    deadline = time.monotonic() + timeout_s
-    last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
-    replies = connection.call(requests, timeout_s)
-    first_errors = [reply.error for reply in replies]
-
-    lost: set[int] = set()  # indices of the sessions whose state no replica has
-    pause_s = 0.0
-    while True:
-        failed = [
-            i
-            for i, reply in enumerate(replies)
-            if isinstance(reply.error, _RETRYABLE[requests[i].op])
-        ]
-        if not failed or time.monotonic() + pause_s >= last_attempt:
-            break
-        time.sleep(pause_s)
-        pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s + _FIRST_PAUSE_S)
-
-        # Resume the lost sessions by a reset.
-        lost |= {i for i in failed if requests[i].op == "act" and sessions[i].is_lost(replies[i])}
-        to_resume = [i for i in failed if i in lost]
-        if to_resume:
-            resets = [sessions[i].begin_again(requests[i]) for i in to_resume]
-            reset_replies = connection.call(resets, deadline - time.monotonic())
-            for i, reply in zip(to_resume, reset_replies, strict=True):
-                if reply.error is None:
-                    sessions[i].begun(reply)
-                    requests[i].step = reply.step
-                    lost.discard(i)
-                else:
-                    replies[i] = reply
-        if time.monotonic() >= last_attempt:
-            break
-
-        # Send the requests of all other sessions again, those just resumed included.
-        to_send = [i for i in failed if i not in lost]
-        if to_send:
-            for i in to_send:
-                requests[i].request_id = connection.request_id()
-            new_replies = connection.call(
-                [requests[i] for i in to_send], deadline - time.monotonic()
-            )
-            for i, reply in zip(to_send, new_replies, strict=True):
-                replies[i] = reply
-
-    for session, request, reply, first_error in zip(
-        sessions, requests, replies, first_errors, strict=True
-    ):
-        # The messages of these errors advise a reset, which is not needed here.
-        if isinstance(reply.error, _LOST) and request.op == "act":
-            reply.error = DeadlineExceeded(
-                f"the session did not begin again within {timeout_s:g} s; the next act does"
-            )
-        reply.error = _with_cause(reply.error, first_error)
-        if session.resumed and reply.act is not None:
-            reply.act.info["resumed"], session.resumed = True, False
-    return replies
-
-
-def _with_cause(
-    error: VLAgentsError | None, first_error: VLAgentsError | None
-) -> VLAgentsError | None:
-    """Return the last error of a call with the loss of the connection that came before it: an
-    address that does not answer any more is no cause.
-    """
-    if error is first_error or not isinstance(first_error, ConnectionLost):
-        return error
-    if not isinstance(error, PolicyUnavailable | DeadlineExceeded):
-        return error
-    return type(error)(f"{error}; before that: {first_error}")
-
 
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
@@ -230,9 +42,10 @@ class RemoteAgent(Agent):
     another replica within `timeout_s`. If the old replica still runs, the session moves with all
     its state. Otherwise the client resumes it with the same instruction and options and sends the
     last observations (`Contract.history` of them; see `Observes.observe`); `act.info["resumed"]` is
-    then set. If a replica has not answered for 5 s (in one call, or in several that reached their
-    deadlines), the next call uses another replica, if one answers. A session never acts twice on
-    one observation.
+    then set. A replica whose process is frozen, so that it answers no ping for 2 s, is left as soon
+    as another one answers. If a replica has not answered for 5 s in calls that reached their
+    deadlines, the next call uses another replica, if one answers. A session never acts twice on one
+    observation.
     """
 
     statistics: dict[str, Any] | None = None
@@ -262,8 +75,8 @@ class RemoteAgent(Agent):
                 replica on this node, else a Serve handle. The others force one. `agent.transport`
                 names it, once connected.
             timeout_s: Time limit of a `reset` or `act`; an observation's `info["deadline_ms"]`
-                shortens it for its `act`. 2 to 5 s suit a robot, since a call to a hung replica
-                lasts until this limit.
+                shortens it for its `act`. 2 to 5 s suit a robot, since a call to a policy that
+                hangs lasts until this limit.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still
                 loading, by default `timeout_s`; after 2 s, a warning is logged.
             codec: The encoding of images for a network: "auto" is JPEG, which changes the pixels a
@@ -433,7 +246,7 @@ class RemoteAgent(Agent):
         ):
             episode_obs = copied(first_obs) if self._resume else first_obs
             recent: deque[Obs] = deque(maxlen=history - 1)
-            episodes.append(EpisodeState(episode_obs, instruction, options, contract_json, recent))
+            episodes.append(ResumePoint(episode_obs, instruction, options, contract_json, recent))
 
         for session in client_sessions:
             session.episode = None
@@ -572,10 +385,7 @@ class RemoteAgent(Agent):
         """Update a session with the reply to its `act`, and return the action or the error."""
         episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
-            if isinstance(reply.error, DeadlineExceeded) and episode is not None:
-                episode.step = None  # the policy may have acted on this observation
-            elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
-                session.episode = None
+            session.failed(reply.error, resumes=self._resume)
             return reply.error or PolicyFailed("act: the server's reply holds no action")
 
         session.begun(reply)

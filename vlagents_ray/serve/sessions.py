@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -39,6 +39,42 @@ class Outdated(UnknownSession):
 
 Version = tuple[int, int]
 """Version of a session's state: its step, and its number of moves. Newer versions are greater."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionState:
+    """All that a replica passes on with a session: another one continues it from there exactly.
+
+    It is what `export` answers and `adopt` takes. A client, which has only seen observations and
+    actions, begins the session again from less: see `vlagents_ray.client.recovery.ResumePoint`.
+    """
+
+    agent: bytes  # the policy's private state, by `AgentCopies.dump`
+    steps: int  # see `Session`, as `first`, `moves`, `follows` and `instruction`
+    first: int
+    moves: int
+    # Time from the reset of its episode to the call for this state, s. Clocks of replicas differ.
+    age_s: float
+    policy: Sequence[str]  # version of the policy and of its shared objects
+    choice: Sequence[Any]  # fields of its `CheckpointChoice`
+    settings: dict[str, Any]  # settings of its checkpoint
+    weights: Sequence[Any]  # number and fingerprint of its version of the weights
+    follows: bool
+    instruction: str
+
+    @property
+    def version(self) -> Version:
+        """Version of the state."""
+        return self.steps, self.moves
+
+    @classmethod
+    def from_info(cls, info: Mapping[str, Any]) -> SessionState:
+        """Return the state of an answer to `export`, or of a request to `adopt`."""
+        return cls(**info)
+
+    def info(self) -> dict[str, Any]:
+        """Return the state as the info of an answer, which may pass to another process."""
+        return {name: getattr(self, name) for name in self.__slots__}
 
 
 @dataclass(slots=True)
@@ -105,7 +141,7 @@ class SessionFinder(Protocol):
         session_id: str,
         then: Callable[[], None],
         caller: str = "",
-        user: Callable[[dict[str, Any], float], Origin | None] = ...,
+        user: Callable[[SessionState, float], Origin | None] = ...,
     ) -> bool:
         """Fetch a session if a request can act on it (`user`), then call `then` whether it was
         found or not; return False if `caller` has too many searches.

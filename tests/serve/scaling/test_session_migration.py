@@ -16,7 +16,7 @@ import pytest
 from eval_fakes import wait_for
 from in_flight import ask as ask_of
 from in_flight import send
-from in_process_replicas import Replicas, export, version_of
+from in_process_replicas import Replicas, export
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, UnknownSession
@@ -384,7 +384,7 @@ def test_a_session_that_goes_on_while_it_is_copied_is_not_released(
     ask(a, "reset", instruction="episode 1")
     state = serve(served, 0, "copy", "robot-1")
     assert obeys(a) == ("episode 1", 1)
-    assert serve(served, 0, "release", "robot-1", version_of(state), "claim") is False
+    assert serve(served, 0, "release", "robot-1", state.version, "claim") is False
     assert obeys(a) == ("episode 1", 2)
 
 
@@ -394,7 +394,7 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
     ask(a, "reset", instruction="episode 1")
     state = serve(served, 0, "copy", "robot-1")
     assert serve(served, 1, "take_over", "robot-1", "0") is True
-    assert serve(served, 0, "release", "robot-1", version_of(state), "late") is False
+    assert serve(served, 0, "release", "robot-1", state.version, "late") is False
     assert serve(served, 1, "take_over", "robot-1", "0") is False  # it is no longer there
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 1, 0]
     assert obeys(c) == ("episode 1", 1)  # fetched from there
@@ -402,11 +402,11 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
         b.moves.adopt("robot-1", state)
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
     returned = serve(served, 2, "copy", "robot-1")
-    assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
-    assert serve(served, 2, "release", "robot-1", version_of(returned), "another") is False
-    assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
+    assert serve(served, 2, "release", "robot-1", returned.version, "one") is True
+    assert serve(served, 2, "release", "robot-1", returned.version, "another") is False
+    assert serve(served, 2, "release", "robot-1", returned.version, "one") is True
     a.moves.adopt("robot-1", returned)
-    serve(served, 0, "release", "robot-1", version_of(state), "one")
+    serve(served, 0, "release", "robot-1", state.version, "one")
     assert obeys(a) == ("episode 1", 2)
 
 

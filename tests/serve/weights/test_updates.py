@@ -27,6 +27,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.sessions import SessionState
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights.trainable import fingerprint
 
@@ -260,15 +261,17 @@ def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
     there.push(1)
     for one in (here, there):
         one.push(2)
-    state = here.ask("a", Request("export")).info
-    assert state is not None
+    info = here.ask("a", Request("export")).info
+    assert info is not None
+    state = SessionState.from_info(info)
     with pytest.raises(UnknownSession, match="version 1 of the weights"):
         there.engine.moves.adopt("a", state)  # nobody acts with it there
     for one in (here, there):
         one.push(3)
     here.reset("a")
-    state = here.ask("a", Request("export")).info
-    assert state is not None
+    info = here.ask("a", Request("export")).info
+    assert info is not None
+    state = SessionState.from_info(info)
     there.engine.moves.adopt("a", state)
     assert there.act("a") == (3, 3.0)
     with pytest.raises(UnknownSession, match="version 3 of the weights"):

@@ -8,7 +8,6 @@ the request. An act whose session is not here is admitted again after a search a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from vlagents_ray.errors import NotReset, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Priority
@@ -17,7 +16,7 @@ from vlagents_ray.serve.engine.responses import public_error
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
-from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import follows
 
 
@@ -207,7 +206,7 @@ class SessionSearch:
             is_same = type(error) is type(self._error)
             pending.fail(self._error if is_same else public_error(error, pending))
 
-    def origin_for(self, state: dict[str, Any], began: float) -> Origin | None:
+    def origin_for(self, state: SessionState, began: float) -> Origin | None:
         """Return the origin of the act if it can be executed on a session in that state, at another
         replica, else None.
 
@@ -222,9 +221,9 @@ class SessionSearch:
         if not episode:
             episode = pending.origin.sessions.get(pending.session_id)
         if pending.request.step is not None:
-            fits = pending.request.step == state["steps"]
+            fits = pending.request.step == state.steps
         elif episode is not None:
-            fits = episode == state["first"]
+            fits = episode == state.first
         else:
             fits = began <= pending.latest_begin
         return pending.origin if fits else None

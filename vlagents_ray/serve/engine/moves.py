@@ -10,7 +10,7 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Origin
-from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.sessions import Session, SessionState
 
 
 class SessionMoves:
@@ -21,9 +21,11 @@ class SessionMoves:
         self._models = parts.models
         self._health = parts.health
 
-    def export(self, session_id: str) -> dict[str, Any]:
+    def export(self, session_id: str, asked: float) -> SessionState:
         """Return the state that another replica needs to continue the session after its release
         here; called on the policy's thread.
+
+        The state was `asked` for at that time, s, of the engine's clock.
         """
         session = self._sessions.get(session_id)
         model, weights = session.model, session.weights
@@ -31,26 +33,26 @@ class SessionMoves:
             raise UnknownSession(f"session {session_id!r}: not reset yet")
         with model.busy, model.uncaptured, model.call("export"):
             agent = model.copies.dump(session.agent)
-        return {
-            "agent": agent,
-            "steps": session.steps,
-            "first": session.first,
-            "moves": session.moves,
-            "began": session.began,
-            "version": list(model.version),
-            "choice": [model.choice.name, model.choice.step],
-            "settings": model.settings,
-            "parameters": [weights.number, weights.fingerprint],
-            "follows": session.follows,
-            "instruction": session.instruction,
-        }
+        return SessionState(
+            agent=agent,
+            steps=session.steps,
+            first=session.first,
+            moves=session.moves,
+            age_s=asked - session.began,
+            policy=list(model.version),
+            choice=[model.choice.name, model.choice.step],
+            settings=model.settings,
+            weights=[weights.number, weights.fingerprint],
+            follows=session.follows,
+            instruction=session.instruction,
+        )
 
-    def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
+    def adopt(self, session_id: str, state: SessionState, timeout_s: float = 0.0) -> None:
         """Continue a session that another replica has released.
 
         Args:
             session_id: Id of the session.
-            state: The `info` of the other replica's reply to "export".
+            state: Its state there.
             timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded
                 already.
 
@@ -63,7 +65,7 @@ class SessionMoves:
     def prepare(
         self,
         session_id: str,
-        state: dict[str, Any],
+        state: SessionState,
         timeout_s: float = 0.0,
         began: float = 0.0,
         origin: Origin = NOWHERE,
@@ -79,10 +81,10 @@ class SessionMoves:
         self._health.require_ready()
         self._sessions.require_room(session_id)
 
-        first, moves = state["first"], state["moves"] + 1
+        first, moves = state.first, state.moves + 1
         arriving: Session[LoadedModel] = Session(
             session_id,
-            steps=state["steps"],
+            steps=state.steps,
             first=first,
             expected=first,
             began=began,
@@ -94,21 +96,21 @@ class SessionMoves:
         self._sessions.expect(arriving)
         try:
             model = self._models.adopt(
-                arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s
+                arriving, CheckpointChoice(*state.choice), state.settings, timeout_s
             )
-            if tuple(state["version"]) != model.version:
+            if tuple(state.policy) != model.version:
                 raise UnknownSession(
                     f"session {session_id!r}: of another version of the policy; reset it"
                 )
 
-            number, fingerprint = state["parameters"]
+            number, fingerprint = state.weights
             # The session holds the version until `find` returns it, or a newer one.
             if weights is not None:
                 arriving.weights = model.parameters.restore(number, fingerprint, weights)
-            arriving.weights = model.parameters.find(number, fingerprint, follows=state["follows"])
+            arriving.weights = model.parameters.find(number, fingerprint, follows=state.follows)
             with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
-                arriving.set_agent(model.copies.load(state["agent"]))
-            arriving.follows, arriving.instruction = state["follows"], state["instruction"]
+                arriving.set_agent(model.copies.load(state.agent))
+            arriving.follows, arriving.instruction = state.follows, state.instruction
         except BaseException:
             self.abandon(arriving)
             raise

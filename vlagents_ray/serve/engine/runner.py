@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from typing import Any
 
 from vlagents_ray.abilities import Observes, ability
@@ -39,7 +40,7 @@ from vlagents_ray.serve.models.model_manager import too_late
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
-from vlagents_ray.serve.sessions import Session
+from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import WeightsVersion
 
 logger = logging.getLogger(__name__)
@@ -145,7 +146,10 @@ class Runner:
                     self._answers.submit(deliver, unsent)
 
                 if not acting.acquire(blocking=False):
-                    acting.acquire()  # the policy has slept
+                    # The policy sleeps. Clients' pings are answered meanwhile.
+                    self._queue.poller.hand_to_reader()
+                    acting.acquire()
+                    self._queue.poller.reclaim()
                     taken = self._without_late(taken)
                 try:
                     self.run(taken)
@@ -337,7 +341,8 @@ class Runner:
         session_id, request = pending.session_id, pending.request
         info: dict[str, Any] = {}
         if request.op == "export":
-            info = self._moves.export(session_id)
+            asked = request.kwargs.get("asked", self._clock())
+            info = self._moves.export(session_id, asked).info()
         elif request.op == "release":
             info = {"released": self._sessions.release(session_id, request.kwargs["version"])}
         elif request.op == "adopt":
@@ -345,7 +350,8 @@ class Runner:
             self._sessions.free(session_id)
             # That replica decides which version of the weights acts: the session's may be older, or
             # not held here.
-            state = {**request.kwargs, "parameters": self._weights.acting()}
+            state = SessionState.from_info(request.kwargs)
+            state = replace(state, weights=self._weights.acting())
             self._moves.adopt(session_id, state)
         elif request.op == "call":
             info = {"result": self._call(pending)}

@@ -45,7 +45,7 @@ from vlagents_ray.serve.requests import (
     PendingRequest,
     deliver,
 )
-from vlagents_ray.serve.sessions import Outdated, Session, Version
+from vlagents_ray.serve.sessions import Outdated, Session, SessionState, Version
 from vlagents_ray.serve.weights import VersionNotHeld
 
 logger = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ T = TypeVar("T")
 InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
-UserOf = Callable[[dict[str, Any], float], Origin | None]
+UserOf = Callable[[SessionState, float], Origin | None]
 # Called when a search is over, and its request's `user` of `fetch`.
 _Callback = tuple[Callable[[], None], UserOf]
 # Largest number of concurrent searches of a caller. Further requests get `UnknownSession`.
@@ -127,11 +127,9 @@ class HeldSessions:
         leaving = dict.fromkeys(filter(self.is_leaving, session_ids), (0, 0))
         return leaving | self._engine.sessions.versions_of(session_ids)
 
-    async def copy(self, session_id: str, is_leaving: bool = False) -> dict[str, Any] | None:
+    async def copy(self, session_id: str, is_leaving: bool = False) -> SessionState | None:
         """Return the session's state after its queued acts; None if this replica does not have the
         session, or if it cannot be pickled.
-
-        The `age_s` of the state is the time from its episode's reset to this call, s.
 
         Args:
             session_id: The session.
@@ -144,10 +142,9 @@ class HeldSessions:
             return None
         if self.is_leaving(session_id) and not is_leaving:
             await asyncio.sleep(ON_ITS_WAY_S)
-        state = await self._ask(session_id, "export", None if is_leaving else EXPORT_S)
-        if state is not None:
-            state["age_s"] = asked - state.pop("began")
-        return state
+        limit_s = None if is_leaving else EXPORT_S
+        info = await self._ask(session_id, "export", limit_s, asked=asked)
+        return None if info is None else SessionState.from_info(info)
 
     async def weights(self, session_id: str) -> dict[str, Any] | None:
         """Return the values of the weights with which the session acts; None if this replica does
@@ -518,15 +515,15 @@ class SessionMigrator:
         # The other replica received the call after `asked`, so `began` is not later than the true
         # begin of the episode. An act that arrived after the reset is therefore never mistaken for
         # an act of an older episode.
-        began = asked - state["age_s"]
+        began = asked - state.age_s
         origin = NOWHERE if is_leaving else self._user_of(session_id, state, began)
         if origin is None:
             return True
 
         arriving = await self._prepare(peer, session_id, state, began, origin)
-        version = state["steps"], state["moves"]
+        claim = uuid.uuid4().hex
         release = self._spawn(
-            self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex))
+            self._answer(peer.ask(HeldSessions.release, session_id, state.version, claim))
         )
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
             # The replica hangs. Only the copy waits for it.
@@ -540,12 +537,12 @@ class SessionMigrator:
         logger.info(
             "session %s: fetched from another replica, after %d acts",
             session_id,
-            state["steps"] - state["first"],
+            state.steps - state.first,
         )
         return True
 
     async def _prepare(
-        self, peer: Peer, session_id: str, state: dict[str, Any], began: float, origin: Origin
+        self, peer: Peer, session_id: str, state: SessionState, began: float, origin: Origin
     ) -> Session[LoadedModel]:
         """Create the copy of a session. If this replica does not have its version of the weights,
         fetch that from the `peer`.
@@ -570,7 +567,7 @@ class SessionMigrator:
                     raise
             return await prepare(weights)
 
-    def _user_of(self, session_id: str, state: dict[str, Any], began: float) -> Origin | None:
+    def _user_of(self, session_id: str, state: SessionState, began: float) -> Origin | None:
         """Return the origin of a waiting request that can act on the session; None if there is
         no such request.
         """
