@@ -169,7 +169,7 @@ def _drive(port: int) -> None:
 
 
 @contextlib.contextmanager
-def _bare(_obs: Path, *, is_proxied: bool) -> Iterator[ProcessDriver]:
+def bare_application(_obs: Path, *, is_proxied: bool) -> Iterator[ProcessDriver]:
     """Run the bare application and its client."""
     name = PROXIED if is_proxied else DIRECT
     serve = [*_COMMAND, "serve", *(["proxied"] if is_proxied else [])]
@@ -193,9 +193,9 @@ def measure_floor(calls: int, peers_python: Path) -> dict[str, Any]:
     found, absent, versions = others.peer_clients(["vlagents"], peers_python)
     jpeg = [one for one in found if one.mode == "jpeg"]
     starters: dict[str, StartClient] = others.starters(jpeg, peers_python)
-    starters[DIRECT] = partial(_bare, is_proxied=False)
+    starters[DIRECT] = partial(bare_application, is_proxied=False)
     if haproxy_binary() is not None:
-        starters[PROXIED] = partial(_bare, is_proxied=True)
+        starters[PROXIED] = partial(bare_application, is_proxied=True)
     trips = measure(OWN, calls, progress, others=starters, skipped=absent)
     return trips.to_json() | {"versions": versions}
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from benchmarks.figures import (
     ratios,
 )
 from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
+from benchmarks.http_floor import bare_application
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.processes import DAEMONS
 from benchmarks.round_trips import ROUND, in_turns, measure
@@ -167,3 +169,9 @@ def test_both_ways_are_measured_in_turns_and_the_child_costs_time() -> None:
     assert (here.name, there.name) == (IN_PROCESS, CHILD)
     assert here.rounds.shape == there.rounds.shape == (2, 100)
     assert 0 < here.median < there.median
+
+
+def test_the_bare_application_answers_its_client() -> None:
+    with bare_application(Path(), is_proxied=False) as client:
+        assert client.ready() == {}
+        assert len(client.measure(5)) == 5
