@@ -41,7 +41,7 @@ from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import OPS, LocalAddress, Request
-from vlagents_ray.serve.endpoints import access_middleware
+from vlagents_ray.serve.endpoints import access_middleware, http_messages
 from vlagents_ray_dialects import gr00t
 from vlagents_ray_dialects.messages import rpyc
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
@@ -359,7 +359,8 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
     caplog.set_level(logging.ERROR)
     # test_gr00t_strangers.py and test_access_middleware.py show these pauses.
     monkeypatch.setattr(gr00t, "_REFUSAL_S", 0.001)
-    monkeypatch.setattr(access_middleware, "_REFUSAL_S", 0.001)
+    for module in (access_middleware, http_messages):
+        monkeypatch.setattr(module, "REFUSAL_S", 0.001)
     share = SEQUENCES // len(TARGETS)
 
     def attack_all(number: int, seed: int) -> None:
