@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
-from collections.abc import Callable, Sequence
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from eval_fakes import wait_for
 
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.access.charges import Account
+from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
@@ -128,3 +134,25 @@ def in_order(decoded: Decoded) -> list[Request | Reply]:
 def read_requests(*arguments: Any) -> list[Request | Reply]:
     """What `decode_requests` reads, in order."""
     return in_order(decode_requests(*arguments))
+
+
+@contextlib.contextmanager
+def kernel_timestamps() -> Iterator[None]:
+    """Within this context, the kernel stamps what arrives by TCP; it begins to a little after the
+    first connection asks for it.
+    """
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        socket.create_connection(listener.getsockname()) as sender,
+    ):
+        receiver, _ = listener.accept()
+        with receiver:
+            enable_timestamps(receiver)
+
+            def is_stamped() -> bool:
+                sender.send(b"x")
+                time.sleep(0.01)
+                return time_in_socket_s(receiver.recvmsg(1, STAMP_SPACE)[1]) > 0
+
+            wait_for(is_stamped)
+            yield

@@ -5,6 +5,7 @@ it is not.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -13,6 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import kernel_timestamps
 
 from vlagents_ray.client.transports.base import CodecChoice, ReplicaSilent, ReplicaWatch, Transport
 from vlagents_ray.client.transports.http import HttpTransport
@@ -22,6 +24,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.connection import LONG_WAIT_S
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
@@ -116,6 +119,7 @@ def replica() -> Iterator[Replica]:
     replica = Replica()
     with ExitStack() as stack:
         stack.callback(replica.close)
+        stack.enter_context(kernel_timestamps())
         yield replica
 
 
@@ -158,6 +162,8 @@ def test_a_frozen_replica_is_left_and_does_not_act_when_it_continues(
     replica.freeze()
     with pytest.raises(ReplicaSilent):
         client.call([request("act", "late")], 60)
+    # A TCP message has waited since the last segment, which says here that the client has left.
+    time.sleep(2 * LONG_WAIT_S)
     clients = replica.local._clients if transport == "shm" else replica.stream._clients
     assert len(clients) >= 2
 

@@ -9,7 +9,6 @@ import contextlib
 import http.client
 import json
 import queue
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -19,8 +18,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from asgi_server import served
-from eval_fakes import wait_for
 from in_flight import ask as ask_of
+from in_flight import kernel_timestamps
 from starlette.types import Receive, Scope, Send
 
 from vlagents_ray.client.transports.shm import ShmTransport
@@ -37,7 +36,6 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
-from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -101,24 +99,9 @@ class WebSocket:
 
 @pytest.fixture
 def timestamps() -> Iterator[None]:
-    """The kernel stamps what arrives by TCP; it begins to a little after the first connection
-    asks for it.
-    """
-    with (
-        socket.create_server(("127.0.0.1", 0)) as listener,
-        socket.create_connection(listener.getsockname()) as sender,
-    ):
-        receiver, _ = listener.accept()
-        with receiver:
-            enable_timestamps(receiver)
-
-            def stamped() -> bool:
-                sender.send(b"x")
-                time.sleep(0.01)
-                return time_in_socket_s(receiver.recvmsg(1, STAMP_SPACE)[1]) > 0
-
-            wait_for(stamped)
-            yield
+    """The kernel stamps what arrives by TCP."""
+    with kernel_timestamps():
+        yield
 
 
 @pytest.mark.usefixtures("timestamps")

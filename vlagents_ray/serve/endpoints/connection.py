@@ -61,7 +61,7 @@ STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a mes
 ANSWERS_S = 1.0  # maximum time for clients to receive their last answers when a server ends
 _POLL_MS = 2
 # Time in a socket after which the client of a message may have left, s. Clients wait longer.
-_LONG_WAIT_S = 0.25
+LONG_WAIT_S = 0.25
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 AncillaryData = Sequence[tuple[int, int, bytes]]
@@ -497,7 +497,7 @@ def is_abandoned(connection: socket.socket, waited_s: float) -> bool:
 
     That is what a client does whose replica was frozen: its session goes on at another one.
     """
-    return waited_s >= _LONG_WAIT_S and _has_hung_up(connection)
+    return waited_s >= LONG_WAIT_S and _has_hung_up(connection)
 
 
 def accept_open(listener: socket.socket) -> socket.socket | None:
