@@ -110,7 +110,8 @@ class InProcess:
     name = "in process"
     holds_sessions = True
 
-    def __init__(self, replicas: Replicas, watch: ReplicaWatch) -> None:
+    def __init__(self, replicas: Replicas, watch: ReplicaWatch | None = None) -> None:
+        """Reach `replicas`, which are not pinged."""
         self._replicas = replicas
         self._sender: Sender | None = None
         self._number = -1
