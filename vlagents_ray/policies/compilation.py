@@ -603,11 +603,26 @@ class Core:
         core.__code__ = core.__code__.replace(
             co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_")
         )
+        # Before 2.8, torch cannot leave out guards. A CUDA graph of the program has none.
+        has_filter = hasattr(torch.compiler, "skip_guard_on_globals_unsafe")
+        options: dict[str, Any] | None = None
+        if has_filter and tensors[0].device.type != "cuda":
+            options = {"guard_filter_fn": _without_state_of_the_process}
         program: Callable[..., Any] = torch.compile(
-            core, fullgraph=True, dynamic=False, backend=self._owner.backend
+            core, fullgraph=True, dynamic=False, backend=self._owner.backend, options=options
         )
         program(*tensors)
         return program
+
+
+def _without_state_of_the_process(guards: Sequence[Any]) -> list[bool]:
+    """Return which of a program's guards are kept: all except that of the process's state.
+
+    transformers sets torch's default dtype, for all threads, while it builds a model. Otherwise an
+    action meanwhile would make its program again, which takes seconds, and would fail if the dtype
+    changed back before the program was made.
+    """
+    return [guard.guard_type != "GLOBAL_STATE" for guard in guards]
 
 
 def _of_one_kind(tensor: Any) -> Any:

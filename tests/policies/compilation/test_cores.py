@@ -285,6 +285,24 @@ def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(
     torch._dynamo.reset()
 
 
+def test_an_action_while_another_model_is_built_makes_no_program(
+    compiler: CountingCompiler,
+) -> None:
+    """transformers sets torch's default dtype for all threads while it builds a model."""
+    policy = made(compile="require", batch_sizes=[2])
+    expected, calls = acted(policy, range(2)), compiler.calls
+
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        actions = acted(policy, range(2))
+    finally:
+        torch.set_default_dtype(usual)
+
+    np.testing.assert_array_equal(actions, expected)
+    assert (compiler.rows, compiler.calls) == ([2], calls + 1)
+
+
 def test_each_comparison_has_inputs_of_its_own(compiler: CountingCompiler) -> None:
     """A program that is right once, for the inputs after which it was made, is not used."""
     right = iter([True, True])  # the first call, and the first comparison
