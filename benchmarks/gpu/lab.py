@@ -153,10 +153,12 @@ class Lab:
     @contextlib.contextmanager
     def engine(self, **changed: Any) -> Iterator[Engine]:
         """Yield an engine with π0, in CUDA graphs for one and eight rows, and a second
-        checkpoint to choose.
+        checkpoint to choose. A dry run compiles it for two rows alone.
         """
         rows = self.size(8, 2)
-        config = self.settings(**{"compile": self.graphs, "batch_sizes": [1, rows], **changed})
+        # On a CPU, tracing the programs of a size takes longer than all else in a step.
+        batch_sizes = self.size([1, rows], [rows])
+        config = self.settings(**{"compile": self.graphs, "batch_sizes": batch_sizes, **changed})
         offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
         engine = Engine(offered, EngineSettings(max_batch_size=rows, patience=0.1))
         try:
