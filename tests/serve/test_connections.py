@@ -537,7 +537,7 @@ FAULTS = [
 # The same of an HTTP connection at the own port.
 HTTP_FAULTS = [
     (Intake, "admit"),
-    (Sender, "admission"),
+    (http_connection, "message_admission"),
     (Sender, "send"),
     (Caller, "throttled_s"),
     (MessageAdmission, "decode_on_thread"),

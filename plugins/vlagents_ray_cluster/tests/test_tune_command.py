@@ -81,7 +81,7 @@ def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
         (["nowhere.yaml", "--p99-ms", "60"], "--for robots"),
         (["FILE", "--state-dim", "joints=some"], "joints"),
         (["FILE", "--app", "yours"], "mine"),
-        (["FILE", "--frames", "."], "trajectory"),
+        (["FILE", "--frames", "."], "trajectories"),
     ],
 )
 def test_mistakes_are_told_in_a_line(

@@ -208,8 +208,8 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     run = Evaluation(config, operator, arm := Arm())
     assert person.answer("ready", person.until("scene")) == 200
     playing = person.until("playing")
+    begun = time.monotonic()  # of the page's last question
     wait_for(lambda: arm.applied > 10)
-    begun = time.monotonic()
     if how == "stop":
         assert person.answer("stop", playing) == 200
     else:
