@@ -15,7 +15,7 @@ import pytest
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve import ports
 from vlagents_ray.serve.launch.haproxy import PublicListener, ingress_environment
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, is_free, keep
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_block, free_port, is_free, keep
 
 
 @pytest.fixture
@@ -85,6 +85,25 @@ def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch
         other.stdin.close()
     assert len(theirs) == len(ours) == 5
     assert not theirs & ours
+
+
+@pytest.mark.usefixtures("claims")
+def test_servers_that_start_at_once_get_different_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, end = free_range(60)
+    draw = (
+        f"import sys; from vlagents_ray.serve import ports; ports._BLOCKS = {first, end}\n"
+        "print(*(ports.free_block(10) for _ in range(3)), flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdin is not None
+        theirs = set(map(int, other.stdout.readline().split()))
+        monkeypatch.setattr(ports, "_BLOCKS", (first, end))
+        ours = {free_block(10) for _ in range(3)}
+        assert theirs | ours == set(range(first, end, 10))
+        assert free_block(10) in theirs | ours  # a further server shares one
+        other.stdin.close()
 
 
 @pytest.mark.usefixtures("claims")

@@ -86,11 +86,18 @@ def keep(*ports: int) -> None:
 def free_block(size: int) -> int:
     """Return the first of `size` consecutive ports for the replicas. The first port is free, and
     Ray skips others that are in use.
+
+    The block is claimed, as by `free_port`, since servers that start at the same time would
+    otherwise choose the same one. If all free blocks are claimed, a block is shared.
     """
-    for _ in range(100):
-        base = _random.randrange(*_BLOCKS, size)
-        if is_free(LOOPBACK, base):
+    bases = list(range(*_BLOCKS, size))
+    _random.shuffle(bases)
+    free_bases = [base for base in bases if is_free(LOOPBACK, base)]
+    for base in free_bases:
+        if _claim(base):
             return base
+    if free_bases:
+        return free_bases[0]
     raise ConfigError(
         f"no free block of ports between {_BLOCKS[0]} and {_BLOCKS[1]} for the replicas"
     )
