@@ -230,7 +230,7 @@ def test_samples_are_draws_of_their_own(policy_of: Policy) -> None:
 
 def test_the_checkpoints_metadata_are_the_contract(policy_of: Policy) -> None:
     trained = Trained.from_statistics(policy_of("relative").statistics)
-    assert trained.parts == ("arm", "gripper")
+    assert trained.state_names == ("arm", "gripper")
     assert trained.state is not None
     assert [len(bound) for bound in trained.state] == [6, 6]
 
