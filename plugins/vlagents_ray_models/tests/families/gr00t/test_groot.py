@@ -194,9 +194,9 @@ def test_actions_relative_to_the_state_are_theirs_and_its_parts_are_the_contract
     for number, act in enumerate(ours):
         torch.manual_seed(int(draws_of(policy).integers(2**63)))
         with torch.inference_mode():
-            wanted = theirs.after(theirs.policy.predict_action_chunk(theirs.see(view(number))))[
-                0
-            ].numpy()
+            wanted = theirs.after(
+                theirs.policy.predict_action_chunk(theirs.preprocess(view(number)))
+            )[0].numpy()
         assert isinstance(act, Act)
         np.testing.assert_allclose(act.action, wanted[: tiny.EXECUTED], atol=ATOL)
 
