@@ -20,7 +20,7 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import EVERYWHERE
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
@@ -32,7 +32,7 @@ def main() -> None:
     out = own_stdout()
     policy = FarPolicy()
     engine = Engine(policy)
-    stream = WebSocketServer(engine, DEFAULT_LIMITS, EVERYWHERE, None, NoKey.OPEN)
+    stream = OwnPortServer(engine, DEFAULT_LIMITS, EVERYWHERE, None, NoKey.OPEN)
     stream.open()
     engine.start()
     metadata = {

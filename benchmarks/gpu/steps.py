@@ -403,10 +403,10 @@ def http_server(engine: Engine) -> Iterator[str]:
     from vlagents_ray.serve.access.api_keys import NoKey
     from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
     from vlagents_ray.serve.endpoints.http import build_http_app
-    from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+    from vlagents_ray.serve.endpoints.own_port import OwnPortServer
     from vlagents_ray.serve.ports import free_port
 
-    own = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
+    own = OwnPortServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
     own.open()
     contract = engine.contract and engine.contract.to_json()
     about = {"policy": "pi0", "version": "0", "protocol": PROTOCOL_VERSION, "contract": contract,

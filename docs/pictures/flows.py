@@ -43,7 +43,7 @@ FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[
         "WebSocket: any machine, straight to the replica",
         [("RemoteAgent", "client/agent"), ("codec", "client/transports/websocket")],
         [("policy", "policies/"), ("batch queue", "serve/engine, serve/queue"),
-         ("WebSocket endpoint", "serve/endpoints/websocket")],
+         ("WebSocket endpoint", "serve/endpoints/own_port")],
         ("TCP", "one frame: JPEG, PNG or raw"),
     ),
     "http": (

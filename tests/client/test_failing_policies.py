@@ -23,8 +23,8 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 
 TRANSPORTS: list[TransportName] = ["shm", "websocket", "http"]
@@ -45,7 +45,7 @@ def serve(how: str) -> None:
     """Print the port, and serve until the standard input ends."""
     engine = Engine(Failing(how))
     local = ShmServer(engine, DEFAULT_LIMITS, NoKey.OPEN)
-    stream = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
+    stream = OwnPortServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
     local.open()
     stream.open()
     engine.start()

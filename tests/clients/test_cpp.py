@@ -53,7 +53,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import access_middleware
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port
 
@@ -217,7 +217,7 @@ class Watcher(Agent):
 class Replica:
     engine: Engine
     policy: Watcher
-    own: WebSocketServer
+    own: OwnPortServer
     known: ChangingKeys
     port: int
     stream: dict[str, Any] | None  # what the metadata says of its own port
@@ -233,7 +233,7 @@ def replica(*, keyed: bool = False) -> Iterator[Replica]:
     known, policy = ChangingKeys(), Watcher()
     engine = Engine(policy)
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, admit)
+    own = OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, admit)
     own.open()
     engine.start()
     found = Replica(engine, policy, own, known, 0, asdict(own.address))

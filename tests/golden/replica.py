@@ -52,8 +52,8 @@ from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dia
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.models.checkpoints import Checkpoints
@@ -311,7 +311,7 @@ class Server:
         if self._own is None:
             engine, admit = self.engines[0], self._check()
             if endpoint == "own port":
-                self._own = WebSocketServer(engine, LIMITS, "127.0.0.1", None, admit)
+                self._own = OwnPortServer(engine, LIMITS, "127.0.0.1", None, admit)
             elif endpoint == "plasma":
                 self._own = plasma_server(engine, LIMITS, self._patch, self._folder)
             else:

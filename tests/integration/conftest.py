@@ -24,6 +24,12 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("server")
 
 
+@pytest.fixture(scope="module")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder where the replicas of `served_agents:Ledger` write down their acts."""
+    return tmp_path_factory.mktemp("ledger")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def importable_agents() -> Iterator[None]:
     """`served_agents` for this process and for the workers that it starts."""

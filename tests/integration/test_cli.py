@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -122,20 +123,19 @@ def test_results_without_workers_are_those_with_them_which_resume_them(
     words = ["--episodes", "4", "--workers", "0", "--out", str(tmp_path / "whole")]
     done = evaluate(ray_home, *BOTH, *words)
     assert done.returncode == 0, done.stdout + done.stderr
-    both = [Results.load(folder) for folder in (tmp_path / "whole", resumed)]
-    whole, in_two_runs = (
-        [one.result.outcome for case in results.cases for one in case.episodes] for results in both
-    )
-    assert len(whole) == 8
-    assert whole == in_two_runs
-    ours, theirs = (
-        {
-            key: results.policies["scripted"].get(key)
-            for key in ("policy", "config", "contract", "program")
-        }
-        for results in both
-    )
-    assert ours == theirs
+
+    def outcomes(results: Results) -> list[object]:
+        episodes = chain.from_iterable(case.episodes for case in results.cases)
+        return [episode.result.outcome for episode in episodes]
+
+    def facts(results: Results) -> dict[str, object]:
+        policy = results.policies["scripted"]
+        return {key: policy.get(key) for key in ("policy", "config", "contract", "program")}
+
+    whole, in_two_runs = Results.load(tmp_path / "whole"), Results.load(resumed)
+    assert len(outcomes(whole)) == 8
+    assert outcomes(whole) == outcomes(in_two_runs)
+    assert facts(whole) == facts(in_two_runs)
 
 
 RUNS = """

@@ -86,11 +86,6 @@ class Robot:
 
 
 @pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("ledger")
-
-
-@pytest.fixture(scope="module")
 def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
     with serving(
         "served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS
@@ -155,10 +150,12 @@ def acting(server: Server, transport: TransportName) -> Iterator[list[Robot]]:
 
 def have_acted_since(robots: list[Robot], moment: float) -> Callable[[], bool]:
     """Whether each has acted on an observation that was made after that."""
-    return lambda: all(
-        robot.error is not None or len([at for at in robot.answered if at > moment]) > 5
-        for robot in robots
-    )
+
+    def has_acted(robot: Robot) -> bool:
+        answers_since = sum(answered_at > moment for answered_at in robot.answered)
+        return robot.error is not None or answers_since > 5
+
+    return lambda: all(map(has_acted, robots))
 
 
 @pytest.mark.alone

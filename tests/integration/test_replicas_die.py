@@ -107,11 +107,6 @@ class Player:
 
 
 @pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("ledger")
-
-
-@pytest.fixture(scope="module")
 def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
     with serving(
         "served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS

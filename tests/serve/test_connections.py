@@ -43,14 +43,14 @@ from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.access.charges import Account, Charge
-from vlagents_ray.serve.endpoints import answers, http_connection, http_messages, websocket
+from vlagents_ray.serve.endpoints import answers, http_connection, http_messages, own_port
 from vlagents_ray.serve.endpoints import shm as local
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.http_connection import HttpConnection
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.websocket_connection import WebSocketConnection
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
@@ -93,7 +93,7 @@ class Replica:
     engine: Engine
     policy: Witness
     known: ChangingKeys
-    own: WebSocketServer
+    own: OwnPortServer
     local: ShmServer
     clients: contextlib.ExitStack
 
@@ -118,7 +118,7 @@ def replica(*, keyed: bool = True, slow_s: float = 60.0, idle_s: float = 60.0) -
     known, policy = ChangingKeys(), Witness()
     engine = Engine(policy, EngineSettings(session_limit=8))
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(
+    own = OwnPortServer(
         engine, MessageLimits(), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=idle_s
     )
     near = ShmServer(engine, MessageLimits(), admit)
@@ -277,7 +277,7 @@ NO_HANDSHAKE = [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0"
 def test_what_comes_without_a_handshake_is_cut_off_and_not_read(
     keyed: Replica, first: bytes, monkeypatch
 ) -> None:
-    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
+    monkeypatch.setattr(own_port, "_HANDSHAKE_S", 0.2)
     silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
     for each in silent:
         with contextlib.suppress(OSError):  # it is cut off meanwhile
@@ -522,13 +522,13 @@ FAULTS = [
     (MessageAdmission, "decode_on_thread"),
     (ReceiveBuffer, "parse"),
     (WebSocketConnection, "_read"),
-    (websocket.PortConnection, "_accept_handshake"),
+    (own_port.PortConnection, "_accept_handshake"),
     (WebSocketConnection, "_process_messages"),
     (RequestStream, "receive"),
     (RequestStream, "_submit"),
     (WebSocketConnection, "_count_partial"),
     (WebSocketConnection, "overdue"),
-    (websocket.WebSocketServer, "identify"),
+    (own_port.OwnPortServer, "identify"),
     (local.UnixConnection, "_read"),
     (local.UnixConnection, "_submit"),
     (local.UnixConnection, "_authenticate"),
@@ -541,8 +541,8 @@ HTTP_FAULTS = [
     (Sender, "send"),
     (Caller, "throttled_s"),
     (MessageAdmission, "decode_on_thread"),
-    (websocket.WebSocketServer, "admit_request"),
-    (websocket.WebSocketServer, "serve_http"),
+    (own_port.OwnPortServer, "admit_request"),
+    (own_port.OwnPortServer, "serve_http"),
     (http_connection, "read_head"),
     (http_messages, "response_to"),
     (http_messages, "body_of"),

@@ -29,8 +29,8 @@ from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import MOST_UNANSWERED
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -67,7 +67,7 @@ class Gate(Agent):
 class Replica:
     policy: Gate
     engine: Engine
-    own: WebSocketServer
+    own: OwnPortServer
     near: ShmServer
 
 
@@ -77,7 +77,7 @@ def replica() -> Iterator[Replica]:
     policy = Gate()
     engine = Engine(policy, EngineSettings(in_flight_bytes=IN_FLIGHT))
     own, near = (
-        WebSocketServer(engine, limits, "127.0.0.1", None, NoKey.OPEN),
+        OwnPortServer(engine, limits, "127.0.0.1", None, NoKey.OPEN),
         ShmServer(engine, limits, NoKey.OPEN),
     )
     own.open(), near.open()

@@ -82,8 +82,8 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Identity, NoKey
 from vlagents_ray.serve.access.charges import REFUSALS, Account, free
 from vlagents_ray.serve.dialects.base import GatewayContext
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import (
     Admission,
     ArrivingBytes,
@@ -506,9 +506,9 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, 
 
 
 @pytest.fixture
-def endpoints() -> Iterator[tuple[WebSocketServer, ShmServer]]:
+def endpoints() -> Iterator[tuple[OwnPortServer, ShmServer]]:
     engine = Engine(Sees())
-    own = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+    own = OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     near = ShmServer(engine, MessageLimits(), NoKey.OPEN)
     own.open(), near.open()
     engine.start()
@@ -518,7 +518,7 @@ def endpoints() -> Iterator[tuple[WebSocketServer, ShmServer]]:
     assert engine.admission.held == 0
 
 
-def _connected(own: WebSocketServer) -> Stream:
+def _connected(own: OwnPortServer) -> Stream:
     return Stream(urlsplit("http://127.0.0.1"), own.address.port, own.address.path, 10)
 
 
@@ -532,7 +532,7 @@ def act(file: bytes, name: str, **more: Any) -> bytes:
     ("priority", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")]
 )
 def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
-    endpoints: tuple[WebSocketServer, ShmServer],
+    endpoints: tuple[OwnPortServer, ShmServer],
     held_up: tuple[threading.Event, list[str]],
     priority: str,
     threads: str,
@@ -567,7 +567,7 @@ def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
 
 
 def test_a_frame_that_waits_for_another_to_be_decoded_spends_its_own_deadline(
-    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]]
+    endpoints: tuple[OwnPortServer, ShmServer], held_up: tuple[threading.Event, list[str]]
 ) -> None:
     go_on, decoders = held_up
     client = _connected(endpoints[0])
@@ -586,7 +586,7 @@ def test_a_frame_that_waits_for_another_to_be_decoded_spends_its_own_deadline(
 
 
 def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
-    endpoints: tuple[WebSocketServer, ShmServer],
+    endpoints: tuple[OwnPortServer, ShmServer],
     held_up: tuple[threading.Event, list[str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -614,7 +614,7 @@ def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
 
 
 def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
-    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]]
+    endpoints: tuple[OwnPortServer, ShmServer], held_up: tuple[threading.Event, list[str]]
 ) -> None:
     go_on, decoders = held_up
     own, _ = endpoints

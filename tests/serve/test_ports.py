@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,20 @@ def free_range(length: int) -> tuple[int, int]:
         if all(is_free(EVERYWHERE, port) for port in range(first, first + length)):
             return first, first + length
     pytest.fail(f"no {length} free ports next to each other")
+
+
+@contextmanager
+def drawn_elsewhere(setting: str, draw: str, number: int) -> Iterator[set[int]]:
+    """The ports that another process has drawn, which lives for as long as the context."""
+    program = (
+        f"import sys; from vlagents_ray.serve import ports; {setting}\n"
+        f"print(*({draw} for _ in range({number})), flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        yield set(map(int, other.stdout.readline().split()))
 
 
 def test_a_port_that_is_taken_on_one_address_is_not_free_everywhere() -> None:
@@ -71,18 +86,9 @@ def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.Mo
 @pytest.mark.usefixtures("claims")
 def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     few = free_range(12)
-    draw = (
-        f"import sys; from vlagents_ray.serve import ports; ports._PORTS = {few}\n"
-        "print(*(ports.free_port() for _ in range(5)), flush=True); sys.stdin.read()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdin is not None
-        theirs = set(map(int, other.stdout.readline().split()))
+    with drawn_elsewhere(f"ports._PORTS = {few}", "ports.free_port()", 5) as theirs:
         monkeypatch.setattr(ports, "_PORTS", few)
         ours = {free_port() for _ in range(5)}
-        other.stdin.close()
     assert len(theirs) == len(ours) == 5
     assert not theirs & ours
 
@@ -90,20 +96,11 @@ def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.usefixtures("claims")
 def test_servers_that_start_at_once_get_different_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     first, end = free_range(60)
-    draw = (
-        f"import sys; from vlagents_ray.serve import ports; ports._BLOCKS = {first, end}\n"
-        "print(*(ports.free_block(10) for _ in range(3)), flush=True); sys.stdin.read()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdin is not None
-        theirs = set(map(int, other.stdout.readline().split()))
+    with drawn_elsewhere(f"ports._BLOCKS = {first, end}", "ports.free_block(10)", 3) as theirs:
         monkeypatch.setattr(ports, "_BLOCKS", (first, end))
         ours = {free_block(10) for _ in range(3)}
         assert theirs | ours == set(range(first, end, 10))
         assert free_block(10) in theirs | ours  # a further server shares one
-        other.stdin.close()
 
 
 @pytest.mark.usefixtures("claims")

@@ -57,12 +57,12 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
-from vlagents_ray.serve.endpoints import access_middleware, websocket
+from vlagents_ray.serve.endpoints import access_middleware
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.ports import free_port, reserve
@@ -169,7 +169,7 @@ class KeyedReplica:
         self.priorities: dict[str, str] = {}
         self._watch_priorities()
         admit = partial(self.known.keys.check, app="app")
-        self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, admit)
+        self.own = OwnPortServer(self.engine, LIMITS, "127.0.0.1", None, admit)
         self.local = ShmServer(self.engine, LIMITS, admit)
         self.plasma = plasma_server(self.engine, LIMITS, patch, folder)
         for each in (self.own, self.local, self.plasma):
@@ -362,7 +362,7 @@ def over_websocket(
             if when == "before":
                 visitor.become()
                 with pytest.MonkeyPatch.context() as impatient:
-                    impatient.setattr(websocket, "_HANDSHAKE_S", 0.1)
+                    impatient.setattr(own_port, "_HANDSHAKE_S", 0.1)
                     connection.sendall(_frame(message(visitor.mark)) * 3)
                     return _until_closed(connection)
             refused = visitor.credential in ("none", "wrong")

@@ -20,7 +20,7 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.engine.engine import Engine
 
 ROWS = 4
@@ -67,7 +67,7 @@ def client_servers() -> Iterator[dict[str, str]]:
     VLAGENTS_TEST_KEY is one.
     """
     engine = Engine(Told())
-    own = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
+    own = OwnPortServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
     own.open()
     engine.start()
     keys = ChangingKeys()

@@ -65,9 +65,9 @@ from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dia
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
@@ -112,7 +112,7 @@ def serve() -> None:
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     admit, limits = partial(keys.check, app="app"), MessageLimits()
     engine = Engine(_Policy(), EngineSettings(session_idle_s=IDLE_S))
-    own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S, idle_s=IDLE_S)
+    own = OwnPortServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S, idle_s=IDLE_S)
     near = ShmServer(engine, limits, admit)
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         plasma = plasma_server(engine, limits, patch, Path(folder))
@@ -143,7 +143,7 @@ def _claim(key: bytes) -> _LeasedChannel:
 
 
 def _serve_replica(
-    engine: Engine, keys: Keys, own: WebSocketServer, near: ShmServer, plasma: PlasmaServer
+    engine: Engine, keys: Keys, own: OwnPortServer, near: ShmServer, plasma: PlasmaServer
 ) -> None:
     limits = MessageLimits()
     for endpoint in (own, near, plasma):

@@ -57,9 +57,9 @@ from vlagents_ray.serve.dialects.base import (
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.shutdown import Shutdown
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.ports import free_port, reserve
@@ -156,7 +156,7 @@ class StoppableServer:
             put(*requests)
 
         self.engine.queue.put = noted  # type: ignore[method-assign]
-        self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, NoKey.OPEN)
+        self.own = OwnPortServer(self.engine, LIMITS, "127.0.0.1", None, NoKey.OPEN)
         self.near = ShmServer(self.engine, LIMITS, NoKey.OPEN)
         self.own.open()
         self.near.open()

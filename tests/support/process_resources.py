@@ -158,9 +158,10 @@ def _play_and_exit(test: pytest.Item, answered: int) -> None:
         test.ihook.pytest_runtest_protocol(item=test, nextitem=None)
         stats = test.config.pluginmanager.get_plugin("terminalreporter").stats
         failed = [*stats.get("failed", []), *stats.get("error", [])]
-        texts = [
-            "\n".join([one.longreprtext, *(text for _, text in one.sections)]) for one in failed
-        ]
+        texts = []
+        for report in failed:
+            printed = [text for _, text in report.sections]
+            texts.append("\n".join([report.longreprtext, *printed]))
         answer = json.dumps("\n".join(texts) if failed else None)
         os.write(answered, answer.encode() + b"\n")
         status = 0

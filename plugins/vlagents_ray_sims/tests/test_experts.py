@@ -46,7 +46,7 @@ def test_the_oracle_solves_the_task(task: str) -> None:
 def test_the_oracle_says_what_it_wants() -> None:
     with pytest.raises(InvalidObservation, match=r"sim_state.*\(39,\)"):
         MetaWorldExpert("metaworld/reach-v3").reset(Obs(), "reach")
-    with pytest.raises(ContractMismatch, match=r"reach-v2.*reach-v3"):
+    with pytest.raises(ContractMismatch, match=r"reach-v2.*did you mean 'reach-v3'"):
         MetaWorldExpert("metaworld/reach-v2")
 
 

@@ -25,8 +25,8 @@ from vlagents_ray.protocol.messages import LocalAddress, MessageLimits, Request
 from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import LONG_WAIT_S
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 
 TRANSPORTS = ("shm", "websocket", "http")
@@ -77,7 +77,7 @@ class Replica:
         Gated.gate, Gated.acts = threading.Event(), []
         self.engine = Engine(Gated())
         self.local = ShmServer(self.engine, MessageLimits(), NoKey.OPEN)
-        self.stream = WebSocketServer(self.engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+        self.stream = OwnPortServer(self.engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
         self.local.open()
         self.stream.open()
         self.engine.start()

@@ -31,7 +31,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 
@@ -65,7 +65,7 @@ class Policy(Agent):
 class Replica:
     engine: Engine
     policy: Policy
-    own: WebSocketServer
+    own: OwnPortServer
     known: ChangingKeys
 
     def request(self, op: str = "act", body: bytes = b"{}", *headers: str, **more: Any) -> bytes:
@@ -131,7 +131,7 @@ def replica(*, keyed: bool = False, slow_s: float = 60.0, **limits: int) -> Iter
     policy, known = Policy(), ChangingKeys()
     engine = Engine(policy, EngineSettings(session_limit=4))
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(
+    own = OwnPortServer(
         engine, MessageLimits(**limits), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=60.0
     )
     own.open()
@@ -152,8 +152,8 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def served_replica() -> Iterator[Replica]:
-    with replica() as one:
-        yield one
+    with replica() as served:
+        yield served
 
 
 def test_a_connection_serves_one_request_after_the_other(served_replica: Replica) -> None:

@@ -26,7 +26,7 @@ from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_request
 from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import message_connection
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 
@@ -44,9 +44,9 @@ class Echo(Agent):
 
 
 @pytest.fixture
-def endpoint() -> Iterator[WebSocketServer]:
+def endpoint() -> Iterator[OwnPortServer]:
     engine = Engine(Echo(), EngineSettings(session_limit=3))
-    endpoint = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint = OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     endpoint.open()
     engine.start()
     yield endpoint
@@ -54,7 +54,7 @@ def endpoint() -> Iterator[WebSocketServer]:
     endpoint.close()
 
 
-def stream(endpoint: WebSocketServer) -> Stream:
+def stream(endpoint: OwnPortServer) -> Stream:
     return Stream(BASE, endpoint.address.port, endpoint.address.path, 5)
 
 
@@ -64,7 +64,7 @@ def ask(client: Stream, op: Any, pixel: int = 0, **info: Any) -> Reply:
     return decode_replies(client.recv(5))[0]
 
 
-def test_each_connection_is_a_session_that_ends_with_it(endpoint: WebSocketServer) -> None:
+def test_each_connection_is_a_session_that_ends_with_it(endpoint: OwnPortServer) -> None:
     clients = [stream(endpoint) for _ in range(3)]
     for client in clients:
         assert ask(client, "reset").error is None
@@ -81,7 +81,7 @@ def test_each_connection_is_a_session_that_ends_with_it(endpoint: WebSocketServe
     wait_for(lambda: len(endpoint.engine.sessions) == 0)
 
 
-def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> None:
+def test_who_does_not_know_the_path_is_not_let_in(endpoint: OwnPortServer) -> None:
     for path in ("/", "/v1/stream", endpoint.address.path[:-1], endpoint.address.path + "x"):
         with pytest.raises(InvalidStatus) as refused:
             Stream(BASE, endpoint.address.port, path, 5)
@@ -91,7 +91,7 @@ def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> 
 
 @pytest.mark.parametrize("compression", [None, "deflate"])
 def test_an_ordinary_websocket_client_is_served_too(
-    endpoint: WebSocketServer, compression: str | None
+    endpoint: OwnPortServer, compression: str | None
 ) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=compression) as socket_:
@@ -104,7 +104,7 @@ def test_an_ordinary_websocket_client_is_served_too(
         assert decode_replies(socket_.recv(5))[0].error is None
 
 
-def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: WebSocketServer) -> None:
+def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: OwnPortServer) -> None:
     other = stream(endpoint)
     ask(other, "reset")
     # It reads nothing before it has sent everything.
@@ -120,7 +120,7 @@ def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: WebSocke
 
 @pytest.mark.parametrize("fragments", [1, 2, 8])
 def test_a_message_in_fragments_is_answered_as_a_whole_one(
-    endpoint: WebSocketServer, fragments: int
+    endpoint: OwnPortServer, fragments: int
 ) -> None:
     """Browsers send large messages in fragments."""
     frame = encode_requests([Request("reset", Obs({"front": np.zeros((64, 64, 3), np.uint8)}))])
@@ -133,7 +133,7 @@ def test_a_message_in_fragments_is_answered_as_a_whole_one(
         assert decode_replies(client.recv(5))[0].error is None
 
 
-def test_many_small_fragments_end_their_connection(endpoint: WebSocketServer) -> None:
+def test_many_small_fragments_end_their_connection(endpoint: OwnPortServer) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=None) as client:
         with suppress(ConnectionClosed):  # the server may close it before the last is sent
@@ -144,7 +144,7 @@ def test_many_small_fragments_end_their_connection(endpoint: WebSocketServer) ->
 
 @pytest.mark.parametrize("floods", [True, False])
 def test_who_stays_after_a_wrong_message_is_cut_off(
-    endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
+    endpoint: OwnPortServer, floods: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(message_connection, "_CLOSING_S", 1e9 if floods else 0.2)
     endpoint.limits = MessageLimits(body_bytes=1_000_000)
@@ -161,7 +161,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
 
 
 def test_a_client_that_takes_no_replies_holds_up_nobody(
-    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+    endpoint: OwnPortServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vlagents_ray.serve.endpoints.send_buffer._SLOW_S", 0.5)
     slow, other = stream(endpoint), stream(endpoint)
@@ -184,7 +184,7 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     other.close()
 
 
-def test_a_reply_longer_than_the_connection_holds_arrives_whole(endpoint: WebSocketServer) -> None:
+def test_a_reply_longer_than_the_connection_holds_arrives_whole(endpoint: OwnPortServer) -> None:
     client = stream(endpoint)
     ask(client, "reset")
     for _ in range(3):
@@ -193,7 +193,7 @@ def test_a_reply_longer_than_the_connection_holds_arrives_whole(endpoint: WebSoc
     client.close()
 
 
-def test_connections_that_say_nothing_make_way(endpoint: WebSocketServer) -> None:
+def test_connections_that_say_nothing_make_way(endpoint: OwnPortServer) -> None:
     silent = [socket.create_connection(("127.0.0.1", endpoint.address.port)) for _ in range(70)]
     client = stream(endpoint)
     assert ask(client, "reset").error is None
@@ -205,7 +205,7 @@ def test_connections_that_say_nothing_make_way(endpoint: WebSocketServer) -> Non
 
 
 def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
-    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+    endpoint: OwnPortServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def decode(frame: bytes, budget: Budget) -> Decoded:
         if frame == b"surprise":
@@ -226,7 +226,7 @@ def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
 
 
 def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
-    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+    endpoint: OwnPortServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hurry = threading.Event()
 
@@ -272,8 +272,8 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=str(port)):
-            WebSocketServer(engine, MessageLimits(), "127.0.0.1", (port, port), NoKey.OPEN)
-        endpoint = WebSocketServer(
+            OwnPortServer(engine, MessageLimits(), "127.0.0.1", (port, port), NoKey.OPEN)
+        endpoint = OwnPortServer(
             engine, MessageLimits(), "127.0.0.1", (port, port + 20), NoKey.OPEN
         )
         assert port < endpoint.address.port <= port + 20
@@ -283,7 +283,7 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
 
 def test_a_replica_that_stops_closes_its_connections_with_a_code_and_a_reason() -> None:
     engine = Engine(Echo())
-    endpoint = WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint = OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     endpoint.open()
     engine.start()
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"

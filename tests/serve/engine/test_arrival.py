@@ -37,8 +37,8 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.sender import Sender
@@ -84,7 +84,7 @@ class Shm:
 class WebSocket:
     """The same at the replica's own port."""
 
-    def __init__(self, endpoint: WebSocketServer) -> None:
+    def __init__(self, endpoint: OwnPortServer) -> None:
         self._stream = Stream(
             urlsplit("http://127.0.0.1"), endpoint.address.port, endpoint.address.path, 5
         )
@@ -116,7 +116,7 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
     endpoint = (
         ShmServer(engine, MessageLimits(), NoKey.OPEN)
         if transport == "shm"
-        else WebSocketServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
+        else OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     )
     endpoint.open()
     engine.start()

@@ -192,7 +192,12 @@ class UnixConnection(PolledConnection):
         descriptors = _descriptors_in(control)
         waited_s = time_in_socket_s(control)
         try:
-            if self._is_end_or_ping(data, waited_s):
+            # Each act passes here, and hardly any has waited, so nothing is called for most.
+            if not data or (waited_s and is_abandoned(self._connection, waited_s)):
+                self.disconnect()
+                return
+            if self._sender is not None and data == LocalAddress.PING:
+                self._answer_ping()
                 return
             with self._sending:
                 self._unanswered += 1
@@ -204,13 +209,7 @@ class UnixConnection(PolledConnection):
                 self._receive(sender, message, waited_s, data, descriptors)
         except VLAgentsError as error:
             self._refuse(message, error)
-            if self._sender is None:
-                self._refused_keys += 1
-                if self._refused_keys >= REFUSALS:
-                    self.end(f"its key was refused {REFUSALS} times; connect with another one")
-                    self.disconnect()  # its further messages are not read
-            elif self.account.refused_too_often:
-                self.end(REFUSED)
+            self._end_if_refused_too_often()
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -222,15 +221,17 @@ class UnixConnection(PolledConnection):
         if self._paused:
             self._pause(BACKLOGGED)
 
-    def _is_end_or_ping(self, data: memoryview, waited_s: float) -> bool:
-        """Handle the end of the connection, or a ping; return False for any other message."""
-        if not data or is_abandoned(self._connection, waited_s):
-            self.disconnect()
-            return True
-        is_ping = self._sender is not None and data == LocalAddress.PING
-        if is_ping:
-            self._answer_ping()
-        return is_ping
+    def _end_if_refused_too_often(self) -> None:
+        """End the connection of a client whose key, or whose messages, are refused again and again;
+        called after each refusal.
+        """
+        if self._sender is None:
+            self._refused_keys += 1
+            if self._refused_keys >= REFUSALS:
+                self.end(f"its key was refused {REFUSALS} times; connect with another one")
+                self.disconnect()  # its further messages are not read
+        elif self.account.refused_too_often:
+            self.end(REFUSED)
 
     def _answer_ping(self) -> None:
         """Answer a ping; end a connection that sends more pings than a WebSocket may send."""

@@ -1,7 +1,7 @@
 """An open WebSocket that a polling thread reads: its frames, its limits and its end.
 
 All WebSockets of a replica are `WebSocketConnection`s, whichever port their clients used: the
-replica's own port (`vlagents_ray.serve.endpoints.websocket`), or the server's port, where uvicorn
+replica's own port (`vlagents_ray.serve.endpoints.own_port`), or the server's port, where uvicorn
 accepts the handshake and gives its socket away (`vlagents_ray.serve.endpoints.asgi_websocket`).
 A `MessageHandler` serves the messages.
 """

@@ -40,10 +40,10 @@ from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSockets
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.direct_requests import DirectRequests, set_for_this_replica
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.own_port import OwnPortServer
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.shutdown import Shutdown
-from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
@@ -408,10 +408,10 @@ class PolicyReplica(ClientApi, SiblingApi):
             await asyncio.sleep(_GATEWAY_POLL_S)
 
 
-def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:
+def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> OwnPortServer:
     slow_s, idle_s, hosts = args.limits.slow_s, args.sessions.idle_s, args.access.hosts
     host, ports, limits = _plain_host(), args.stream.ports, args.limits.limits()
-    return WebSocketServer(
+    return OwnPortServer(
         engine, limits, host, ports, admit, slow_s=slow_s, idle_s=idle_s, hosts=hosts
     )
 

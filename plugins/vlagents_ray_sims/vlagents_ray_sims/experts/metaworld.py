@@ -8,6 +8,7 @@ import numpy as np
 
 from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task, require
 
@@ -23,8 +24,8 @@ class MetaWorldExpert:
         task = env_task(env_name) or "reach-v3"
         if task not in oracles:
             raise ContractMismatch(
-                f"expected an env with an oracle of Meta-World, one of {sorted(oracles)}, got "
-                f"{env_name!r}"
+                f"expected a task of Meta-World that has an oracle, one of {sorted(oracles)}, got "
+                f"{env_name!r}{did_you_mean(task, oracles)}"
             )
         self._name = env_name
         self._oracle = oracles[task]()

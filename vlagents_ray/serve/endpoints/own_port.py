@@ -6,9 +6,9 @@ Large messages are not copied, and a client that reads slowly delays no other cl
 The metadata contains the port and an unguessable path, so that only clients that may read the
 metadata can use the port; with API keys, a handshake or a request must also contain one. Messages
 of WebSockets are those of `WS /v1/stream` on the server's port, requests of HTTP those of
-`POST /v1/act`; both remain for clients that cannot reach this one. As for
-local clients, the policy thread reads the sockets (see `vlagents_ray.serve.endpoints.connection`)
-and decodes the messages.
+`POST /v1/act`; both remain for clients that cannot reach this one. As for local clients, the
+policy thread reads the sockets (see `vlagents_ray.serve.endpoints.connection`) and decodes the
+messages.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _KEEPALIVE = (
 )
 
 
-class WebSocketServer(HttpServer):
+class OwnPortServer(HttpServer):
     """Accepts WebSockets and HTTP connections at a port of the replica."""
 
     name: ClassVar[str] = "websocket"
@@ -195,7 +195,7 @@ class WebSocketServer(HttpServer):
 class PortConnection(WebSocketConnection):
     """A WebSocket of the replica's own port, from its handshake to its end."""
 
-    def __init__(self, server: WebSocketServer, connection: socket.socket) -> None:
+    def __init__(self, server: OwnPortServer, connection: socket.socket) -> None:
         super().__init__(
             server,
             connection,
