@@ -1,0 +1,119 @@
+"""The arithmetic of robots in time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.fleet import (
+    IDLE,
+    USABLE,
+    CostCurve,
+    RobotNeed,
+    most_robots,
+    replica_load,
+)
+
+PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
+CHUNKS_OF_50 = RobotNeed(10.0, 50)
+
+costs = st.builds(CostCurve, st.floats(1e-3, 0.2), st.floats(1e-4, 0.05))
+needs = st.builds(
+    RobotNeed,
+    st.sampled_from([1.0, 5.0, 10.0, 50.0]),
+    st.sampled_from([1, 8, 16, 50]),
+    st.none() | st.floats(0.05, 5.0),
+)
+
+
+def test_a_line_and_its_table_cost_the_same() -> None:
+    table = CostCurve(table=tuple((rows, PI0.cost_s(rows)) for rows in (1, 4, 16)))
+    for rows in (1, 2, 4, 9, 16, 32):
+        assert table.cost_s(rows) == pytest.approx(PI0.cost_s(rows))
+
+
+def test_a_table_is_not_extended_below_its_smallest_size() -> None:
+    assert CostCurve(table=((4, 0.1), (8, 0.2))).cost_s(1) == 0.1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"fixed_s": 0.0},
+        {"fixed_s": -1.0, "row_s": 2.0},
+        {"fixed_s": math.nan},
+        {"table": ((2, 0.1), (1, 0.2))},
+        {"table": ((1, 0.1), (1, 0.2))},
+        {"table": ((0, 0.1),)},
+        {"table": ((1, 0.0),)},
+    ],
+)
+def test_a_curve_that_cannot_be_is_refused(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match=r"costs: expected .* got"):
+        CostCurve(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"hz": 0.0}, {"hz": math.nan}, {"hz": 1.0, "rows": 0}, {"hz": 1.0, "age_s": 0.0}]
+)
+def test_a_need_that_cannot_be_is_refused(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match="expected .* got"):
+        RobotNeed(**wrong)
+
+
+def test_a_robot_replans_before_its_rows_are_executed() -> None:
+    assert CHUNKS_OF_50.interval_s(0.5) == pytest.approx(4.5)
+    assert CHUNKS_OF_50.interval_s(5.0) == 0.0
+    assert RobotNeed(10.0, 50, age_s=1.0).interval_s(0.4) == pytest.approx(0.6)
+    assert RobotNeed(10.0, 50, age_s=0.4).interval_s(0.4) == 0.0
+    assert RobotNeed(10.0, 50, age_s=0.45).interval_s(0.4) == 0.1  # once a tick
+
+
+def test_a_robot_with_single_actions_asks_once_a_tick() -> None:
+    lone = RobotNeed(10.0, 1)
+    assert lone.interval_s(0.1) == 0.1
+    assert lone.interval_s(0.11) == 0.0
+    assert RobotNeed(10.0, 1, age_s=0.05).interval_s(0.06) == 0.0
+
+
+def test_nobody_is_no_load() -> None:
+    assert replica_load(PI0, {}, 16) == IDLE
+
+
+def test_a_policy_that_is_slower_than_a_tick_serves_no_robot() -> None:
+    slow = replica_load(CostCurve(0.2), {RobotNeed(10.0, 1): 1}, 16)
+    assert slow.load == math.inf
+    assert not slow.in_time
+
+
+def test_the_largest_fleet_is_that_of_the_costs() -> None:
+    # Batches of 16 take 158 ms; a robot needs one every 5 s less twice that.
+    by_hand = USABLE * 16 / 0.15826 * (5.0 - 2 * 0.15826)
+    assert most_robots(PI0, CHUNKS_OF_50, 16) == math.floor(by_hand)
+
+
+@given(costs, st.dictionaries(needs, st.integers(1, 30), min_size=1, max_size=4), needs)
+def test_a_further_robot_never_makes_a_replica_emptier(
+    curve: CostCurve, robots: dict[RobotNeed, int], newcomer: RobotNeed
+) -> None:
+    before = replica_load(curve, robots, 16).load
+    more = {**robots, newcomer: robots.get(newcomer, 0) + 1}
+    # Its batches may be larger by one row than those of the robots before.
+    after = replica_load(curve, more, min(16, sum(robots.values()))).load
+    assert after >= before
+
+
+@given(costs, st.dictionaries(needs, st.integers(1, 30), min_size=1, max_size=4))
+def test_robots_that_replan_as_told_use_no_more_than_the_replica_has(
+    curve: CostCurve, robots: dict[RobotNeed, int]
+) -> None:
+    load = replica_load(curve, robots, 16)
+    if not load.in_time:
+        return
+    requests_hz = sum(count / load.replan_s(need) for need, count in robots.items())
+    used = requests_hz * curve.cost_s(load.batch_size) / load.batch_size
+    assert used == pytest.approx(USABLE)

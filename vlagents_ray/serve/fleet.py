@@ -1,0 +1,199 @@
+"""How many robots a replica can serve in time: the costs of its batches against what robots need.
+
+A robot executes the rows of an action chunk, one a tick, and needs the next chunk before the last
+row was executed. A request waits for the batch that runs when it arrives, and then for its own, so
+that its answer comes after two batches and the transport; the longer this takes, the fewer rows of
+the answer are left to execute. This arithmetic is used by the queue, by the check of a robot's SLO
+at its reset, by autoscaling, and by the plan of a fleet.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from vlagents_ray.errors import ConfigError
+
+USABLE = 0.9
+"""The largest load at which robots are in time: requests arrive in bursts, so a replica that is
+needed all the time has a queue without bound.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CostCurve:
+    """The duration of a batch over its number of rows: a line, or a table of measured sizes.
+
+    Raises:
+        ConfigError: A duration is not a finite number above 0, or the table is not in the order of
+            its sizes.
+    """
+
+    fixed_s: float = 0.0  # duration of a batch without rows, s
+    row_s: float = 0.0  # further duration of each row, s
+    table: tuple[tuple[int, float], ...] = ()
+    """The duration, s, by the number of rows; the line is not used then. Between two sizes the
+    duration is interpolated; past the largest it grows as between the last two.
+    """
+
+    def __post_init__(self) -> None:
+        sizes = [size for size, _ in self.table]
+        if sizes != sorted(set(sizes)) or (sizes and sizes[0] < 1):
+            raise ConfigError(
+                f"costs: expected batch sizes of at least 1 in ascending order, got {sizes}"
+            )
+        durations = [duration for _, duration in self.table] or [self.fixed_s + self.row_s]
+        is_positive = all(math.isfinite(duration) and duration > 0 for duration in durations)
+        if not is_positive or self.fixed_s < 0 or self.row_s < 0:
+            raise ConfigError(
+                "costs: expected a duration of a batch above 0 s, got "
+                f"{self.table or (self.fixed_s, self.row_s)}"
+            )
+
+    def cost_s(self, rows: int) -> float:
+        """Return the duration of a batch of `rows` rows, s."""
+        if not self.table:
+            return self.fixed_s + self.row_s * rows
+
+        sizes = [size for size, _ in self.table]
+        if rows <= sizes[0] or len(sizes) == 1:
+            return self.table[0][1]
+        above = min(bisect.bisect_left(sizes, rows), len(sizes) - 1)
+        (size, duration), (next_size, next_duration) = self.table[above - 1 : above + 1]
+        return duration + (next_duration - duration) * (rows - size) / (next_size - size)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotNeed:
+    """What a robot needs of its policy.
+
+    Raises:
+        ConfigError: A value is out of range.
+    """
+
+    hz: float  # ticks a second
+    rows: int = 1  # rows of an answer that it executes at most
+    age_s: float | None = None  # largest age of an executed action, s; None: any
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.hz) and self.hz > 0):
+            raise ConfigError(f"hz: expected a rate above 0, got {self.hz}")
+        if self.rows < 1:
+            raise ConfigError(f"rows: expected at least 1, got {self.rows}")
+        if self.age_s is not None and not self.age_s > 0:
+            raise ConfigError(f"age_s: expected seconds above 0, or None, got {self.age_s}")
+
+    def interval_s(self, latency_s: float) -> float:
+        """Return the longest time between two requests with which the robot is in time, s.
+
+        Args:
+            latency_s: The time from the capture of an observation to the first tick at which its
+                answer can be executed, s.
+
+        Returns:
+            The interval; 0 if the robot cannot be in time with this latency.
+        """
+        if self.rows == 1:
+            # Each tick needs an answer of its own, which comes before the next one.
+            interval_s = 1 / self.hz if latency_s <= 1 / self.hz else 0.0
+        else:
+            interval_s = self.rows / self.hz - latency_s
+        if self.age_s is not None:
+            # The oldest action is executed just before the next answer comes. With one action an
+            # answer, that is the only one, as old as the answer took.
+            fresh_s = self.age_s - latency_s
+            if self.rows == 1:
+                interval_s = interval_s if fresh_s >= 0 else 0.0
+            else:
+                interval_s = min(interval_s, fresh_s)
+
+        # More than one request a tick would compute actions that are never executed.
+        return max(interval_s, 1 / self.hz) if interval_s > 0 else 0.0
+
+
+class ReplicaLoad(NamedTuple):
+    """How much of a replica its robots need."""
+
+    load: float
+    """Requests a second that the robots need, as a share of those that the replica can answer in
+    time; `inf` if some robot cannot be in time here even alone.
+    """
+    batch_size: int  # size of the batches with which the load is least
+    latency_s: float  # from a request to its answer with batches of that size, s
+
+    @property
+    def in_time(self) -> bool:
+        """Whether all robots can be in time."""
+        return self.load <= USABLE
+
+    def replan_s(self, need: RobotNeed) -> float:
+        """Return the time between two requests of a robot with which the replica is used no more
+        than it can be, s; 0 if the robot may ask as often as it wants.
+
+        Every robot replans after the same share of its plan, so that nobody has fresher actions at
+        the cost of another one's.
+        """
+        share = min(1.0, self.load / USABLE)
+        return share * need.interval_s(self.latency_s)
+
+
+IDLE = ReplicaLoad(0.0, 1, 0.0)
+
+
+def replica_load(
+    costs: CostCurve,
+    needs: Mapping[RobotNeed, int],
+    max_batch_size: int,
+    transport_s: float = 0.0,
+) -> ReplicaLoad:
+    """Compute the load of a replica, with the size of batches that makes it least.
+
+    Small batches answer soon, and large ones answer more requests a second.
+
+    Args:
+        costs: The duration of its batches.
+        needs: The number of robots with each need.
+        max_batch_size: The largest batch of the replica.
+        transport_s: The time that a request and its answer spend on the way, s.
+    """
+    robots = sum(needs.values())
+    if not robots:
+        return IDLE
+
+    best = ReplicaLoad(math.inf, 1, answer_s(costs, 1, robots) + transport_s)
+    for size in range(1, min(max_batch_size, robots) + 1):
+        latency_s = answer_s(costs, size, robots) + transport_s
+        intervals_s = [(need.interval_s(latency_s), count) for need, count in needs.items()]
+        if any(interval_s <= 0 for interval_s, _ in intervals_s):
+            break  # larger batches answer later still
+        needed_hz = sum(count / interval_s for interval_s, count in intervals_s)
+        load = needed_hz * costs.cost_s(size) / size
+        if load < best.load:
+            best = ReplicaLoad(load, size, latency_s)
+    return best
+
+
+def answer_s(costs: CostCurve, size: int, robots: int) -> float:
+    """Return the longest time from the arrival of a request to its answer, s: the batch that runs
+    meanwhile, and its own. A lone robot finds no batch running.
+    """
+    return costs.cost_s(size) * (1 if robots == 1 else 2)
+
+
+def most_robots(
+    costs: CostCurve, need: RobotNeed, max_batch_size: int, transport_s: float = 0.0
+) -> int:
+    """Return the largest number of equal robots that a replica can serve in time."""
+    most, too_many = 0, 1
+    while replica_load(costs, {need: too_many}, max_batch_size, transport_s).in_time:
+        most, too_many = too_many, 2 * too_many
+    while too_many - most > 1:
+        robots = (most + too_many) // 2
+        if replica_load(costs, {need: robots}, max_batch_size, transport_s).in_time:
+            most = robots
+        else:
+            too_many = robots
+    return most
