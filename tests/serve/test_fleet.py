@@ -61,7 +61,7 @@ def test_a_curve_that_cannot_be_is_refused(wrong: dict) -> None:
     "wrong", [{"hz": 0.0}, {"hz": math.nan}, {"hz": 1.0, "rows": 0}, {"hz": 1.0, "age_s": 0.0}]
 )
 def test_a_need_that_cannot_be_is_refused(wrong: dict) -> None:
-    with pytest.raises(ConfigError, match="expected .* got"):
+    with pytest.raises(ConfigError, match=r"expected .* got"):
         RobotNeed(**wrong)
 
 
