@@ -57,7 +57,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
-from vlagents_ray.serve.endpoints import access_middleware
+from vlagents_ray.serve.endpoints import access_middleware, own_port
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
