@@ -19,8 +19,9 @@ from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
+from vlagents_ray.serve.python_env.child_agent import ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray.serve.python_env.child_process import ChildProgram
 from vlagents_ray.serve.python_env.probe import probe
 
 IN_PROCESS, CHILD = "in the replica", "child process"
@@ -38,7 +39,7 @@ def measure_hop(
     with contextlib.ExitStack() as stack:
         agents = {
             IN_PROCESS: Noop.from_config({}),
-            CHILD: ChildAgent(Child(python, Settings("noop", {}, 1, ""), {})),
+            CHILD: ChildAgent(ChildProgram(python, Settings("noop", {}, 1, ""), {})),
         }
         drivers = {name: _Driver(stack.enter_context(agent)) for name, agent in agents.items()}
         found = in_turns(drivers, calls, progress)

@@ -97,11 +97,12 @@ def gains(gain: float) -> dict[str, Any]:
 
 def in_child(policy: str = "Gain", **config: Any) -> Any:
     """The proxy of one of these policies, or of "module:Class", in a child process."""
-    from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
+    from vlagents_ray.serve.python_env.child_agent import ChildAgent
     from vlagents_ray.serve.python_env.child_main import Settings
+    from vlagents_ray.serve.python_env.child_process import ChildProgram
 
     here, policy = Path(__file__).parent, policy if ":" in policy else f"gain_policies:{policy}"
     paths = os.pathsep.join([str(here), str(here.parents[1])])
     return ChildAgent(
-        Child(sys.executable, Settings(policy, config, 16, "1"), {"PYTHONPATH": paths})
+        ChildProgram(sys.executable, Settings(policy, config, 16, "1"), {"PYTHONPATH": paths})
     )

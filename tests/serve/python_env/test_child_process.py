@@ -50,8 +50,10 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.ability_call import is_method, name_of
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
-from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
+from vlagents_ray.serve.python_env.child_agent import ChildAgent
+from vlagents_ray.serve.python_env.child_connection import ChildConnection
 from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray.serve.python_env.child_process import ChildProgram
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.serve.weights import PushOptions
@@ -65,7 +67,9 @@ ROOT = Path(__file__).parents[3]
 def agent(policy: str = "Telling", **config: Any) -> ChildAgent:
     settings = Settings(f"python_env_agents:{policy}", config, 16, "1")
     return ChildAgent(
-        Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}", "VARIABLE": "set"})
+        ChildProgram(
+            sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}", "VARIABLE": "set"}
+        )
     )
 
 
@@ -210,8 +214,9 @@ def test_a_policys_error_is_its_sessions_alone_and_its_text_stays_in_the_log(
 
 def test_what_the_replica_drops_the_child_forgets() -> None:
     child = agent()
-    one, held = Engine(child), child._child.sessions
+    one = Engine(child)
     one.start()
+    held = child.child.sessions
     for i in range(50):
         told = info(ask(one, f"short {i}", "reset", instruction="a task"))
     assert (told["alive"], len(held)) == (50, 50)
@@ -291,7 +296,7 @@ def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced()
     ],
 )
 def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any], said: str) -> None:
-    gone = ChildAgent(Child("/no/such/python", Settings("noop", {}, 1, ""), {}))
+    gone = ChildAgent(ChildProgram("/no/such/python", Settings("noop", {}, 1, ""), {}))
     one = Engine(agent(policy, **config) if policy else gone)
     with pytest.raises(VLAgentsError) as error:
         one.start()
@@ -309,10 +314,11 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
 def test_the_child_ends_with_its_replica_that_is_killed() -> None:
     code = (
         "import sys, time\n"
-        "from vlagents_ray.serve.python_env.child_agent import Child\n"
         "from vlagents_ray.serve.python_env.child_main import Settings\n"
-        "child = Child(sys.executable, Settings('noop', {}, 1, ''), {}); child.start()\n"
-        "print(child._process.pid, flush=True)\n"
+        "from vlagents_ray.serve.python_env.child_process import ChildProcess, ChildProgram\n"
+        "program = ChildProgram(sys.executable, Settings('noop', {}, 1, ''), {})\n"
+        "child = ChildProcess(program); child.wait_until_loaded()\n"
+        "print(child.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -398,12 +404,12 @@ def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engin
     assert engine.weights.describe()["newest"]["version"] == 0
 
 
-def learner(policy: str = "Gain", **config: Any) -> tuple[Engine, Child]:
+def learner(policy: str = "Gain", **config: Any) -> tuple[Engine, ChildConnection]:
     """A trained policy in a child process."""
     one = in_child(policy, **config)
     served = Engine(one)
     served.start()
-    return served, one._child
+    return served, one.child
 
 
 def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
@@ -461,7 +467,7 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
 
 def test_a_policy_in_a_child_process_says_whether_its_chunks_go_on_from_a_plan() -> None:
     settings = Settings("mirror_policy:CountingPolicy", {}, 16, "1")
-    policy = ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))
+    policy = ChildAgent(ChildProgram(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))
     assert ability(policy, ContinuesPlans) is None
     policy.initialize()
     try:

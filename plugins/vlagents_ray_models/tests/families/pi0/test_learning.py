@@ -28,8 +28,9 @@ from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAM
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
+from vlagents_ray.serve.python_env.child_agent import ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray.serve.python_env.child_process import ChildProgram
 from vlagents_ray_learn import Publisher
 from vlagents_ray_models import pi0
 from vlagents_ray_models.pi0 import Pi0
@@ -203,7 +204,8 @@ def test_in_a_child_process_it_acts_with_pushed_weights(folder: Path) -> None:
         pushed[name] = 0.8 * value if value.is_floating_point() else value
 
     settings = Settings("pi0", {"checkpoint": str(folder)}, 1, "1")
-    served = Engine(ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": str(ROOT)})))
+    program = ChildProgram(sys.executable, settings, {"PYTHONPATH": str(ROOT)})
+    served = Engine(ChildAgent(program))
     served.start()
     try:
         Publisher(served).push(pushed)
