@@ -58,6 +58,15 @@ LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this ob
 # int: the expected number of ticks until the answer arrives, at most the rows of LEFTOVER. It is 0
 # if the number is unknown.
 DELAY = "delay_ticks"
+# In an observation, float: the time from the request's arrival for which the server may take to
+# send its answer, ms. A robot that has no rows left states 0.
+SLACK = "slack_ms"
+# In an observation, [int, int]: the ticks since the last request at which the policy was to act,
+# and those of them without a row of an answer (starved ticks).
+TICKS = "ticks"
+# In an observation, float: the age of the action of the policy that was executed last, ms; absent
+# if there was none since the last request.
+EXECUTED_AGE = "executed_age_ms"
 # In the Act of a policy that was trained to continue given rows, an int: the number of rows of
 # LEFTOVER with which its chunk begins. If more rows have been executed when the chunk arrives, it
 # continues from a pose that the robot has left, and is dropped.

@@ -17,6 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from vlagents_ray.abilities import Prepares, ability
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
+from vlagents_ray.serve.in_time import RobotTimes
 from vlagents_ray.serve.requests import NOWHERE, Answer, Origin, PendingRequest
 from vlagents_ray.serve.weights import WeightsVersion
 
@@ -105,6 +106,8 @@ class Session(Generic[M]):
     # Whether it was announced to the other replicas, which then keep no older state.
     announced: bool = False
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
+    # What its robot has reported at this replica; None before the first report.
+    times: RobotTimes | None = None
 
     @property
     def version(self) -> Version:
@@ -471,6 +474,10 @@ class SessionTable(Generic[M]):
         """Return the number of sessions by transport."""
         with self._lock:
             return Counter(session.origin.transport for session in self._sessions.values())
+
+    def times(self) -> list[RobotTimes]:
+        """Return the reports of the sessions whose robots report their ticks."""
+        return [session.times for session in self.all() if session.times is not None]
 
     def by_connection(self, transports: Container[str], within_s: float) -> Counter[str]:
         """Return the number of sessions by connection, over these transports and used within the

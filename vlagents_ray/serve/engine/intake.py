@@ -13,6 +13,7 @@ from vlagents_ray.errors import NotReset, PolicyUnavailable, UnknownSession, VLA
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.responses import public_error
+from vlagents_ray.serve.in_time import RobotReport, RobotTimes
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
@@ -31,6 +32,8 @@ class Intake:
         self._queue = parts.queue
         self._finder = parts.finder
         self._drain_list = parts.drain_list
+        self._stats = parts.stats
+        self._clock = parts.clock
         # None if the engine has no threads.
         self._preparations = Preparations() if parts.settings.threaded else None
 
@@ -93,6 +96,7 @@ class Intake:
             model = session.model  # another thread may set it to None
             if model is not None:
                 model.check(request)
+            self._record_report(session, pending)
             preparation = None
             if self._preparations is not None and self._queue.window.overlaps:
                 preparation = self._preparations.begin(session.prepares, request.obs)
@@ -105,6 +109,19 @@ class Intake:
         elif origin.owner and request.op != "close":
             origin.sessions.setdefault(session_id, None)
         return None
+
+    def _record_report(self, session: Session[LoadedModel], pending: PendingRequest) -> None:
+        """Add what the robot of an act reports to its session and to the metrics."""
+        obs = pending.request.obs
+        report = RobotReport.of(obs.info) if obs is not None and obs.info else None
+        if report is None:
+            return
+        times = session.times
+        if times is None:
+            times = session.times = RobotTimes()
+        times.priority = pending.priority
+        times.add(report, self._clock())
+        self._stats.report(pending.priority.name.lower(), report)
 
     def _open(self, pending: PendingRequest) -> Opening:
         """Check a reset, and reserve an episode of its session."""

@@ -14,6 +14,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from vlagents_ray.serve.in_time import RobotReport
 from vlagents_ray.serve.requests import IncomingMessage
 
 T = TypeVar("T")
@@ -62,6 +63,10 @@ class Collected:
     out_of_memory: int = 0  # forward passes that did not fit into memory
     # Calls of the policy that exceeded their limit, by op.
     hung: Counter[str] = field(default_factory=Counter)
+    # What robots reported, by priority: ticks, starved ticks, and ages of executed actions, ms.
+    ticks: Counter[str] = field(default_factory=Counter)
+    starved: Counter[str] = field(default_factory=Counter)
+    ages_ms: dict[str, Sample[float]] = field(default_factory=dict)
 
 
 class MetricsBuffer:
@@ -117,6 +122,17 @@ class MetricsBuffer:
             if sample is None:
                 sample = self._collected.requests[kind] = Sample()
             sample.add(times)
+
+    def report(self, priority: str, report: RobotReport) -> None:
+        """Record what a robot reported with a request of that priority."""
+        if not self._enabled:
+            return
+        with self._lock:
+            collected = self._collected
+            collected.ticks[priority] += report.ticks
+            collected.starved[priority] += report.starved
+            if report.age_ms is not None:
+                collected.ages_ms.setdefault(priority, Sample()).add(report.age_ms)
 
     def batch(self, observations: int, rows: int) -> None:
         """Record a forward pass with this number of observations, and of rows including padding."""

@@ -23,6 +23,7 @@ from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
+from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 
@@ -113,6 +114,26 @@ class Exporter:
         self._uncompiled = make(
             Gauge, "uncompiled", "Batch sizes that run without the compilation that is set."
         )
+        # The next five series are of robots that report their ticks.
+        self._ticks = make(
+            Counter, "ticks", "Ticks at which the policy was to act, as robots report.", "priority"
+        )
+        self._starved = make(
+            Counter, "starved_ticks", "Those of these ticks without an action in time.", "priority"
+        )
+        self._executed_age = make(
+            Histogram,
+            "executed_age_ms",
+            "Age of executed actions, as robots report.",
+            "priority",
+            boundaries=MS_BOUNDARIES,
+        )
+        self._robots = make(
+            Gauge, "robots", "Robots that reported ticks in the last 10 s.", "priority"
+        )
+        self._goodput = make(
+            Gauge, "goodput", "Robots whose share of ticks in time reached its target.", "priority"
+        )
         self._unreadable = make(
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
         )
@@ -142,6 +163,11 @@ class Exporter:
         sessions = self._engine.sessions.by_transport()
         for transport in _TRANSPORTS:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
+        robots = goodput(self._engine.sessions.times(), self._engine.clock())
+        for priority, count in robots.items():
+            tags = {"priority": priority.name.lower()}
+            self._robots.set(count.robots, tags)
+            self._goodput.set(count.in_time, tags)
         self._utilisation.set(self._meter.read().utilisation)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
@@ -171,6 +197,12 @@ class Exporter:
             self._gpu_ms.observe(took_ms)
         for op, calls in collected.hung.items():
             self._hung.inc(calls, {"op": op})
+        for priority, ticks in collected.ticks.items():
+            self._ticks.inc(ticks, {"priority": priority})
+            self._starved.inc(collected.starved[priority], {"priority": priority})
+        for priority, ages_ms in collected.ages_ms.items():
+            for age_ms in _in_slices(ages_ms.values):
+                self._executed_age.observe(age_ms, {"priority": priority})
         if collected.out_of_memory:
             self._out_of_memory.inc(collected.out_of_memory)
         if collected.padding:

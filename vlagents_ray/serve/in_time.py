@@ -1,0 +1,164 @@
+"""Whether robots had their actions in time, as they report it with their requests.
+
+A chunk player on a robot adds to each request the number of ticks at which the policy was to act
+since the last one, those of them without a row of an answer (*starved ticks*), and the age of the
+action that it executed last. The entries of the requests' info are untrusted: `RobotReport.of`
+checks them, and a session keeps a fixed number of values however often its robot reports.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.interface import EXECUTED_AGE, TICKS
+from vlagents_ray.protocol.messages import Priority
+
+WINDOW_S = 10  # time over which shares, ages and the goodput are computed, s
+TARGET_SHARE = 0.98
+"""The share of its ticks that a robot must have in time if its SLO does not name one."""
+
+# The largest number of ticks and age of one report. A robot that was offline for weeks stays below
+# them, as it would be refused for ever otherwise.
+_MOST_TICKS = 2**31
+_MOST_AGE_MS = 2.0**31
+_AGES = 128  # number of the last ages that a session keeps
+
+
+class RobotReport(NamedTuple):
+    """What a robot reports with one request."""
+
+    ticks: int  # ticks at which the policy was to act since the last request
+    starved: int  # those of them without a row of an answer
+    age_ms: float | None  # age of the action that was executed last; None if there was none
+
+    @classmethod
+    def of(cls, info: Mapping[str, Any]) -> RobotReport | None:
+        """Return the report in the info of an observation; None without one.
+
+        Raises:
+            InvalidInput: An entry has another type than a chunk player sends, or is out of range.
+        """
+        if TICKS not in info and EXECUTED_AGE not in info:
+            return None
+
+        ticks = info.get(TICKS, (0, 0))
+        is_pair = isinstance(ticks, (list, tuple)) and len(ticks) == 2
+        if not is_pair or any(type(number) is not int for number in ticks):
+            raise InvalidInput(f"info[{TICKS!r}]: expected two integers, got {reprlib.repr(ticks)}")
+        all_ticks, starved = ticks
+        if not 0 <= starved <= all_ticks <= _MOST_TICKS:
+            raise InvalidInput(
+                f"info[{TICKS!r}]: expected 0 <= starved ticks <= ticks <= {_MOST_TICKS}, got "
+                f"{reprlib.repr(ticks)}"
+            )
+
+        age_ms = info.get(EXECUTED_AGE)
+        if age_ms is None:
+            return cls(all_ticks, starved, None)
+        # A NaN fails the comparison.
+        if type(age_ms) not in (int, float) or not 0 <= age_ms <= _MOST_AGE_MS:
+            raise InvalidInput(
+                f"info[{EXECUTED_AGE!r}]: expected a number in [0, {_MOST_AGE_MS:g}], got "
+                f"{reprlib.repr(age_ms)}"
+            )
+        return cls(all_ticks, starved, float(age_ms))
+
+
+class TimeShare(NamedTuple):
+    """How well a robot was served in some time."""
+
+    ticks: int  # ticks at which the policy was to act
+    starved: int  # those of them without a row of an answer
+    age_p50_ms: float | None  # age of executed actions; None if none was reported
+    age_p95_ms: float | None
+    age_p99_ms: float | None
+
+    @property
+    def share(self) -> float | None:
+        """The share of the ticks in time, in [0, 1]; None without ticks."""
+        return None if self.ticks == 0 else 1 - self.starved / self.ticks
+
+
+class RobotTimes:
+    """The ticks and the ages that the robot of one session reports. Thread-safe."""
+
+    def __init__(self, priority: Priority = Priority.ROBOT) -> None:
+        """Start without reports, for a session of that priority."""
+        self.priority = priority
+        self.target_share = TARGET_SHARE  # share of the ticks in time that the robot needs
+        self.ticks = 0  # in total
+        self.starved = 0  # in total
+        self._lock = threading.Lock()
+        # By second, oldest first: its number, ticks and starved ticks.
+        self._seconds: deque[tuple[int, int, int]] = deque(maxlen=WINDOW_S + 1)
+        self._ages: deque[tuple[float, float]] = deque(maxlen=_AGES)  # time, s, and age, ms
+
+    def add(self, report: RobotReport, now: float) -> None:
+        """Add a report that arrived at `now`, s."""
+        second = math.floor(now)
+        with self._lock:
+            self.ticks += report.ticks
+            self.starved += report.starved
+            ticks, starved = report.ticks, report.starved
+            if self._seconds and self._seconds[-1][0] >= second:
+                second, ticks_before, starved_before = self._seconds.pop()
+                ticks += ticks_before
+                starved += starved_before
+            self._seconds.append((second, ticks, starved))
+            if report.age_ms is not None:
+                self._ages.append((now, report.age_ms))
+
+    def lately(self, now: float) -> TimeShare:
+        """Return how well the robot was served in the last `WINDOW_S` seconds before `now`, s."""
+        with self._lock:
+            oldest = math.floor(now) - WINDOW_S
+            seconds = [each for each in self._seconds if each[0] > oldest]
+            ages = sorted(age_ms for when, age_ms in self._ages if when > now - WINDOW_S)
+        ticks = sum(ticks for _, ticks, _ in seconds)
+        starved = sum(starved for _, _, starved in seconds)
+        p50, p95, p99 = (_quantile(ages, share) for share in (0.5, 0.95, 0.99))
+        return TimeShare(ticks, starved, p50, p95, p99)
+
+    def is_in_time(self, now: float) -> bool | None:
+        """Return whether the robot's share was at least its target in the last `WINDOW_S` seconds
+        before `now`, s; None if it reported no ticks.
+        """
+        share = self.lately(now).share
+        return None if share is None else share >= self.target_share
+
+
+class Goodput(NamedTuple):
+    """The robots that report their ticks."""
+
+    robots: int  # those that reported ticks in the last `WINDOW_S` seconds
+    in_time: int  # those of them with a share of at least their target
+
+    @property
+    def late(self) -> int:
+        """The robots with a share below their target."""
+        return self.robots - self.in_time
+
+
+def goodput(times: Iterable[RobotTimes], now: float) -> dict[Priority, Goodput]:
+    """Count the robots in time at `now`, s, by the priority of their sessions."""
+    robots = dict.fromkeys(Priority, 0)
+    in_time = dict.fromkeys(Priority, 0)
+    for robot in times:
+        is_in_time = robot.is_in_time(now)
+        if is_in_time is not None:
+            robots[robot.priority] += 1
+            in_time[robot.priority] += is_in_time
+    return {priority: Goodput(robots[priority], in_time[priority]) for priority in Priority}
+
+
+def _quantile(ordered: list[float], share: float) -> float | None:
+    """Return the nearest-rank quantile of sorted values; None without values."""
+    if not ordered:
+        return None
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
