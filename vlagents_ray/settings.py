@@ -171,10 +171,15 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
 
 def _fields(model: type | None, path: Iterable[Any]) -> Mapping[str, Any]:
     """Return the fields at a path below `model`; empty if they cannot be determined."""
+    is_key = False  # whether the next name is a key of a mapping, whose value has the fields
     for name in path:
         if isinstance(name, int):  # an index in a list
             continue
+        if is_key:
+            is_key = False
+            continue
         field = _of(model).get(name)
+        is_key = get_origin(getattr(field, "annotation", None)) is dict
         model = None if field is None else next(filter(_of, _parts(field.annotation)), None)
     return _of(model)
 

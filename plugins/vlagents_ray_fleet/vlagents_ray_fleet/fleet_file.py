@@ -1,0 +1,263 @@
+"""The file of a fleet: its robots, the models that they need, and the GPUs at hand."""
+
+from __future__ import annotations
+
+import json
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vlagents_ray.bounds import MOST_ROWS, MOST_WORKERS
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.serve.fleet import USABLE, CostCurve
+from vlagents_ray.settings import wrong_settings
+from vlagents_ray.yaml_text import read_yaml
+
+MOST_LOAD = 0.75
+"""The largest load with which a plan fills a replica. Above it, robots that start at about the same
+time keep a queue that does not shrink: an answer that comes after the last row is worthless, so
+each robot that starves asks twice. In the simulation, fleets at a load of 0.8 starved for minutes.
+"""
+
+_HTTP_S = 10.0  # longest wait for the costs that a running replica has measured
+_MOST_MS = 1e9
+_MOST_HZ = 1e4
+_MOST_GB = 1e6
+_MOST_ROBOTS = 1_000_000
+
+Milliseconds = Annotated[float, Field(gt=0, le=_MOST_MS)]
+Hertz = Annotated[float, Field(gt=0, le=_MOST_HZ)]
+Name = Annotated[str, Field(pattern=r"^[\w.@-]+$")]
+
+
+class _FleetModel(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ModelUse(_FleetModel):
+    """How the robots of a group use one model."""
+
+    rows: int = Field(
+        default=1, ge=1, le=MOST_ROWS, description="rows of its chunks that are executed"
+    )
+    hz: Hertz | None = Field(
+        default=None, description="rows a second; default: the rate of the robots"
+    )
+    age_ms: Milliseconds | None = Field(
+        default=None, description="largest age of an executed row; default: that of the robots"
+    )
+
+
+class RobotGroup(_FleetModel):
+    """Robots with the same needs."""
+
+    count: int = Field(ge=1, le=_MOST_ROBOTS, examples=[12])
+    hz: Hertz = Field(examples=[10], description="ticks of the control loop a second")
+    share: float = Field(
+        default=0.98, gt=0, le=1, description="of the ticks that must have an action in time"
+    )
+    age_ms: Milliseconds | None = Field(
+        default=None, description="largest age of an executed action; unset: any"
+    )
+    transport_ms: float = Field(
+        default=5.0,
+        ge=0,
+        le=_MOST_MS,
+        description="time that a request and its answer spend on the way, with their coding",
+    )
+    models: dict[Name, ModelUse] = Field(
+        min_length=1, examples=["{pi0: {rows: 50}}"], description="by the names below `models`"
+    )
+
+
+class Costs(_FleetModel):
+    """The duration of a batch over its number of rows, on a whole GPU."""
+
+    fixed_ms: float | None = Field(
+        default=None, ge=0, le=_MOST_MS, description="of a batch, whatever its size"
+    )
+    row_ms: float | None = Field(default=None, ge=0, le=_MOST_MS, description="of each row")
+    table: dict[Annotated[int, Field(ge=1, le=MOST_ROWS)], Milliseconds] | None = Field(
+        default=None,
+        description="milliseconds by the size of the batch, as `vlagents-ray tune` prints them",
+    )
+    url: str | None = Field(
+        default=None,
+        description="address whose JSON has `fixed_ms` and `row_ms`, or `table`, as a server "
+        "measures them",
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> Costs:
+        is_line = self.fixed_ms is not None or self.row_ms is not None
+        ways = [is_line, self.table is not None, self.url is not None]
+        if sum(ways) != 1:
+            raise ValueError(
+                "expected one of `fixed_ms` with `row_ms`, `table` and `url`, got "
+                f"{sorted(self.model_fields_set)}; keep one"
+            )
+        if is_line and None in (self.fixed_ms, self.row_ms):
+            raise ValueError(
+                f"expected fixed_ms with row_ms, got {sorted(self.model_fields_set)}; write "
+                "both, where 0 is none"
+            )
+        if is_line:
+            self.curve()
+        return self
+
+    def curve(self) -> CostCurve:
+        """Return the curve; with `url`, as its server answers.
+
+        Raises:
+            ConfigError: The costs are not above 0, or the server does not answer with costs.
+        """
+        if self.url is not None:
+            return _curve_at(self.url)
+        if self.table is not None:
+            sizes = sorted(self.table.items())
+            return CostCurve(table=tuple((size, duration / 1e3) for size, duration in sizes))
+        return CostCurve((self.fixed_ms or 0.0) / 1e3, (self.row_ms or 0.0) / 1e3)
+
+
+class FleetModel(_FleetModel):
+    """A model that robots use, with its costs."""
+
+    costs: Costs = Field(examples=["{fixed_ms: 29.3, row_ms: 8.06}"])
+    memory_gb: float = Field(
+        gt=0, le=_MOST_GB, examples=[9], description="GPU memory of one replica"
+    )
+    max_batch_size: int = Field(
+        default=16, ge=1, le=MOST_ROWS, description="the largest batch that was measured"
+    )
+    gpu_fraction: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="share of a GPU of each replica; unset: the plan chooses it",
+    )
+    max_load: float = Field(
+        default=MOST_LOAD,
+        gt=0,
+        le=USABLE,
+        description="largest load of a replica: requests a second that its robots need, as a share "
+        "of those that it can answer",
+    )
+    deployment: str | None = Field(
+        default=None,
+        description="deployment file with the settings of the policy, seen from the file of the "
+        "fleet",
+    )
+    policy: str | None = Field(
+        default=None, description="in place of `deployment`: a registered name or 'module:Class'"
+    )
+    config: dict[str, Any] = Field(default_factory=dict, description="settings of `policy`")
+
+    @model_validator(mode="after")
+    def _one(self) -> FleetModel:
+        if self.deployment is not None and (self.policy is not None or self.config):
+            raise ValueError("expected deployment or policy with config, got both; keep one")
+        return self
+
+
+class GpuPool(_FleetModel):
+    """The GPUs at hand, all of one kind."""
+
+    count: int = Field(ge=1, le=MOST_WORKERS, examples=[4])
+    memory_gb: float = Field(gt=0, le=_MOST_GB, examples=[80], description="of each")
+    finest_fraction: float = Field(
+        default=0.1,
+        gt=0,
+        le=1,
+        description="smallest share of a GPU that the plan gives to a replica; 1 never shares",
+    )
+
+
+class FleetFile(_FleetModel):
+    """The file of a fleet."""
+
+    robots: dict[Name, RobotGroup] = Field(min_length=1)
+    models: dict[Name, FleetModel] = Field(min_length=1)
+    gpus: GpuPool = Field(examples=["{count: 4, memory_gb: 80}"])
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FleetFile:
+        used = set()
+        for group, robots in self.robots.items():
+            for name in robots.models:
+                if name not in self.models:
+                    raise ValueError(
+                        f"robots.{group}.models: expected some of {sorted(self.models)}, got "
+                        f"{name!r}{did_you_mean(name, self.models)}"
+                    )
+                used.add(name)
+        unused = sorted(self.models.keys() - used)
+        if unused:
+            raise ValueError(
+                f"models: expected each to be used by some robots, got the unused {unused}; name "
+                "them below `robots`, or leave them out"
+            )
+        for name, model in self.models.items():
+            if model.memory_gb > self.gpus.memory_gb:
+                raise ValueError(
+                    f"models.{name}.memory_gb: expected at most the {self.gpus.memory_gb:g} of a "
+                    f"GPU, got {model.memory_gb:g}"
+                )
+        return self
+
+
+def read_fleet(file: Path | str) -> FleetFile:
+    """Read the file of a fleet.
+
+    Raises:
+        ConfigError: The file cannot be read, or a setting is wrong.
+    """
+    path = Path(file)
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"expected a file of a fleet (.yaml), got {str(file)!r}")
+    if not path.is_file():
+        files = [str(other) for other in path.parent.glob("*.y*ml")]
+        raise ConfigError(
+            f"file of a fleet {path.absolute()} does not exist{did_you_mean(str(file), files)}"
+        )
+    document = read_yaml(path)
+    if not isinstance(document, dict):
+        raise ConfigError(
+            f"{file}: expected a mapping with {sorted(FleetFile.model_fields)}, got "
+            f"{type(document).__name__}"
+        )
+    try:
+        return FleetFile(**document)
+    except ValidationError as error:
+        raise ConfigError(f"{file}: {wrong_settings(error, FleetFile)}") from error
+
+
+def _curve_at(url: str) -> CostCurve:
+    """Return the costs that a server has measured."""
+    if not url.startswith(("http://", "https://")):
+        raise ConfigError(f"costs.url: expected http://… or https://…, got {url!r}")
+    try:
+        with urllib.request.urlopen(url, timeout=_HTTP_S) as answer:  # noqa: S310
+            document = json.load(answer)
+    except (urllib.error.URLError, TimeoutError, ValueError) as error:
+        raise ConfigError(
+            f"costs.url: expected the costs as JSON from {url}, got {error}; is the server "
+            "running? Or write its costs into the file"
+        ) from error
+
+    known = Costs.model_fields.keys() - {"url"}
+    values = {}
+    if isinstance(document, dict):
+        measured = document.get("costs", document)
+        if isinstance(measured, dict):
+            values = {name: value for name, value in measured.items() if name in known}
+    try:
+        return Costs(**values).curve()
+    except ValidationError as error:
+        raise ConfigError(
+            f"costs.url: expected {sorted(known)} from {url}: {wrong_settings(error, Costs)}; it "
+            "has none until batches have run"
+        ) from error

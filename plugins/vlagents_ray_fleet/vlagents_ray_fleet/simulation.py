@@ -1,0 +1,565 @@
+"""A fleet in virtual time: robots that execute chunks, replicas with the batch queue of the server,
+and what happens to them.
+
+The queue is `BatchQueue`, driven by `take`. All else is arithmetic: a batch takes the time of the
+cost curve, a message the time of the transport, and a robot follows the rules of the chunk player
+in mode "async": one request at a time with the newest observation, sent at a tick, no earlier than
+the server allows unless the robot would starve; rows for executed ticks are skipped, and a robot
+without a row holds still, with its plan. Ticks are counted, not simulated: nothing but the rows
+that are left changes between two answers. The same seed gives the same result.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.protocol.messages import Priority, Request
+from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
+from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
+
+_ACT = Request("act")
+_MESSAGE = IncomingMessage("simulation")  # of all requests: nothing is delivered
+_AGE_BIN_S = 0.001
+_AGE_BINS = 120_000
+_FLUSH = 200_000  # runs of ticks that are kept until they are added up
+
+
+class _EverySession:
+    """The sessions of a replica: all that a request names."""
+
+    def __contains__(self, session_id: object) -> bool:
+        return True
+
+
+class _NoFiles:
+    """In place of the poller: nothing is read from files here."""
+
+    def wake(self) -> None:
+        pass
+
+    hand_to_reader = reclaim = close = wake
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What messages, batches and lost replicas take.
+
+    Args:
+        jitter: Standard deviation of the duration of a batch, as a share of it.
+        transport_jitter_s: Mean of the time by which a message is late, s.
+        replan: Whether the server states when the next request of a robot is useful.
+        broken_s: Time until a robot whose connection ends has sent its request to another replica.
+        silent_s: The same for a replica whose machine is lost, so that nothing ends the connection.
+        move_s: Time by which the first request at another replica comes later, as its session
+            moves.
+    """
+
+    jitter: float = 0.03
+    transport_jitter_s: float = 0.001
+    replan: bool = True
+    broken_s: float = 0.1
+    silent_s: float = 3.0
+    move_s: float = 0.02
+
+
+USUAL = Behaviour()
+
+
+class Tally:
+    """Ticks in time and starved ones, by second, and the ages of the executed actions."""
+
+    def __init__(self) -> None:
+        self.in_time = 0
+        self.starved = 0
+        self._runs = array("d")  # of each run: its first tick, s, ticks, period, age or -1
+        self._ages = np.zeros(_AGE_BINS, np.int64)
+        self._seconds: dict[bool, np.ndarray] = {
+            True: np.zeros(64, np.int64),
+            False: np.zeros(64, np.int64),
+        }
+
+    def add(self, first_s: float, ticks: int, period_s: float, age_s: float) -> None:
+        """Add ticks in a row.
+
+        Args:
+            first_s: The time of the first one, s.
+            ticks: Their number.
+            period_s: The time between two of them, s.
+            age_s: The age of the action at the first one, s; -1 if they had none.
+        """
+        if age_s < 0:
+            self.starved += ticks
+        else:
+            self.in_time += ticks
+        self._runs.extend((first_s, ticks, period_s, age_s))
+        if len(self._runs) >= 4 * _FLUSH:
+            self._flush()
+
+    @property
+    def share(self) -> float:
+        """The share of ticks that had an action in time; 1 without ticks."""
+        ticks = self.in_time + self.starved
+        return self.in_time / ticks if ticks else 1.0
+
+    def age_s(self, quantile: float) -> float:
+        """Return a quantile of the ages of executed actions, s; 0 without any."""
+        self._flush()
+        total = np.cumsum(self._ages)
+        if not total[-1]:
+            return 0.0
+        return float(np.searchsorted(total, quantile * total[-1])) * _AGE_BIN_S
+
+    def by_second(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ticks in time, and the starved ones, of each second."""
+        self._flush()
+        return self._seconds[True], self._seconds[False]
+
+    def _flush(self) -> None:
+        runs = np.frombuffer(self._runs, float).reshape(-1, 4).copy()
+        self._runs = array("d")
+        if not len(runs):
+            return
+        ticks = runs[:, 1].astype(np.int64)
+        of_run = np.repeat(np.arange(len(runs)), ticks)
+        number = np.arange(len(of_run)) - np.repeat(np.cumsum(ticks) - ticks, ticks)
+        since = number * runs[of_run, 2]
+        seconds = (runs[of_run, 0] + since).astype(np.int64)
+        executed = runs[of_run, 3] >= 0
+
+        for is_in_time in (True, False):
+            counts = np.bincount(seconds[executed == is_in_time])
+            total = self._seconds[is_in_time]
+            size = max(len(total), len(counts), len(self._seconds[not is_in_time]))
+            self._seconds[is_in_time] = _longer(total, size) + _longer(counts, size)
+            self._seconds[not is_in_time] = _longer(self._seconds[not is_in_time], size)
+
+        bins = ((runs[of_run, 3] + since)[executed] / _AGE_BIN_S).astype(np.int64)
+        self._ages += np.bincount(np.minimum(bins, _AGE_BINS - 1), minlength=_AGE_BINS)
+
+
+def _longer(counts: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(counts, (0, size - len(counts)))
+
+
+class Stream:
+    """The use of one model by one robot: a plan of rows, and at most one request."""
+
+    __slots__ = (
+        "_asked",
+        "_asked_at_s",
+        "_asked_row",
+        "_begun",
+        "_captured_s",
+        "_executed",
+        "_left",
+        "_period_s",
+        "_phase_s",
+        "_round_trip_s",
+        "_tick",
+        "asks",
+        "need",
+        "replica",
+        "session_id",
+        "starved",
+        "tally",
+        "ticks",
+        "transport_s",
+        "world",
+    )
+
+    def __init__(
+        self,
+        world: World,
+        session_id: str,
+        need: RobotNeed,
+        transport_s: float,
+        start_s: float,
+        tally: Tally,
+    ) -> None:
+        self.world = world
+        self.session_id = session_id
+        self.need = need
+        self.transport_s = transport_s
+        self.tally = tally
+        self.replica: Replica | None = None
+        self.ticks = 0
+        self.starved = 0
+        self.asks = 0  # numbers its requests, so that an answer to an abandoned one is known
+        self._period_s = 1 / need.hz
+        self._phase_s = start_s
+        self._tick = 0  # the next tick that is not counted yet
+        self._executed = 0  # rows
+        self._left = 0  # rows of the plan
+        self._captured_s = 0.0  # of the observation of the plan
+        self._asked = 0  # the tick of the last request
+        self._asked_row = 0  # rows that were executed before it
+        self._asked_at_s = 0.0
+        self._begun = False  # whether the first answer is there
+        self._round_trip_s = transport_s
+
+    def begin(self) -> None:
+        """Send the first request."""
+        self._ask(0)
+
+    def deadline_s(self) -> float:
+        """Return the time at which the plan ends, less the way back, s; now without a plan."""
+        if not self._left:
+            return self.world.now
+        return self._phase_s + (self._tick + self._left) * self._period_s - self.transport_s / 2
+
+    def answered(self, arrives_s: float, replan_s: float) -> None:
+        """Take the answer to the last request, and plan the next one.
+
+        Args:
+            arrives_s: The time at which the answer arrives, s.
+            replan_s: The time from then on at which the next request is useful, s; 0: at once.
+        """
+        period_s = self._period_s
+        tick = max(math.ceil((arrives_s - self._phase_s) / period_s), self._asked + 1)
+        if not self._begun:
+            # `reset` waits for the first answer, and the episode begins with it.
+            self._begun = True
+            self._tick = tick
+        self._count_until(tick)
+
+        rows = self._asked_row + self.need.rows - self._executed
+        if rows == 0 and self._left == 0:
+            rows = 1  # the last row may be executed one step late
+        if rows > 0:
+            self._left = rows
+            self._captured_s = self._asked_at_s
+        round_trip_s = arrives_s - self._asked_at_s
+        self._round_trip_s += 0.25 * (round_trip_s - self._round_trip_s)
+
+        due = tick
+        if replan_s > 0:
+            allowed = math.ceil((arrives_s + replan_s - self._phase_s) / period_s)
+            urgent = tick + self._left - math.floor(self._round_trip_s / period_s) - 2
+            due = max(tick, min(allowed, urgent))
+        self._ask(due)
+
+    def resend(self) -> None:
+        """Send the last request to another replica."""
+        self._send(self.world.now)
+
+    def finish(self) -> None:
+        """Count the ticks until now."""
+        if self._begun:
+            tick = math.ceil((self.world.now - self._phase_s) / self._period_s)
+            if tick > self._tick:
+                self._count_until(tick)
+
+    def _ask(self, tick: int) -> None:
+        """Send a request with the observation of this tick, before its row is executed."""
+        if self._begun and tick > self._tick:
+            self._count_until(tick)
+        self._asked = tick
+        self._asked_row = self._executed
+        self._asked_at_s = self._phase_s + tick * self._period_s
+        self._send(self._asked_at_s)
+
+    def _send(self, sent_s: float) -> None:
+        world = self.world
+        self.asks += 1
+        way_s = self.transport_s / 2 + world.late_s()
+        world.at(sent_s + way_s, world.arrive, self, self.asks)
+
+    def _count_until(self, tick: int) -> None:
+        """Execute the rows of the ticks before this one."""
+        ticks = tick - self._tick
+        if ticks <= 0:
+            return
+        executed = min(ticks, self._left)
+        first_s = self._phase_s + self._tick * self._period_s
+        if executed:
+            self.tally.add(first_s, executed, self._period_s, first_s - self._captured_s)
+        starved = ticks - executed
+        if starved:
+            first_s += executed * self._period_s
+            self.tally.add(first_s, starved, self._period_s, -1.0)
+        self._executed += executed
+        self._left -= executed
+        self._tick = tick
+        self.ticks += ticks
+        self.starved += starved
+
+
+class Replica:
+    """A policy with its batch queue."""
+
+    def __init__(
+        self, world: World, model: str, costs: CostCurve, max_batch_size: int, node: int = 0
+    ) -> None:
+        self.world = world
+        self.model = model
+        self.node = node
+        self.alive = True
+        self.accepts = True  # whether new sessions may begin here
+        self.needs: dict[RobotNeed, int] = {}  # of its sessions
+        self.sessions = 0
+        self.batches = 0
+        self.requests = 0
+        self.busy_s = 0.0
+        self._costs = costs
+        self._largest = max_batch_size
+        self._streams: dict[str, tuple[Stream, int]] = {}  # of the waiting requests
+        self._busy = False
+        self._running: list[PendingRequest] = []
+        self._replan_s: dict[RobotNeed, float] | None = None
+        self.queue = BatchQueue(
+            max_batch_size,
+            sessions=_EverySession(),
+            clock=world.clock,
+            poller=_NoFiles(),  # type: ignore[arg-type]
+        )
+        self.queue.bind(driven=True)
+
+    def join(self, stream: Stream) -> None:
+        """Begin a session."""
+        stream.replica = self
+        self._change(stream.need, 1)
+
+    def leave(self, stream: Stream) -> None:
+        """End a session."""
+        stream.replica = None
+        self._change(stream.need, -1)
+
+    def _change(self, need: RobotNeed, by: int) -> None:
+        self.needs[need] = self.needs.get(need, 0) + by
+        if not self.needs[need]:
+            del self.needs[need]
+        self.sessions += by
+        self._replan_s = None
+
+    def receive(self, stream: Stream, number: int) -> None:
+        """Queue a request."""
+        world = self.world
+        request = PendingRequest(
+            stream.session_id, _ACT, _MESSAGE, Priority.ROBOT, arrived=world.now
+        )
+        if world.requests_have_slack:
+            request.needed = max(world.now, stream.deadline_s())  # type: ignore[attr-defined]
+        self._streams[stream.session_id] = stream, number
+        self.queue.put(request)
+        if not self._busy:
+            self._take()
+
+    def fail(self, detected_s: float) -> list[Stream]:
+        """Lose the replica.
+
+        Args:
+            detected_s: Time until the robots whose requests are here notice it, s.
+
+        Returns:
+            Those robots.
+        """
+        self.alive = self.accepts = False
+        waiting = [*self._running, *self.queue.close()]
+        streams = [self._streams[request.session_id] for request in waiting]
+        for stream, number in streams:
+            self.world.at(self.world.now + detected_s, self.world.resend, stream, number)
+        self._streams.clear()
+        return [stream for stream, _ in streams]
+
+    def _take(self) -> None:
+        if not self.alive:
+            return
+        taken = self.queue.take()
+        if taken is None or not taken.batch:
+            return
+        world = self.world
+        self._busy = True
+        self._running = taken.batch
+        duration_s = self._costs.cost_s(len(taken.batch)) * world.factor()
+        self.queue.begin(taken.batch)
+        self.batches += 1
+        self.requests += len(taken.batch)
+        self.busy_s += duration_s
+        world.at(world.now + duration_s, self._end, None, 0)
+
+    def _end(self, _: None, __: int) -> None:
+        if not self.alive:
+            return
+        world = self.world
+        self.queue.end()
+        batch, self._running = self._running, []
+        replan_s = self._replan()
+        for request in batch:
+            stream, number = self._streams.pop(request.session_id)
+            if stream.asks != number:
+                continue
+            arrives_s = world.now + stream.transport_s / 2 + world.late_s()
+            left_s = replan_s[stream.need] - (world.now - request.arrived) if replan_s else 0.0
+            stream.answered(arrives_s, max(0.0, left_s))
+            if not self.accepts:
+                world.move(stream)
+        self._busy = False
+        self._take()
+
+    def _replan(self) -> dict[RobotNeed, float]:
+        """Return the time between two requests of its robots that the replica states, s."""
+        if self._replan_s is None:
+            self._replan_s = {}
+            if self.world.behaviour.replan:
+                transport_s = self.world.transport_s
+                load = replica_load(self._costs, self.needs, self._largest, transport_s)
+                if math.isfinite(load.load):
+                    self._replan_s = {need: load.replan_s(need) for need in self.needs}
+        return self._replan_s
+
+
+Event = tuple[float, int, Callable[..., None], Any, int]
+
+
+class World:
+    """Robots, replicas and the time."""
+
+    def __init__(
+        self,
+        seed: int = 0,
+        behaviour: Behaviour = USUAL,
+        transport_s: float = 0.005,
+        least_loaded: bool = True,
+    ) -> None:
+        """Begin at time 0.
+
+        Args:
+            seed: Of all random numbers.
+            behaviour: What messages and faults take.
+            transport_s: The time of a request and its answer on the way, for the arithmetic of the
+                server.
+            least_loaded: Whether a session begins at the replica with the fewest sessions, as
+                clients of a replica's own port do; else at one by the hash of its id, as behind a
+                proxy.
+        """
+        self.now = 0.0
+        self.behaviour = behaviour
+        self.transport_s = transport_s
+        self.least_loaded = least_loaded
+        self.replicas: dict[str, list[Replica]] = {}
+        self.streams: list[Stream] = []
+        self.events = 0
+        self.moves = 0
+        self.requests_have_slack = "needed" in PendingRequest.__slots__
+        self._draw = random.Random(seed)
+        self._due: list[Event] = []
+        self._count = 0
+
+    def clock(self) -> float:
+        """Return the time, s."""
+        return self.now
+
+    def late_s(self) -> float:
+        """Draw the time by which a message is late, s."""
+        return self._draw.expovariate(1.0) * self.behaviour.transport_jitter_s
+
+    def factor(self) -> float:
+        """Draw the duration of a batch, as a multiple of its cost."""
+        return max(0.5, self._draw.gauss(1.0, self.behaviour.jitter))
+
+    def at(self, when: float, call: Callable[..., None], subject: Any, number: int) -> None:
+        """Call `call(subject, number)` at that time."""
+        self._count += 1
+        heapq.heappush(self._due, (when, self._count, call, subject, number))
+
+    def run(self, until: float) -> None:
+        """Let the time pass until then, s."""
+        due = self._due
+        while due and due[0][0] <= until:
+            self.now, _, call, subject, number = heapq.heappop(due)
+            self.events += 1
+            call(subject, number)
+        self.now = until
+
+    def add_replica(
+        self, model: str, costs: CostCurve, max_batch_size: int, node: int = 0
+    ) -> Replica:
+        """Start a replica."""
+        replica = Replica(self, model, costs, max_batch_size, node)
+        self.replicas.setdefault(model, []).append(replica)
+        return replica
+
+    def add_stream(
+        self, model: str, need: RobotNeed, transport_s: float, start_s: float, tally: Tally
+    ) -> Stream:
+        """Add the use of a model by a robot, whose episode begins at `start_s`."""
+        stream = Stream(self, f"{model}/{len(self.streams)}", need, transport_s, start_s, tally)
+        self.streams.append(stream)
+        self.at(start_s, self._begin, (stream, model), 0)
+        return stream
+
+    def _begin(self, subject: tuple[Stream, str], _: int) -> None:
+        stream, model = subject
+        replica = self.choose(model)
+        if replica is None:  # it asks again
+            self.at(self.now + 1.0, self._begin, subject, 0)
+            return
+        replica.join(stream)
+        stream.begin()
+
+    def choose(self, model: str) -> Replica | None:
+        """Choose the replica of a new session; None if there is none."""
+        accepting = [replica for replica in self.replicas[model] if replica.accepts]
+        if not accepting:
+            return None
+        if self.least_loaded:
+            return min(accepting, key=_sessions_of)
+        return self._draw.choice(accepting)
+
+    def arrive(self, stream: Stream, number: int) -> None:
+        """Take a request of a robot, at its replica."""
+        if stream.asks != number:
+            return
+        replica = stream.replica
+        if replica is not None and replica.alive:
+            replica.receive(stream, number)
+        else:
+            # It is not accepted by anything, which the robot notices.
+            self.at(self.now + self.behaviour.broken_s, self.resend, stream, number)
+
+    def resend(self, stream: Stream, number: int) -> None:
+        """Send a request whose replica was lost to another one."""
+        if stream.asks != number:
+            return
+        if not self.move(stream):
+            self.at(self.now + 1.0, self.resend, stream, number)
+            return
+        stream.resend()
+
+    def move(self, stream: Stream) -> bool:
+        """Move a session to another replica; return False if there is none."""
+        old = stream.replica
+        model = stream.session_id.rpartition("/")[0]
+        replica = self.choose(model)
+        if replica is None:
+            return False
+        if old is not None:
+            old.leave(stream)
+        replica.join(stream)
+        self.moves += 1
+        return True
+
+    def finish(self) -> None:
+        """Count the ticks of all robots until now."""
+        for stream in self.streams:
+            stream.finish()
+
+
+def _sessions_of(replica: Replica) -> int:
+    return replica.sessions
+
+
+def starved_streams(streams: Iterable[Stream], share: float) -> Sequence[Stream]:
+    """Return those with a smaller share of ticks in time."""
+    return [
+        stream for stream in streams if stream.ticks and 1 - stream.starved / stream.ticks < share
+    ]
