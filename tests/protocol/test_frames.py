@@ -33,6 +33,8 @@ from vlagents_ray.protocol.frames import decode_replies, encode_replies, encode_
 from vlagents_ray.protocol.json_messages import request_from_parts
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
+    INNER_OPS,
+    OPS,
     Budget,
     MessageLimits,
     Reply,
@@ -402,7 +404,8 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
         ({"history": {"a": 1}}, MalformedMessage),
         ({"history": [{}] * 300}, MessageTooLarge),
         *(
-            ({"op": of_a_replica}, MalformedMessage) for of_a_replica in ("call", "export", "adopt")
+            ({"op": of_a_replica}, MalformedMessage)
+            for of_a_replica in sorted({*INNER_OPS} - {*OPS})
         ),  # two carry pickles
     ],
 )

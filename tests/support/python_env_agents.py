@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import sys
+import threading
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,6 +35,31 @@ class Dances(Protocol):
 
     def rest(self, seconds: float) -> str:
         """Rest."""
+
+
+RESTED = threading.Event()
+
+
+class ActsAfterRest(Agent):
+    """Does not return from an act before the loaded policy has been asked to rest."""
+
+    contract = Contract(action=ActionSpec(dim=1))
+    tempo = 1.0
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        if not RESTED.wait(30):
+            raise TimeoutError("no rest")
+        return Act(np.zeros(1))
+
+    def dance(self, obs: Obs, times: int, *, fast: bool = False) -> str:
+        return "danced"
+
+    def rest(self, seconds: float) -> str:
+        RESTED.set()
+        return "rested"
 
 
 ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds

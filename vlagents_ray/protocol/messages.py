@@ -45,11 +45,27 @@ def is_name(text: str) -> bool:
     )
 
 
-Op = Literal["reset", "act", "close", "call", "export", "adopt", "weights", "release"]
+Op = Literal[
+    "reset",
+    "act",
+    "close",
+    "call",
+    "export",
+    "adopt",
+    "weights",
+    "release",
+    "ability",
+    "make_weights",
+    "read_weights",
+    "sleep",
+    "wake",
+]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
+# These run while the policy acts, and use no session; see `BackgroundCalls`.
+BACKGROUND_OPS: tuple[Op, ...] = ("ability", "make_weights", "read_weights", "sleep", "wake")
 # Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain
 # pickles.
-INNER_OPS: tuple[Op, ...] = (*OPS, "call", "export", "adopt", "weights")
+INNER_OPS: tuple[Op, ...] = (*OPS, "call", "export", "adopt", "weights", *BACKGROUND_OPS)
 PriorityName = Literal["robot", "simulation"]
 
 
@@ -79,7 +95,7 @@ class Request:
     obs: Obs | None = None  # for reset and act; for call: its argument that is an observation
     instruction: str | None = None  # reset only
     # For reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`;
-    # for call: see `AbilityCall`.
+    # for call and ability: see `AbilityCall`; for other `BACKGROUND_OPS`: see `BackgroundCalls`.
     kwargs: dict[str, Any] = field(default_factory=dict)
     # Reset only: the contract of the robot or the environment, which the server compares with the
     # policy's contract.

@@ -64,7 +64,7 @@ class SharedValues:
         """Return everything except `others` as JSON values, which `from_json` reads."""
         storages = {}
         for address, handle in self.storages.items():
-            storages[address] = [
+            storages[str(address)] = [
                 handle.allocation.hex(),
                 handle.size,
                 handle.begin,

@@ -398,6 +398,20 @@ def test_an_ability_of_the_loaded_policy_is_used_while_it_acts(able: Engine) -> 
         found.dance(observation(), 1)
 
 
+def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
+    one = Engine(agent("ActsAfterRest"))
+    one.start()
+    assert ask(one, "a", "reset").error is None
+    replies: list[Reply] = []
+    submit(one, "a", Request("act", observation()), replies.append)
+    wait_for(lambda: one.calls.under_way, 10)
+    loaded: Any = ability(one.models.loaded(DEFAULT).agent, Dances)
+    assert loaded.rest(0.0) == "rested"
+    wait_for(lambda: replies, 10)
+    assert replies[0].error is None
+    one.close()
+
+
 def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engine) -> None:
     with pytest.raises(NotTrainable, match="Telling: names no parameters to train"):
         engine.weights.stage(1, {"w": np.zeros(1)}, PushOptions())
@@ -424,7 +438,7 @@ def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
     assert served.weights.number == 0
     assert not served.health.ready
     with pytest.raises(PolicyUnavailable):
-        child.call_for_weights(name=0, values="")
+        child.call_for_weights("wake")
     served.close()
 
 

@@ -15,6 +15,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import OutcomeUnknown
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.engine.admission import Admission
+from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.health import Health
 from vlagents_ray.serve.engine.intake import Intake
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
@@ -112,7 +113,8 @@ class Engine:
             drain_list=self.drain_list,
             finder=finder,
         )
-        self.intake, self.moves = Intake(parts), SessionMoves(parts)
+        self._background = BackgroundCalls(parts)
+        self.intake, self.moves = Intake(parts, self._background), SessionMoves(parts)
         self.runner = Runner(parts, self.intake, self.moves)
 
     def start(self) -> None:
@@ -168,6 +170,7 @@ class Engine:
         self.admission.close()
         self.stop(timeout_s=30)
         self.intake.close()
+        self._background.close()
         self.models.close()
 
     def stop(self, timeout_s: float) -> None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vlagents_ray.errors import NotReset, PolicyUnavailable, UnknownSession, VLAgentsError
-from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.protocol.messages import BACKGROUND_OPS, Priority
+from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.responses import public_error
 from vlagents_ray.serve.in_time import RobotReport, RobotTimes
@@ -20,11 +21,15 @@ from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, Reserve
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import follows
 
+# Operations after which their connection has no further session.
+_USE_NO_SESSION = ("close", *BACKGROUND_OPS)
+
 
 class Intake:
     """Admits requests to the queue. Thread-safe."""
 
-    def __init__(self, parts: EngineParts) -> None:
+    def __init__(self, parts: EngineParts, background: BackgroundCalls) -> None:
+        self._background = background
         self._health = parts.health
         self._sessions = parts.sessions
         self._models = parts.models
@@ -39,13 +44,16 @@ class Intake:
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
         """Admit requests, and queue them together; those that cannot be queued are finished with
-        their errors.
+        their errors. Calls that run while the policy acts are begun at once.
         """
         ready: list[PendingRequest] = []
         for pending in requests:
             try:
-                pending.reserved = self.admit(pending)
-                ready.append(pending)
+                reserved = pending.reserved = self.admit(pending)
+                if reserved is None and pending.request.op in BACKGROUND_OPS:
+                    self._background.submit(pending)
+                else:
+                    ready.append(pending)
             except Exception as error:  # noqa: BLE001 - becomes the reply, and affects no other request
                 public = public_error(error, pending)
                 if not self.search(pending, public):
@@ -106,7 +114,7 @@ class Intake:
             return self._open(pending)
         if origin.owner and request.op == "adopt":
             origin.sessions[session_id] = None
-        elif origin.owner and request.op != "close":
+        elif origin.owner and request.op not in _USE_NO_SESSION:
             origin.sessions.setdefault(session_id, None)
         return None
 

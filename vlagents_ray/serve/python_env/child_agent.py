@@ -128,7 +128,7 @@ class ChildAgent(Agent, HoldsWeights):
             return (self._ask(Request("call", obs, kwargs=asdict(call))).info or {}).get("result")
         if obs is not None:
             raise NotReset(f"{call.member} before reset; reset first")
-        return self.child.process.call_beside_acts(**asdict(call))["result"]
+        return self.child.call_in_background("ability", **asdict(call))["result"]
 
     def check_health(self) -> None:
         """Raise `PolicyUnavailable` if the child has ended, as it does if its policy is not

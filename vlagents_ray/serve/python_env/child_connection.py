@@ -11,7 +11,7 @@ from typing import Any
 
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import LocalAddress, Op, Reply, Request
 from vlagents_ray.serve.engine.ability_call import name_of
 from vlagents_ray.serve.python_env.child_process import ChildProcess, LoadedPolicy
 
@@ -24,8 +24,9 @@ class ChildConnection:
     """The calls of a replica to the engine in its child process, and its sessions there.
 
     They are sent through shared memory (`vlagents_ray.client.transports.shm`): a batch is one
-    message, and each session of the replica has a session in the child. All methods may be called
-    from any thread.
+    message, and each session of the replica has a session in the child. Calls that run while the
+    policy acts have a channel of their own, as each channel has one message at a time. All methods
+    may be called from any thread.
     """
 
     def __init__(self, process: ChildProcess, policy: LoadedPolicy) -> None:
@@ -37,11 +38,8 @@ class ChildConnection:
         self.process = process
         self.policy = policy
         self.sessions: set[str] = set()  # names of the sessions in the child
-
-        self._transport = ShmTransport(policy.address)
-        self._transport.connect(_CONNECT_S)
-        self._lock = threading.Lock()  # held during a call
-        self._requests = itertools.count(1)  # numbers of requests
+        self._acts = _Channel(process, policy.address)
+        self._background = _Channel(process, policy.address)
 
         # Whether the policy has an ability, by the name of its protocol.
         self._abilities: dict[str, bool] = {}
@@ -56,51 +54,54 @@ class ChildConnection:
         closer.start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
-        """Send requests in one message, and return their replies.
+        """Send requests in one message to the policy's thread, and return their replies.
 
         Raises:
             ConnectionLost: The process has ended.
             VLAgentsError: The child has rejected the message.
         """
-        for request in requests:
-            request.request_id = f"{next(self._requests):x}"
-
-        with self._lock:
-            try:
-                replies = self._transport.call(requests, _FOREVER_S)
-            except PolicyUnavailable as error:
-                raise ConnectionLost(
-                    f"{self.process.describe_end()}; the replica is being replaced"
-                ) from error
-
-        if len(replies) != len(requests):  # a single reply to the whole message
-            raise replies[0].error or PolicyFailed(
-                f"expected {len(requests)} replies, one for each request, got {len(replies)}"
-            )
-        return replies
+        try:
+            return self._acts.call(requests)
+        except ConnectionLost as error:
+            raise ConnectionLost(f"{error}; the replica is being replaced") from error
 
     def ask(self, request: Request) -> Reply:
-        """Send one request, and return its reply, or raise the error in it."""
+        """Send one request to the policy's thread, and return its reply, or raise the error in
+        it.
+        """
         [reply] = self.call([request])
         if reply.error is not None:
             raise reply.error
         return reply
 
-    def has(self, protocol: type) -> bool:
-        """Return whether the loaded policy has an ability; the process is asked once for each."""
-        name = name_of(protocol)
-        if name not in self._abilities:
-            self._abilities[name] = self.process.call_beside_acts(protocol=name)["has"]
-        return self._abilities[name]
+    def call_in_background(self, op: Op, **arguments: Any) -> dict[str, Any]:
+        """Make a call, one of `BACKGROUND_OPS`, while the policy acts; return its result.
 
-    def call_for_weights(self, **call: Any) -> dict[str, Any]:
-        """Let the process execute a call for its weights, as `call_beside_acts` does."""
+        Raises:
+            ConnectionLost: The process has ended.
+            VLAgentsError: Any error of the call.
+        """
+        [reply] = self._background.call([Request(op, kwargs=arguments)])
+        if reply.error is not None:
+            raise reply.error
+        return reply.info or {}
+
+    def call_for_weights(self, op: Op, **arguments: Any) -> dict[str, Any]:
+        """Make a call for the weights, as `call_in_background` does."""
         try:
-            return self.process.call_beside_acts(**call)
+            return self.call_in_background(op, **arguments)
         except ConnectionLost as error:
             raise PolicyUnavailable(
                 f"weights: {error}, so that nothing was changed; push again"
             ) from error
+
+    def has(self, protocol: type) -> bool:
+        """Return whether the loaded policy has an ability; the process is asked once for each."""
+        name = name_of(protocol)
+        if name not in self._abilities:
+            answer = self.call_in_background("ability", protocol=name)
+            self._abilities[name] = answer["available"]
+        return self._abilities[name]
 
     def open_session(self) -> str:
         """Return a name for a new session; names are reused, since each takes memory until the
@@ -123,8 +124,8 @@ class ChildConnection:
         """Close the policy, and end its process and the connection."""
         self._dropped.put(None)
         self.process.close()  # a call that hangs ends with its process
-        with self._lock:
-            self._transport.close()
+        self._acts.close()
+        self._background.close()
 
     def _close_dropped(self) -> None:
         """Close the dropped sessions, and drop versions of the weights, until the process ends."""
@@ -138,3 +139,38 @@ class ChildConnection:
                 return
             self.sessions.discard(name)
             self._free.append(name)
+
+
+class _Channel:
+    """One connection to the engine in a child process, with one message at a time."""
+
+    def __init__(self, process: ChildProcess, address: LocalAddress) -> None:
+        self._process = process
+        self._transport = ShmTransport(address)
+        self._transport.connect(_CONNECT_S)
+        self._lock = threading.Lock()  # held during a call
+        self._numbers = itertools.count(1)  # of requests
+
+    def call(self, requests: Sequence[Request]) -> list[Reply]:
+        """Send requests in one message, and return their replies; raise `ConnectionLost` if the
+        process has ended.
+        """
+        for request in requests:
+            request.request_id = f"{next(self._numbers):x}"
+
+        with self._lock:
+            try:
+                replies = self._transport.call(requests, _FOREVER_S)
+            except PolicyUnavailable as error:
+                raise ConnectionLost(self._process.describe_end()) from error
+
+        if len(replies) != len(requests):  # a single reply to the whole message
+            raise replies[0].error or PolicyFailed(
+                f"expected {len(requests)} replies, one for each request, got {len(replies)}"
+            )
+        return replies
+
+    def close(self) -> None:
+        """End the connection after the running call."""
+        with self._lock:
+            self._transport.close()

@@ -6,10 +6,8 @@ cannot use.
 It needs the light install and pydantic, not Ray. The first line of its standard input is
 `Settings`, as JSON. It writes a line of JSON for each step of a long load and, when the policy is
 loaded, a line with the contract and the address of its `ShmServer`, which receives all requests; if
-the policy does not load, that line contains the error. Each further line of input is a call for new
-weights (see `_execute`) or of an ability of the loaded policy (`AbilityCall`), which is answered
-with a line of output while the policy acts; an empty line makes it close the policy and end. The
-end of its input, or the death of its parent, ends it at once.
+the policy does not load, that line contains the error. A further line of input makes it close the
+policy and end. The end of its input, or the death of its parent, ends it at once.
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, BinaryIO
 
 from vlagents_ray.errors import (
@@ -32,18 +29,14 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent, require_trainable, unloaded_contract
-from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import INNER_OPS, MessageLimits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.serve.weights import PushOptions, WeightUpdates
-from vlagents_ray.weights.safetensors import read_values, write_values
-from vlagents_ray.weights.shared_values import NotShared, SharedValues
+from vlagents_ray.serve.weights import WeightUpdates
 from vlagents_ray.weights.trainable import dtype_name
 
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the
@@ -87,27 +80,22 @@ def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -
 def run() -> None:
     """Run the policy until the replica closes it or ends."""
     die_with_parent()
-    answers = own_stdout()  # printed text goes to the replica's log
+    reports = own_stdout()  # printed text goes to the replica's log
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    calls = os.fdopen(0, "rb", closefd=False)
-    line = calls.readline()
+    stream = os.fdopen(0, "rb", closefd=False)
+    line = stream.readline()
     if not line:
         sys.exit(1)
     settings = Settings(**json.loads(line))
     over = threading.Event()
 
-    def answer(document: dict[str, Any]) -> None:
-        print(json.dumps(document), file=answers, flush=True)
+    def report(document: dict[str, Any]) -> None:
+        print(json.dumps(document), file=reports, flush=True)
 
     def report_step(step: str) -> None:
-        answer({"step": step})
+        report({"step": step})
 
-    def execute(call: dict[str, Any]) -> dict[str, Any]:
-        if "protocol" in call:
-            return _use_ability(agent, AbilityCall(**call))
-        return _execute(engine.weights, **call)
-
-    threading.Thread(target=_read_calls, args=[calls, execute, answer, over], daemon=True).start()
+    threading.Thread(target=_follow_input, args=[stream, over], daemon=True).start()
 
     try:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
@@ -128,12 +116,12 @@ def run() -> None:
         logging.getLogger(__name__).exception("the policy did not load")
         # The cause of `PolicyFailed` is the policy's own error.
         cause = error.__cause__ if isinstance(error, PolicyFailed) else error
-        answer({"error": f"{type(cause).__name__}: {cause}"})
+        report({"error": f"{type(cause).__name__}: {cause}"})
         sys.exit(1)
 
     contract = None if engine.contract is None else engine.contract.to_json()
     models = engine.models
-    answer(
+    report(
         {
             "local": asdict(server.address),
             "contract": contract,
@@ -158,25 +146,6 @@ def run() -> None:
     server.close()
 
 
-def _use_ability(agent: Agent, call: AbilityCall) -> dict[str, Any]:
-    """Return whether the loaded policy has an ability, or the result of a call, while it acts.
-
-    Raises:
-        PolicyFailed: The call failed; the cause is in the log.
-    """
-    if not call.member:
-        return {"has": call.is_available(agent)}
-    try:
-        return {"result": call.execute(agent, None)}
-    except VLAgentsError:
-        raise
-    except Exception as error:
-        logging.getLogger(__name__).exception("%s failed", call.member)
-        raise PolicyFailed(
-            f"{call.member}: the policy raised {type(error).__name__}; see the server's log"
-        ) from error
-
-
 def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     """Return types and shapes of the values that a learner trains, by name, or the reason why
     there are none.
@@ -195,67 +164,12 @@ def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     }
 
 
-def _read_calls(
-    calls: BinaryIO,
-    execute: Callable[[dict[str, Any]], dict[str, Any]],
-    answer: Callable[[dict[str, Any]], None],
-    over: threading.Event,
-) -> None:
-    """Execute the calls that the replica writes, until it writes an empty line; end the process
-    at the end of the input.
-    """
-    while (line := calls.readline()) and not over.is_set():
-        if not line.strip():
-            over.set()
-            continue
-        try:
-            answer(execute(json.loads(line)))
-        except VLAgentsError as error:
-            answer({**problem(error), "not_shared": isinstance(error, NotShared)})
-        except Exception as error:
-            logging.getLogger(__name__).exception("a call for the weights failed")
-            failure = PolicyFailed(
-                f"weights: the policy raised {type(error).__name__}; see the server's log"
-            )
-            answer(problem(failure))
+def _follow_input(stream: BinaryIO, over: threading.Event) -> None:
+    """Set `over` at the next line of the input, and end the process at the end of the input."""
+    if stream.readline():
+        over.set()
+        stream.readline()
     os._exit(1)
-
-
-def _execute(
-    updates: WeightUpdates,
-    name: int = 0,
-    values: str = "",
-    make: dict[str, Any] | None = None,
-    shared: Any = None,
-    offload: bool | None = None,
-) -> dict[str, Any]:
-    """Make a version of the weights, or write the values of one, or let the policy sleep or wake.
-
-    Args:
-        updates: The versions.
-        name: The name of the version.
-        values: The file in shared memory for its values, as safetensors.
-        make: The arguments of `WeightUpdates.make`, to read the values; None to write them.
-        shared: `SharedValues.to_json` of values that are not in the file.
-        offload: See `ModelWeights.sleep`; without a file, None lets the policy wake.
-    """
-    if not values:
-        weights = updates.current()
-        if offload is None:
-            weights.wake()
-        else:
-            weights.sleep(offload=offload)
-        return {}
-
-    with Path(values).open("r+b") as file:
-        if make is None:
-            write_values(file, updates.current().portable_values(updates.version_named(name)))
-            return {}
-        copied = read_values(file)
-
-    options = PushOptions(**make.pop("options"))
-    pushed = copied if shared is None else SharedValues.from_json(shared, copied)
-    return {"fingerprint": updates.make(name, pushed=pushed, options=options, **make)}
 
 
 if __name__ == "__main__":

@@ -15,13 +15,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
-from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import LocalAddress
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
-from vlagents_ray.weights.shared_values import NotShared
 
 _CLOSE_S = 10.0
 _EXIT_S = 2.0
@@ -69,7 +67,6 @@ class ChildProcess:
         """
         self._python = program.python
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)  # of the child's error output
-        self._calling = threading.Lock()  # held during a call beside acts
         self._closed = False
 
         # The kernel kills the child when the thread that started it ends; this thread ends after
@@ -99,7 +96,7 @@ class ChildProcess:
             PolicyFailed: The policy did not load.
         """
         while True:
-            line = self._read_line()
+            line = b"" if self._process.stdout is None else self._process.stdout.readline()
             if not line:
                 self._runner.join(_EXIT_S)
                 output = "".join(self._last_lines).strip()
@@ -116,22 +113,6 @@ class ChildProcess:
         for device in document["devices"]:
             report_device(device)
         return LoadedPolicy.from_json(document)
-
-    def call_beside_acts(self, **call: Any) -> dict[str, Any]:
-        """Let the process execute a call (see `child_main`) while it acts, and return the result
-        or raise its error; raise `ConnectionLost` if the process ends meanwhile.
-        """
-        with self._calling:
-            self._write(json.dumps(call).encode() + b"\n")
-            line = self._read_line()
-        if not line:
-            raise ConnectionLost(self.describe_end())
-
-        answer: dict[str, Any] = json.loads(line)
-        if "code" in answer:
-            error = read_error(answer)
-            raise NotShared(str(error)) if answer.get("not_shared") else error
-        return answer
 
     def require_alive(self) -> None:
         """Raise `PolicyUnavailable` if the process has ended."""
@@ -196,12 +177,6 @@ class ChildProcess:
         """Write to the standard input of the process; its end is detected elsewhere."""
         stream = self._process.stdin
         if stream is not None:
-            # A stream that `close` has closed raises `ValueError`.
-            with contextlib.suppress(BrokenPipeError, ValueError):
+            with contextlib.suppress(BrokenPipeError):
                 stream.write(data)
                 stream.flush()
-
-    def _read_line(self) -> bytes:
-        """Return the next line of its standard output; empty if the process has ended."""
-        stream = self._process.stdout
-        return b"" if stream is None or stream.closed else stream.readline()

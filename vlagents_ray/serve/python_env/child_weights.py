@@ -18,7 +18,7 @@ from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.python_env.child_connection import ChildConnection
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights.safetensors import ValueSpec, read_values, write_values
-from vlagents_ray.weights.shared_values import SharedValues
+from vlagents_ray.weights.shared_values import NotShared, SharedValues
 from vlagents_ray.weights.trainable import portable, require_fit
 
 
@@ -74,14 +74,21 @@ class ChildWeights(ModelWeights):
             # The values are checked before any of them is copied.
             require_fit(newest.values or {}, pushed, partial=options.partial)
 
-        make = {"base": self._names[newest], "number": number, "options": asdict(options)}
         with _memory_file() as file:
             write_values(file, {key: portable(value) for key, value in copied.items()})
-            made = self._child.call_for_weights(
-                name=name, values=_path(file), make=make, shared=shared
+            answer = self._child.call_for_weights(
+                "make_weights",
+                name=name,
+                base=self._names[newest],
+                number=number,
+                file=_path(file),
+                options=asdict(options),
+                shared=shared,
             )
+        if "not_shared" in answer:
+            raise NotShared(answer["not_shared"])
 
-        version = WeightsVersion(number, made["fingerprint"], newest.values)
+        version = WeightsVersion(number, answer["fingerprint"], newest.values)
         self._name(version, name)
         return version
 
@@ -93,14 +100,16 @@ class ChildWeights(ModelWeights):
             self._live = version
 
     def sleep(self, *, offload: bool) -> None:
-        self._child.call_for_weights(offload=offload)
+        self._child.call_for_weights("sleep", offload=offload)
 
     def wake(self) -> None:
-        self._child.call_for_weights()
+        self._child.call_for_weights("wake")
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         with _memory_file() as file:
-            self._child.call_for_weights(name=self._names[version], values=_path(file))
+            self._child.call_for_weights(
+                "read_weights", name=self._names[version], file=_path(file)
+            )
             return dict(read_values(file))
 
     def _name(self, version: WeightsVersion, name: int) -> None:
