@@ -120,6 +120,36 @@ def test_a_replica_that_leaves_hands_over_its_robots_after_their_answers() -> No
     assert sum(stream.starved for stream in streams) == 0
 
 
+def test_a_replica_that_joins_gets_its_share_of_the_robots() -> None:
+    world = World(behaviour=EXACT)
+    world.add_replica("model", CostCurve(0.02, 0.002), 16)
+    streams = [
+        world.add_stream("model", RobotNeed(10.0, 20), 0.005, index / 20, Tally())
+        for index in range(20)
+    ]
+    world.at(0.0, world.compare, "model", 0)
+    world.run(4.0)
+    newcomer = world.add_replica("model", CostCurve(0.02, 0.002), 16)
+    world.run(15.0)
+    assert newcomer.sessions == 10
+    assert sum(stream.starved for stream in streams) == 0
+
+
+def test_a_robot_notices_a_lost_machine_later_than_an_ended_connection() -> None:
+    starved = []
+    for detected_s in (0.1, 3.0):
+        world = World(behaviour=EXACT)
+        replicas = [world.add_replica("model", CostCurve(0.02), 16) for _ in range(2)]
+        stream = world.add_stream("model", RobotNeed(10.0, 8), 0.005, 0.0, Tally())
+        world.run(5.0)
+        replicas[0].fail(detected_s)
+        world.run(15.0)
+        world.finish()
+        starved.append(stream.starved)
+    assert starved[0] == 0
+    assert starved[1] == pytest.approx(10 * 3.0 - 8, abs=4)
+
+
 def test_a_hundred_thousand_requests_take_seconds() -> None:
     world = World()
     for _ in range(40):

@@ -31,6 +31,10 @@ _MESSAGE = IncomingMessage("simulation")  # of all requests: nothing is delivere
 _AGE_BIN_S = 0.001
 _AGE_BINS = 120_000
 _FLUSH = 200_000  # runs of ticks that are kept until they are added up
+# As in `vlagents_ray.serve.scaling.rebalancer`: interval of its comparisons, s, and the tolerated
+# excess of sessions over their mean.
+_COMPARE_S = 3.0
+_TOLERATED = 1.25
 
 
 class _EverySession:
@@ -159,6 +163,7 @@ class Stream:
         "_asked_row",
         "_begun",
         "_captured_s",
+        "_delay_s",
         "_executed",
         "_left",
         "_period_s",
@@ -203,6 +208,7 @@ class Stream:
         self._asked = 0  # the tick of the last request
         self._asked_row = 0  # rows that were executed before it
         self._asked_at_s = 0.0
+        self._delay_s = 0.0  # by which its next message is late, s
         self._begun = False  # whether the first answer is there
         self._round_trip_s = transport_s
 
@@ -251,6 +257,10 @@ class Stream:
         """Send the last request to another replica."""
         self._send(self.world.now)
 
+    def delay_next(self, delay_s: float) -> None:
+        """Let the next message arrive later by this time, s."""
+        self._delay_s = delay_s
+
     def finish(self) -> None:
         """Count the ticks until now."""
         if self._begun:
@@ -270,7 +280,8 @@ class Stream:
     def _send(self, sent_s: float) -> None:
         world = self.world
         self.asks += 1
-        way_s = self.transport_s / 2 + world.late_s()
+        way_s = self.transport_s / 2 + world.late_s() + self._delay_s
+        self._delay_s = 0.0
         world.at(sent_s + way_s, world.arrive, self, self.asks)
 
     def _count_until(self, tick: int) -> None:
@@ -306,9 +317,11 @@ class Replica:
         self.accepts = True  # whether new sessions may begin here
         self.needs: dict[RobotNeed, int] = {}  # of its sessions
         self.sessions = 0
+        self.surplus = 0  # sessions that are asked to reconnect
         self.batches = 0
         self.requests = 0
         self.busy_s = 0.0
+        self._detected_s = 0.0  # once it is lost: time until a robot notices it, s
         self._costs = costs
         self._largest = max_batch_size
         self._streams: dict[str, tuple[Stream, int]] = {}  # of the waiting requests
@@ -363,12 +376,17 @@ class Replica:
             Those robots.
         """
         self.alive = self.accepts = False
+        self._detected_s = detected_s
         waiting = [*self._running, *self.queue.close()]
         streams = [self._streams[request.session_id] for request in waiting]
         for stream, number in streams:
-            self.world.at(self.world.now + detected_s, self.world.resend, stream, number)
+            self.miss(stream, number)
         self._streams.clear()
         return [stream for stream, _ in streams]
+
+    def miss(self, stream: Stream, number: int) -> None:
+        """Leave a request unanswered, which its robot notices after a time."""
+        self.world.at(self.world.now + self._detected_s, self.world.resend, stream, number)
 
     def _take(self) -> None:
         if not self.alive:
@@ -399,9 +417,10 @@ class Replica:
                 continue
             arrives_s = world.now + stream.transport_s / 2 + world.late_s()
             left_s = replan_s[stream.need] - (world.now - request.arrived) if replan_s else 0.0
-            stream.answered(arrives_s, max(0.0, left_s))
-            if not self.accepts:
+            if not self.accepts or self.surplus > 0:
+                self.surplus -= 1
                 world.move(stream)
+            stream.answered(arrives_s, max(0.0, left_s))
         self._busy = False
         self._take()
 
@@ -520,11 +539,12 @@ class World:
         if stream.asks != number:
             return
         replica = stream.replica
-        if replica is not None and replica.alive:
+        if replica is None:
+            self.resend(stream, number)
+        elif replica.alive:
             replica.receive(stream, number)
         else:
-            # It is not accepted by anything, which the robot notices.
-            self.at(self.now + self.behaviour.broken_s, self.resend, stream, number)
+            replica.miss(stream, number)
 
     def resend(self, stream: Stream, number: int) -> None:
         """Send a request whose replica was lost to another one."""
@@ -545,8 +565,20 @@ class World:
         if old is not None:
             old.leave(stream)
         replica.join(stream)
+        stream.delay_next(self.behaviour.move_s)
         self.moves += 1
         return True
+
+    def compare(self, model: str, _: int = 0) -> None:
+        """Ask the robots of replicas with clearly too many sessions to reconnect, and again after
+        each interval.
+        """
+        accepting = [replica for replica in self.replicas[model] if replica.accepts]
+        mean = sum(replica.sessions for replica in accepting) / max(1, len(accepting))
+        for replica in accepting:
+            is_uneven = replica.sessions > max(mean + 1, _TOLERATED * mean)
+            replica.surplus = replica.sessions - math.ceil(mean) if is_uneven else 0
+        self.at(self.now + _COMPARE_S, self.compare, model, 0)
 
     def finish(self) -> None:
         """Count the ticks of all robots until now."""
