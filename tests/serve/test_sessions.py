@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import logging
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ import pytest
 
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve import sessions
 from vlagents_ray.serve.models import agent_copies
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.requests import Origin
-from vlagents_ray.serve.sessions import Session, SessionTable
+from vlagents_ray.serve.sessions import Outdated, Session, SessionTable
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
@@ -203,3 +205,132 @@ def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clo
     assert table.begin(table.get("a"), None, 0.0)[0] > earlier
     table.close("a")
     assert table.begin(table.open("a"), None, 0.0)[0] > earlier
+
+
+class HeldModels:
+    """Counts how often the model of each session is released."""
+
+    def __init__(self) -> None:
+        self.released: list[str] = []
+
+    def release_model(self, session: Session[str]) -> bool:
+        """Release the model of a session."""
+        held, session.model = session.model is not None, None
+        self.released.append(session.id)
+        return held
+
+
+Table = SessionTable[str]
+
+
+def begin_idle(table: Table) -> None:
+    table.get("a").used -= 61
+    table.drop_idle()
+
+
+def replace_by_newer(table: Table) -> None:
+    table.enter(Session("a", steps=2**80))
+
+
+def cancel_first_reset(table: Table) -> None:
+    session = table.get("a")
+    session.steps = session.first = 0
+    table.undo("a", session.expected)
+
+
+def abandon_arriving(table: Table) -> None:
+    arriving = table.get("a")
+    table.release("a", arriving.version)
+    arriving.over, arriving.model = False, "model"
+    table.abandon(arriving)
+
+
+ENDS: dict[str, tuple[Callable[[Table], object], int]] = {
+    "closed": (lambda table: table.close("a"), 1),
+    "closed with its connection": (lambda table: table.close_owned("left", ["a"]), 1),
+    "closed with its model": (lambda table: table.close_those_of("model"), 1),
+    "idle": (begin_idle, 1),
+    "released to another replica": (lambda table: table.release("a", table.get("a").version), 1),
+    "begun at another replica": (lambda table: table.drop_older({"a": 2**80}), 1),
+    "replaced by its newer state": (replace_by_newer, 1),
+    "its first reset cancelled": (cancel_first_reset, 1),
+    "expected in vain": (abandon_arriving, 2),  # released, and then abandoned on its way back
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_session_releases_its_model_however_it_ends_and_others_keep_theirs(end: str) -> None:
+    models = HeldModels()
+    table: Table = SessionTable(limit=10, idle_s=60, models=models)
+    for name, model in (("a", "model"), ("b", "another")):
+        session = table.open(name, Origin(owner="left" if name == "a" else "right"))
+        session.model = model
+        table.begin(session, None, 0.0)
+        session.steps = session.first = session.expected
+    ended = table.get("a")
+
+    cause, releases = ENDS[end]
+    cause(table)
+
+    assert models.released == ["a"] * releases
+    assert ended.over
+    assert ended.model is None
+    assert table.get("b").model == "another"
+
+
+@pytest.mark.parametrize(
+    ("steps", "moves", "expected", "is_kept"),
+    [
+        (9, 0, 0, False),
+        (9, 7, 0, False),
+        (9, 7, 9, False),
+        (10, 0, 0, True),  # the announced episode has moved here before its announcement
+        (10, 2, 0, True),
+        (11, 0, 0, True),
+        (9, 7, 10, True),  # a reset in progress counts as completed
+        (9, 7, 11, True),
+    ],
+)
+def test_an_announced_episode_ends_the_states_before_it_alone(
+    steps: int, moves: int, expected: int, is_kept: bool
+) -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    table.enter(Session("a", steps=steps, moves=moves, expected=expected))
+    table.drop_older({"a": 10, "unknown": 10})
+    assert ("a" in table) is is_kept
+
+    for name in ("a", "unknown"):
+        with pytest.raises(Outdated):
+            table.enter(Session(name, steps=9, moves=99))
+    table.enter(Session("unknown", steps=10))
+
+
+def test_the_states_that_are_rejected_are_those_of_the_sessions_that_left_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sessions, "_REMEMBERED", 3)
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    for name in "abcde":
+        table.enter(Session(name, steps=5))
+        table.close(name)
+    table.drop_older({"c": 7})  # as if it had left last
+    table.enter(Session("f", steps=5))
+    table.close("f")
+    assert [name for name in "abcdef" if table.is_past(name, 5)] == ["c", "e", "f"]
+
+
+@pytest.mark.parametrize("previous", [None, 3])
+def test_a_cancelled_reset_leaves_its_connection_in_the_episode_that_it_was_in(
+    previous: int | None,
+) -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60)
+    origin = Origin(owner="left", sessions={"a": previous, "b": 4})
+    session = table.open("a", origin)
+    first, before = table.begin(session, None, 0.0, origin)
+    assert (before, origin.sessions) == (previous, {"a": first, "b": 4})
+
+    second, _ = table.begin(session, None, 0.0, origin)
+    table.undo("a", first, origin, before)
+    assert origin.sessions == {"a": second, "b": 4}, "it is in a newer episode by now"
+    table.undo("a", second, origin, before)
+    assert origin.sessions == {"a": previous, "b": 4}
