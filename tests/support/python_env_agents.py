@@ -41,7 +41,9 @@ RESTED = threading.Event()
 
 
 class ActsAfterRest(Agent):
-    """Does not return from an act before the loaded policy has been asked to rest."""
+    """Does not return from an act before the loaded policy has been asked to rest, which fails for
+    some durations.
+    """
 
     contract = Contract(action=ActionSpec(dim=1))
     tempo = 1.0
@@ -57,7 +59,13 @@ class ActsAfterRest(Agent):
     def dance(self, obs: Obs, times: int, *, fast: bool = False) -> str:
         return "danced"
 
-    def rest(self, seconds: float) -> str:
+    def rest(self, seconds: float) -> Any:
+        if seconds < 0:
+            raise ValueError("/no/path/of/ours")
+        if seconds == 1.0:
+            return object()
+        if seconds == 2.0:
+            sys.exit(3)
         RESTED.set()
         return "rested"
 

@@ -412,6 +412,18 @@ def test_a_call_of_the_loaded_policy_does_not_wait_for_a_running_act() -> None:
     one.close()
 
 
+def test_an_error_of_a_call_of_the_loaded_policy_arrives_with_its_code() -> None:
+    one = Engine(agent("ActsAfterRest"))
+    one.start()
+    loaded: Any = ability(one.models.loaded(DEFAULT).agent, Dances)
+    for seconds, message in [(-1.0, "ValueError"), (1.0, "cannot be sent"), (2.0, "SystemExit")]:
+        with pytest.raises(PolicyFailed, match=message) as error:
+            loaded.rest(seconds)
+        assert "/no/path" not in str(error.value)
+    assert loaded.rest(0.0) == "rested", "the process still answers"
+    one.close()
+
+
 def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engine) -> None:
     with pytest.raises(NotTrainable, match="Telling: names no parameters to train"):
         engine.weights.stage(1, {"w": np.zeros(1)}, PushOptions())
