@@ -28,6 +28,8 @@ from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 _ACT = Request("act")
 _MESSAGE = IncomingMessage("simulation")  # of all requests: nothing is delivered
+# The field of a request with the time at which its answer is needed, for a queue that uses it.
+_NEEDED = "needed"
 _AGE_BIN_S = 0.001
 _AGE_BINS = 120_000
 _FLUSH = 200_000  # runs of ticks that are kept until they are added up
@@ -360,7 +362,7 @@ class Replica:
             stream.session_id, _ACT, _MESSAGE, Priority.ROBOT, arrived=world.now
         )
         if world.requests_have_slack:
-            request.needed = max(world.now, stream.deadline_s())  # type: ignore[attr-defined]
+            setattr(request, _NEEDED, max(world.now, stream.deadline_s()))
         self._streams[stream.session_id] = stream, number
         self.queue.put(request)
         if not self._busy:
@@ -468,7 +470,7 @@ class World:
         self.streams: list[Stream] = []
         self.events = 0
         self.moves = 0
-        self.requests_have_slack = "needed" in PendingRequest.__slots__
+        self.requests_have_slack = _NEEDED in PendingRequest.__slots__
         self._draw = random.Random(seed)
         self._due: list[Event] = []
         self._count = 0
