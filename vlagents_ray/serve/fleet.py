@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +21,10 @@ USABLE = 0.9
 """The largest load at which robots are in time: requests arrive in bursts, so a replica that is
 needed all the time has a queue without bound.
 """
+
+# Share of its longest interval after which a robot replans where the replica can do that: arrivals
+# are not even, and requests are sent at ticks only.
+_RELAXED = 0.75
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +127,9 @@ class ReplicaLoad(NamedTuple):
     """
     batch_size: int  # size of the batches with which the load is least
     latency_s: float  # from a request to its answer with batches of that size, s
+    # Time between two requests of a robot that can wait so long, with which the replica is used no
+    # more than it can be, s.
+    interval_s: float = math.inf
 
     @property
     def in_time(self) -> bool:
@@ -133,14 +140,15 @@ class ReplicaLoad(NamedTuple):
         """Return the time between two requests of a robot with which the replica is used no more
         than it can be, s; 0 if the robot may ask as often as it wants.
 
-        Every robot replans after the same share of its plan, so that nobody has fresher actions at
-        the cost of another one's.
+        All robots replan equally often, so that nobody has fresher actions at the cost of another
+        one's, except those that must replan more often to be in time. The nearer the replica is to
+        its limit, the more of its plan every robot executes before.
         """
-        share = min(1.0, self.load / USABLE)
-        return share * need.interval_s(self.latency_s)
+        share = min(1.0, max(_RELAXED, self.load / USABLE))
+        return min(self.interval_s, share * need.interval_s(self.latency_s))
 
 
-IDLE = ReplicaLoad(0.0, 1, 0.0)
+IDLE = ReplicaLoad(0.0, 1, 0.0, 0.0)
 
 
 def replica_load(
@@ -172,8 +180,29 @@ def replica_load(
         needed_hz = sum(count / interval_s for interval_s, count in intervals_s)
         load = needed_hz * costs.cost_s(size) / size
         if load < best.load:
-            best = ReplicaLoad(load, size, latency_s)
+            usable_hz = USABLE * size / costs.cost_s(size)
+            share = max(_RELAXED, load / USABLE)
+            paced_s = [(share * interval_s, count) for interval_s, count in intervals_s]
+            best = ReplicaLoad(load, size, latency_s, _common_interval_s(paced_s, usable_hz))
     return best
+
+
+def _common_interval_s(longest_s: Sequence[tuple[float, int]], usable_hz: float) -> float:
+    """Return the time between two requests with which robots send `usable_hz` requests a second
+    together, s, if those send them more often whose longest time is shorter.
+
+    Args:
+        longest_s: The longest time between two requests, s, with its number of robots.
+        usable_hz: The requests a second; `inf` is returned if the robots need more.
+    """
+    robots = sum(count for _, count in longest_s)
+    for interval_s, count in sorted(longest_s):
+        common_s = robots / usable_hz if usable_hz > 0 else math.inf
+        if common_s <= interval_s:
+            return common_s
+        usable_hz -= count / interval_s
+        robots -= count
+    return math.inf
 
 
 def answer_s(costs: CostCurve, size: int, robots: int) -> float:

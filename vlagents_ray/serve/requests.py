@@ -122,6 +122,9 @@ class PendingRequest:
     # Time of arrival, s, of the engine's clock, which is this one by default.
     arrived: float = field(default_factory=time.perf_counter)
     deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
+    # Time at which the robot needs the answer, s, of the engine's clock; 0.0 if it states no slack:
+    # as soon as possible.
+    needed: float = 0.0
     origin: Origin = NOWHERE
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock

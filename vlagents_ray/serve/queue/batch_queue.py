@@ -186,6 +186,7 @@ class BatchQueue:
         with self._lock:
             self._running = ()  # its observations may be in the sender's memory
             self.window.record_end(ended, ended - self._begun)
+            self._waiting.costs_s = self.window.costs_s
         self.poller.reclaim()
 
     def clear(self) -> tuple[Sequence[PendingRequest], list[PendingRequest]]:

@@ -27,12 +27,15 @@ import math
 from collections.abc import Container, Sequence
 
 from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.serve.fleet import CostCurve
 from vlagents_ray.serve.queue.fair_queue import FairQueue
 from vlagents_ray.serve.requests import PendingRequest
 
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
 _NEWEST = 0.25  # weight of the last batch in the mean duration of batches
+_NEWEST_OF_SIZE = 0.1  # the same, in the mean duration of the batches of one size
+_CURVE_BATCHES = 32  # number of batches after which the curve of durations is drawn again
 # Longest wait of robots for one another, as a share of the last batch: usual policies save less,
 # and it bounds the wait while the fixed cost is not known. Eight robots of one process return
 # within 30 ms, more than `patience` allows.
@@ -60,12 +63,15 @@ class _AnsweredBatch:
 
 
 class BatchCost:
-    """A weighted linear fit of the durations of batches over their sizes; older batches have
-    less weight.
+    """The measured durations of batches over their sizes; older batches have less weight.
+
+    They are a weighted linear fit, and the mean of each size, since a compiled policy pads a batch
+    to the next size that it is compiled for.
     """
 
     def __init__(self) -> None:
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self._means_s: dict[int, float] = {}  # mean duration by size, s
 
     def add(self, size: int, duration: float) -> None:
         """Add a batch of `size` observations that took `duration` s."""
@@ -73,16 +79,49 @@ class BatchCost:
         self._sums = tuple(  # type: ignore[assignment]
             _KEPT * total + term for total, term in zip(self._sums, new, strict=True)
         )
+        mean_s = self._means_s.get(size, duration)
+        self._means_s[size] = mean_s + _NEWEST_OF_SIZE * (duration - mean_s)
 
     def fixed_s(self) -> float:
         """Return the fixed cost of a batch, s; `inf` until batches of different sizes were
         added.
         """
+        line = self._line()
+        return math.inf if line is None else line[0]
+
+    def curve(self, largest: int) -> CostCurve | None:
+        """Return the durations up to batches of size `largest`; None if no batch was added.
+
+        The largest size has the duration of the line, until there was such a batch. If all batches
+        had one size, further rows count as free, until larger batches show their cost.
+        """
+        if not self._means_s:
+            return None
+        durations_s = dict(self._means_s)
+        line = self._line()
+        if line is not None and largest not in durations_s:
+            fixed_s, row_s = line
+            durations_s[largest] = fixed_s + row_s * largest
+
+        table: list[tuple[int, float]] = []
+        longest_s = 0.0
+        for size, duration_s in sorted(durations_s.items()):
+            # A larger batch takes no less time: where it seems to, its batches were too few.
+            longest_s = max(longest_s, duration_s)
+            table.append((size, longest_s))
+        return CostCurve(table=tuple(table)) if table[0][1] > 0 else None
+
+    def _line(self) -> tuple[float, float] | None:
+        """Return the fixed duration of a batch and that of a row, s; None until batches of
+        different sizes were added.
+        """
         count, size, duration, squares, products = self._sums
         spread = count * squares - size * size
         if spread <= _SPREAD * count * count:
-            return math.inf
-        return (duration * squares - size * products) / spread
+            return None
+        fixed_s = (duration * squares - size * products) / spread
+        row_s = (count * products - size * duration) / spread
+        return fixed_s, row_s
 
 
 class BatchWindow:
@@ -108,6 +147,10 @@ class BatchWindow:
         # other session.
         self.overlaps = False
         self._cost = BatchCost()
+        self._until_curve = 0  # number of batches until the curve is drawn again
+        self._curve: CostCurve | None = None  # the measured durations of slow batches
+        # The same by size, from 0 to the largest, for `FairQueue`; empty if there is no curve.
+        self.costs_s: Sequence[float] = ()
         self._missing: set[str] = set()
         self._priority = Priority.SIMULATION  # of the missing sessions
         self._bound = self._until = 0.0  # the longest wait, s, and its end
@@ -130,6 +173,26 @@ class BatchWindow:
         self._last.ended, self._duration = now, duration
         if self._last.acts:
             self._cost.add(self._last.acts, duration)
+            self._until_curve -= 1
+            if self._until_curve < 0:
+                self._draw_curve()
+
+    def curve(self) -> CostCurve | None:
+        """Return the measured durations of batches; None if there were none.
+
+        A policy whose batches are not slow has one duration for all sizes.
+        """
+        if self._curve is None and self._mean_s > 0:
+            return CostCurve(fixed_s=self._mean_s)
+        return self._curve
+
+    def _draw_curve(self) -> None:
+        """Draw the curve of durations again: often while it is new."""
+        self._curve = self._cost.curve(self._size)
+        if self._curve is None:
+            return
+        self._until_curve = _CURVE_BATCHES if len(self._curve.table) > 1 else 0
+        self.costs_s = [0.0, *(self._curve.cost_s(size) for size in range(1, self._size + 1))]
 
     def record_arrival(self, pending: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.

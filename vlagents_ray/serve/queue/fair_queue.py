@@ -7,6 +7,13 @@ gets one, and so on until the batch is full. So a client with many requests dela
 priority by no more than one batch, and a client alone fills the batch. A session (one robot, one
 env) has at most one request in a batch, and its requests keep their order.
 
+A robot that executes an action chunk can state its slack: the time until its rows run out
+(`PendingRequest.needed`). One whose slack is long waits behind those that are *urgent*: robots whose
+answers are needed within two full batches, and those that state no slack. Urgent ones take turns,
+the others follow by the time at which they need their answers, and become urgent as that comes
+near. So a client gains nothing by stating less slack than it has. A batch takes no request that can
+wait, and no simulation, if its most urgent answer would be late only because of that row.
+
 Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
 of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
 batch.
@@ -14,7 +21,11 @@ batch.
 
 from __future__ import annotations
 
+import heapq
+import itertools
+import math
 from collections import deque
+from collections.abc import Sequence
 
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.requests import PendingRequest
@@ -67,13 +78,45 @@ class _SourceQueue:
         return now - next_queue[0].arrived > PATIENCE_S
 
 
+class _PatientQueue:
+    """The sessions of robots that can wait, by the time at which they need their answers."""
+
+    __slots__ = ("_heap", "_numbers")
+
+    def __init__(self) -> None:
+        # The number keeps the order of arrival where two need their answers at the same time.
+        self._heap: list[tuple[float, int, _SessionQueue]] = []
+        self._numbers = itertools.count()
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def add(self, queue: _SessionQueue) -> None:
+        """Add the queue of a session that did not wait before."""
+        heapq.heappush(self._heap, (queue[0].needed, next(self._numbers), queue))
+
+    def next(self) -> _SessionQueue:
+        """Remove and return the session whose answer is needed first."""
+        return heapq.heappop(self._heap)[2]
+
+    def first_needed(self) -> float:
+        """Return the time at which the first answer is needed, s; `inf` if no session waits."""
+        return self._heap[0][0] if self._heap else math.inf
+
+
 class FairQueue:
-    """The waiting requests. Adding or taking one takes constant time for any number of others.
-    Not thread-safe.
+    """The waiting requests. Adding or taking one takes constant time for any number of others, or
+    with slack logarithmic time. Not thread-safe.
+    """
+
+    costs_s: Sequence[float] = ()
+    """The duration of a batch by its number of requests, s, from 0 to the largest; empty if unknown:
+    all robots are urgent then.
     """
 
     def __init__(self) -> None:
         self._queues_by_priority = [_SourceQueue() for _ in Priority]
+        self._patient = _PatientQueue()
         self._sessions: dict[str, _SessionQueue] = {}
         # The only waiting request, which is not in a session's queue.
         self._lone: PendingRequest | None = None
@@ -118,7 +161,23 @@ class FairQueue:
             queue.append(pending)
             return
         queue = self._sessions[pending.session_id] = deque((pending,))
-        self._queues_by_priority[pending.priority].add(queue)
+        self._enqueue(queue, pending.arrived)
+
+    def _enqueue(self, queue: _SessionQueue, now: float) -> None:
+        """Add the queue of a session that did not wait before."""
+        head = queue[0]
+        # A request that states no slack is needed at 0.0.
+        can_wait = head.priority is Priority.ROBOT and head.needed > now + self._urgent_s()
+        if can_wait:
+            self._patient.add(queue)
+        else:
+            self._queues_by_priority[head.priority].add(queue)
+
+    def _urgent_s(self) -> float:
+        """Return the slack up to which a robot is urgent, s: the batch that may be running, and one
+        more, if both are full.
+        """
+        return 2 * self.costs_s[-1] if self.costs_s else math.inf
 
     def take(self, size: int, now: float) -> tuple[list[PendingRequest], list[PendingRequest]]:
         """Take the next batch of at most `size` requests.
@@ -141,18 +200,43 @@ class FairQueue:
         still_waiting: list[_SessionQueue] = []  # sessions with further requests
 
         robots, simulations = self._queues_by_priority
-        if robots.sources and not self._yielded and simulations.is_impatient(now):
+        urgent = now + self._urgent_s()
+        while self._patient and self._patient.first_needed() <= urgent:
+            robots.add(self._patient.next())
+        if (
+            (robots.sources or self._patient)
+            and not self._yielded
+            and simulations.is_impatient(now)
+        ):
             self._pick(simulations.next(), now, batch, expired, still_waiting)
         # It has not yielded if all requests of that session are over or have expired.
         self._yielded = bool(batch)
 
-        for source_queue in self._queues_by_priority:
-            while source_queue.sources and len(batch) < size:
-                self._pick(source_queue.next(), now, batch, expired, still_waiting)
+        while robots.sources and len(batch) < size:
+            self._pick(robots.next(), now, batch, expired, still_waiting)
+        size = self._size_in_time(batch, size, now)
+        while self._patient and len(batch) < size:
+            self._pick(self._patient.next(), now, batch, expired, still_waiting)
+        while simulations.sources and len(batch) < size:
+            self._pick(simulations.next(), now, batch, expired, still_waiting)
 
         for queue in still_waiting:
-            self._queues_by_priority[queue[0].priority].add(queue)
+            self._enqueue(queue, now)
         return batch, expired
+
+    def _size_in_time(self, batch: Sequence[PendingRequest], size: int, now: float) -> int:
+        """Return how many requests the batch may have, of at most `size`, so that no answer is late
+        that is in time without further ones.
+        """
+        if not self.costs_s:
+            return size
+        in_time_s = now + self.costs_s[len(batch)]
+        first_needed = min(
+            (pending.needed for pending in batch if pending.needed >= in_time_s), default=math.inf
+        )
+        while size > len(batch) and now + self.costs_s[size] > first_needed:
+            size -= 1
+        return size
 
     def clear(self) -> list[PendingRequest]:
         """Remove and return all waiting requests."""
@@ -163,6 +247,7 @@ class FairQueue:
 
         self._sessions.clear()
         self._queues_by_priority = [_SourceQueue() for _ in Priority]
+        self._patient = _PatientQueue()
         self.depth = [0] * len(Priority)
         self.size = 0
         return waiting

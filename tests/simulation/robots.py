@@ -1,0 +1,355 @@
+"""Robots that share one policy, in virtual time: the real queue, and the real pace of its replica.
+
+`python -m tests.simulation.robots --seeds 100000` plays drawn worlds, and checks each; `python -m
+tests.simulation.robots --fleets` prints the largest fleets in time, with the queue's use of slack
+and without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import itertools
+import math
+import random
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from in_flight import AnySession, message_of_one
+
+from vlagents_ray.protocol.messages import Priority, Request
+from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
+from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.queue.fair_queue import PATIENCE_S
+from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
+from vlagents_ray.serve.requests import Origin, PendingRequest
+
+PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
+GRAPHS = CostCurve(0.0415, 0.0105)
+SMALL = CostCurve(0.004, 0.0005)
+LARGEST = 16
+import os
+
+OVER = float(os.environ.get("OVER", "1"))
+WIRE_S = 0.002  # of a message, one way
+
+
+class _NoFiles:
+    """In place of what the queue's thread waits on."""
+
+    def wake(self) -> None:
+        pass
+
+    hand_to_reader = reclaim = close = wake
+
+
+@dataclass
+class Robot:
+    """A control loop with chunks: at each tick it executes a row, and may send a request."""
+
+    name: str
+    hz: float
+    rows: int
+    states_slack: bool = True
+    states_slo: bool = True  # whether its rate is known from its reset on
+    lies: bool = False  # whether it says that it is about to run out of rows
+    obeys: bool = True  # whether it replans at the pace that it is told
+    source: str = ""
+    planned: int = -1  # the last tick that has a row
+    began: float = math.inf  # tick of the first row
+    captured: float = 0.0  # tick of the observation of its rows, s
+    ticks: int = 0
+    starved: int = 0
+    ages: list[float] = field(default_factory=list)
+    waiting: PendingRequest | None = None
+    waits_until: float = 0.0  # time before which a request is of no use, s
+    round_trip_s: float = 0.0
+    plan: RobotPlan = field(default_factory=RobotPlan)
+
+    def __post_init__(self) -> None:
+        if self.states_slo:
+            self.plan = RobotPlan(RobotNeed(self.hz, self.rows), is_stated=True)
+
+
+@dataclass
+class Simulation:
+    """An environment that sends its next observation a moment after each answer."""
+
+    name: str
+    answered: int = 0
+    longest_s: float = 0.0
+
+
+class World:
+    """A policy, its queue, and those that use it."""
+
+    def __init__(
+        self,
+        costs: CostCurve,
+        robots: Iterable[Robot],
+        *,
+        seed: int = 0,
+        simulations: int = 0,
+        slack: bool = True,
+        deadlines: float = 0.0,
+        jitter: float = 0.02,
+    ) -> None:
+        self.draw = random.Random(seed)
+        self.costs, self.slack = costs, slack
+        self.deadlines, self.jitter = deadlines, jitter
+        self.robots = list(robots)
+        self.simulations = [Simulation(f"env{number}") for number in range(simulations)]
+        self.now = 0.0
+        self.measured_from = 0.0  # ticks before are not counted
+        self.queue = BatchQueue(
+            LARGEST,
+            sessions=AnySession(),
+            clock=lambda: self.now,
+            poller=_NoFiles(),  # type: ignore[arg-type]
+        )
+        self.queue.bind(driven=True)
+        self.pace = ReplicaPace(
+            self.queue.window.curve,
+            lambda: [robot.plan.need for robot in self.robots],
+            LARGEST,
+            lambda: self.now,
+            self.queue.depth,
+        )
+        self.busy = False
+        self.batches: list[int] = []
+        self.sent = self.answered = self.expired = 0
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = itertools.count()
+
+    def at(self, when: float, call: Callable[[], None]) -> None:
+        """Call something at that time."""
+        heapq.heappush(self._due, (when, next(self._count), call))
+
+    def run(self, seconds: float) -> World:
+        """Play so long."""
+        for robot in self.robots:
+            # Robots begin one after the other.
+            phase = self.draw.random() * max(1.0, robot.rows / robot.hz)
+            self.at(phase, lambda robot=robot, phase=phase: self._tick(robot, phase, 0))
+        for simulation in self.simulations:
+            self.at(self.draw.random() * 0.1, lambda one=simulation: self._simulate(one))
+        while self._due and self._due[0][0] <= seconds:
+            self.now, _, call = heapq.heappop(self._due)
+            call()
+        return self
+
+    def _tick(self, robot: Robot, phase: float, tick: int) -> None:
+        period = 1 / robot.hz
+        at = phase + tick * period
+        if tick <= robot.planned:
+            if self.now >= self.measured_from and robot.rows > 1:
+                robot.ages.append(self.now - robot.captured)
+            if self.now >= self.measured_from:
+                robot.ticks += 1
+        elif robot.planned >= 0 and self.now >= self.measured_from:
+            robot.ticks += 1
+            robot.starved += 1
+        self.at(at + period, lambda: self._tick(robot, phase, tick + 1))
+
+        slack_s = max(0.0, phase + (robot.planned + 1) * period - at) if robot.planned >= 0 else 0.0
+        if robot.rows == 1:
+            slack_s = period
+        starves = slack_s < robot.round_trip_s + OVER * period
+        if robot.waiting is not None or (self.now < robot.waits_until and not starves):
+            return
+        self._ask(robot, slack_s, at, lambda: self._receive(robot, tick, at, phase))
+
+    def _ask(self, robot: Robot, slack_s: float, at: float, done: Callable[[], None]) -> None:
+        arrived = self.now + WIRE_S
+        one = PendingRequest(
+            robot.name,
+            Request("act"),
+            message_of_one(),
+            Priority.ROBOT,
+            arrived,
+            origin=Origin(connection=robot.source),
+        )
+        if robot.states_slack and self.slack:
+            slack_s = 0.0 if robot.lies else max(0.0, slack_s - 2 * WIRE_S)
+            one.needed = arrived + slack_s
+        if self.deadlines and self.draw.random() < self.deadlines:
+            one.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])
+        one.observer_data = {"done": done, "robot": robot}
+        robot.waiting = one
+        self.sent += 1
+        self.at(arrived, lambda: self._put(one))
+
+    def _simulate(self, simulation: Simulation) -> None:
+        one = PendingRequest(
+            simulation.name, Request("act"), message_of_one(), Priority.SIMULATION, self.now
+        )
+
+        def done() -> None:
+            simulation.answered += 1
+            simulation.longest_s = max(simulation.longest_s, self.now - one.arrived)
+            self.at(self.now + 0.005, lambda: self._simulate(simulation))
+
+        one.observer_data = {"done": done}
+        self.sent += 1
+        self._put(one)
+
+    def _put(self, one: PendingRequest) -> None:
+        costs_s = self.queue.window.costs_s
+        one.observer_data["patient"] = (
+            one.priority is Priority.ROBOT
+            and bool(costs_s)
+            and one.needed > self.now + 2 * costs_s[-1]
+        )
+        self.queue.put(one)
+        if not self.busy:
+            self._turn()
+
+    def _turn(self) -> None:
+        taken = self.queue.take()
+        assert taken is not None
+        for late in taken.expired:
+            assert late.deadline < self.now, "a request was dropped that was of use"
+            self.expired += 1
+            if "robot" in late.observer_data:
+                late.observer_data["robot"].waiting = None
+        if not taken.batch:
+            return
+        self._check(taken.batch)
+        self.busy = True
+        self.batches.append(len(taken.batch))
+        self.queue.begin(taken.batch)
+        took = self.costs.cost_s(len(taken.batch)) * self.draw.uniform(1, 1 + self.jitter)
+        self.at(self.now + took, lambda: self._finish(taken.batch, took))
+
+    def _check(self, batch: list[PendingRequest]) -> None:
+        """What must be true of each batch."""
+        assert len(batch) <= LARGEST
+        assert len({one.session_id for one in batch}) == len(batch), "two of one session"
+        costs_s = self.queue.window.costs_s
+        if not costs_s:
+            return
+        urgent_s = self.now + 2 * costs_s[-1]
+        left = [
+            one
+            for one in self.queue._waiting.heads()
+            if one.priority is Priority.ROBOT
+            and one.needed <= urgent_s
+            and not one.over
+            and one.deadline >= self.now
+        ]
+        patient = [one for one in batch if one.observer_data["patient"] and one.needed > urgent_s]
+        assert not (left and patient), "an urgent request is behind one that can wait"
+
+    def _finish(self, batch: list[PendingRequest], took: float) -> None:
+        self.queue.end()
+        self.busy = False
+        for one in batch:
+            self.answered += 1
+            one.over = True
+            robot: Robot | None = one.observer_data.get("robot")
+            if robot is None:
+                one.observer_data["done"]()
+                continue
+            robot.plan.observe(robot.rows, one.arrived, one.needed)
+            replan_s = 0.0
+            if one.needed and robot.plan.need is not None:
+                replan_s = self.pace.replan_s(robot.plan.need, one.arrived)
+            arrives = self.now + WIRE_S
+            # Without the wait in the queue, which is long only for those who have the time.
+            robot.round_trip_s = 2 * WIRE_S + took
+            self.at(arrives, lambda one=one, replan_s=replan_s: self._answer(one, replan_s))
+        self._turn()
+
+    def _answer(self, one: PendingRequest, replan_s: float) -> None:
+        robot: Robot = one.observer_data["robot"]
+        robot.waiting = None
+        if robot.obeys:
+            robot.waits_until = self.now + replan_s
+        one.observer_data["done"]()
+
+    def _receive(self, robot: Robot, tick: int, at: float, phase: float) -> None:
+        """The rows of an answer: those of ticks that are over are skipped."""
+        if robot.rows == 1:
+            tick += 1
+            robot.ages.append(self.now - at)
+        last = tick + robot.rows - 1
+        if last > robot.planned:
+            robot.planned, robot.captured = last, at
+
+    def share(self) -> float:
+        """The lowest share in time of a robot."""
+        return min(
+            (1 - robot.starved / robot.ticks if robot.ticks else 0.0) for robot in self.robots
+        )
+
+    def mean_share(self) -> float:
+        """The share in time of all robots together."""
+        ticks = sum(robot.ticks for robot in self.robots)
+        return 1 - sum(robot.starved for robot in self.robots) / max(1, ticks)
+
+    def age_p95_s(self) -> float:
+        """Of executed actions."""
+        ages = sorted(age for robot in self.robots for age in robot.ages)
+        return ages[int(0.95 * len(ages))] if ages else math.nan
+
+
+def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
+    """So many robots, of each kind (rows, hz) in turns."""
+    return [
+        Robot(f"robot{index}", kinds[index % len(kinds)][1], kinds[index % len(kinds)][0])
+        for index in range(number)
+    ]
+
+
+def play(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) -> World:
+    """A fleet, long enough to have settled."""
+    longest_s = max(rows / hz for rows, hz in kinds)
+    world = World(costs, fleet(number, *kinds), seed=number, slack=slack)
+    world.measured_from = 4 * longest_s + 2
+    return world.run(world.measured_from + 6 * longest_s + 4)
+
+
+def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float]) -> int:
+    """The largest fleet of which 98 % of all robots' ticks have an action."""
+
+    def fits(number: int) -> bool:
+        return play(costs, number, slack, *kinds).share() >= 0.98
+
+    low, high = 0, 2
+    while fits(high):
+        low, high = high, 2 * high
+    while high - low > max(1, low // 100):
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def print_fleets() -> None:
+    """Print the largest fleets in time and the age of actions at half load."""
+    print("costs  fleet              arithmetic  today  slack  ratio  age p95 at half: today slack")
+    fleets = {
+        "50 rows": [(50, 10.0)],
+        "8 rows": [(8, 10.0)],
+        "50 and 8 rows": [(50, 10.0), (8, 10.0)],
+        "50 and 1 row": [(50, 10.0), (1, 5.0)],
+        "1 row at 5 Hz": [(1, 5.0)],
+    }
+    for label, costs in (("pi0", PI0), ("graphs", GRAPHS)):
+        for name, kinds in fleets.items():
+            needs = [RobotNeed(hz, rows) for rows, hz in kinds]
+            bound: float = most_robots(costs, needs[0], LARGEST) if len(needs) == 1 else math.nan
+            before, after = (largest(costs, slack, *kinds) for slack in (False, True))
+            ages = [
+                play(costs, max(1, before // 2), slack, *kinds).age_p95_s()
+                for slack in (False, True)
+            ]
+            print(
+                f"{label:6} {name:18} {bound:10} {before:6} {after:6} {after / max(1, before):6.2f}"
+                f"  {ages[0]:.3f} {ages[1]:.3f} s",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    print_fleets()
