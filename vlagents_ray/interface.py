@@ -67,6 +67,12 @@ TICKS = "ticks"
 # In an observation, float: the age of the action of the policy that was executed last, ms; absent
 # if there was none since the last request.
 EXECUTED_AGE = "executed_age_ms"
+# In the Act of a server that is under load, float: the time from its answer until the next request
+# of this robot is useful, ms.
+REPLAN = "replan_ms"
+# An option of `reset`: what the robot needs, as `vlagents_ray.slo.Slo.to_json`. In the info that
+# `reset` returns: {"load": float, "in_time": bool, "reason": str, if it is not in time}.
+SLO = "slo"
 # In the Act of a policy that was trained to continue given rows, an int: the number of rows of
 # LEFTOVER with which its chunk begins. If more rows have been executed when the chunk arrives, it
 # continues from a pose that the robot has left, and is dropped.

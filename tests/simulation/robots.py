@@ -29,9 +29,6 @@ PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
 GRAPHS = CostCurve(0.0415, 0.0105)
 SMALL = CostCurve(0.004, 0.0005)
 LARGEST = 16
-import os
-
-OVER = float(os.environ.get("OVER", "1"))
 WIRE_S = 0.002  # of a message, one way
 
 
@@ -155,7 +152,7 @@ class World:
         slack_s = max(0.0, phase + (robot.planned + 1) * period - at) if robot.planned >= 0 else 0.0
         if robot.rows == 1:
             slack_s = period
-        starves = slack_s < robot.round_trip_s + OVER * period
+        starves = slack_s < robot.round_trip_s + period
         if robot.waiting is not None or (self.now < robot.waits_until and not starves):
             return
         self._ask(robot, slack_s, at, lambda: self._receive(robot, tick, at, phase))
@@ -277,6 +274,19 @@ class World:
         if last > robot.planned:
             robot.planned, robot.captured = last, at
 
+    def check_all_answered(self) -> None:
+        """Nothing is lost, and no simulation waits for ever."""
+        under_way = sum(robot.waiting is not None for robot in self.robots)
+        under_way += len(self.simulations) if self.now > 0.2 else 0
+        missing = self.sent - self.answered - self.expired
+        assert 0 <= missing <= under_way, f"{missing} requests without an answer, {under_way} sent"
+
+        # Each second batch has a slot for a simulation that has waited for long.
+        longest_batch_s = self.costs.cost_s(LARGEST) * (1 + self.jitter)
+        bound_s = PATIENCE_S + 2 * (len(self.simulations) + 1) * longest_batch_s
+        for simulation in self.simulations:
+            assert simulation.longest_s <= bound_s, f"{simulation.name} waited for too long"
+
     def share(self) -> float:
         """The lowest share in time of a robot."""
         return min(
@@ -351,5 +361,63 @@ def print_fleets() -> None:
             )
 
 
+def drawn(seed: int) -> World:
+    """A world of a few seconds: robots that obey and that do not, liars, simulations, deadlines."""
+    draw = random.Random(seed)
+    robots = []
+    for number in range(draw.choice([1, 3, 8, 20, 40])):
+        robot = Robot(
+            f"robot{number}",
+            draw.choice([5.0, 10.0]),
+            draw.choice([1, 8, 50]),
+            states_slack=draw.random() < 0.7,
+            states_slo=draw.random() < 0.5,
+            lies=draw.random() < 0.1,
+            obeys=draw.random() < 0.8,
+            source=draw.choice(["", "", "cell"]),
+        )
+        robots.append(robot)
+    return World(
+        draw.choice([PI0, GRAPHS, SMALL]),
+        robots,
+        seed=seed,
+        simulations=draw.choice([0, 0, 2, 20]),
+        deadlines=draw.choice([0.0, 0.0, 0.3]),
+    )
+
+
+def play_drawn(seed: int) -> World:
+    """Play the world of a seed; what is wrong with it is an `AssertionError` that names the seed."""
+    world = drawn(seed)
+    try:
+        world.run(3.0)
+        world.check_all_answered()
+    except AssertionError as error:
+        raise AssertionError(
+            f"seed {seed}: {error}\nagain: python -m tests.simulation.robots --first {seed} "
+            "--seeds 1"
+        ) from error
+    return world
+
+
+def main() -> None:
+    """Play seeds, or print the largest fleets."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=0, help="number of worlds to play")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--fleets", action="store_true", help="print the largest fleets in time")
+    options = parser.parse_args()
+
+    began = time.monotonic()
+    answered = 0
+    for seed in range(options.first, options.first + options.seeds):
+        answered += play_drawn(seed).answered
+        if seed % 1000 == 999:
+            print(f"{seed + 1} seeds, {time.monotonic() - began:.0f} s", flush=True)
+    print(f"{options.seeds} seeds, {answered} answers")
+    if options.fleets:
+        print_fleets()
+
+
 if __name__ == "__main__":
-    print_fleets()
+    main()

@@ -83,6 +83,8 @@ def policy_metadata(
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
         "program": program | models.files,
+        "batch_costs": engine.queue.window.describe_costs(),
+        "load": engine.pace.load().load,
     }
 
 

@@ -33,6 +33,7 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DecodedFiles, Priority, Reply, Request
 from vlagents_ray.serve.queue.preparation import Preparation
+from vlagents_ray.slo import Slo
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
@@ -98,6 +99,7 @@ class Opening:
     # First step of the connection's previous episode, which continues if the reset is undone; None
     # if there is none.
     previous: int | None
+    slo: Slo | None = None  # what the robot needs, if it states that
 
 
 @dataclass(slots=True, eq=False)

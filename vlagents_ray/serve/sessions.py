@@ -18,6 +18,7 @@ from vlagents_ray.abilities import Prepares, ability
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.in_time import RobotTimes
+from vlagents_ray.serve.queue.replica_pace import RobotPlan
 from vlagents_ray.serve.requests import NOWHERE, Answer, Origin, PendingRequest
 from vlagents_ray.serve.weights import WeightsVersion
 
@@ -62,6 +63,7 @@ class SessionState:
     weights: Sequence[Any]  # number and fingerprint of its version of the weights
     follows: bool
     instruction: str
+    robot: Sequence[Any] = ()  # see `RobotPlan.to_list`
 
     @property
     def version(self) -> Version:
@@ -108,6 +110,7 @@ class Session(Generic[M]):
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
     # What its robot has reported at this replica; None before the first report.
     times: RobotTimes | None = None
+    plan: RobotPlan = field(default_factory=RobotPlan)  # what its robot needs
 
     @property
     def version(self) -> Version:

@@ -32,6 +32,7 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.call_limits import PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
+from vlagents_ray.serve.queue.replica_pace import ReplicaPace
 from vlagents_ray.serve.sessions import DrainList, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightUpdates
 
@@ -100,6 +101,14 @@ class Engine:
             poller=poller,
         )
 
+        self.pace = ReplicaPace(
+            self.queue.window.curve,
+            lambda: [session.plan.need for session in self.sessions.all()],
+            settings.max_batch_size,
+            clock,
+            self.queue.depth,
+        )
+
         parts = EngineParts(
             settings=settings,
             clock=clock,
@@ -108,6 +117,7 @@ class Engine:
             models=self.models,
             weights=self.weights,
             queue=self.queue,
+            pace=self.pace,
             health=self.health,
             stats=self.stats,
             drain_list=self.drain_list,

@@ -9,7 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vlagents_ray.errors import NotReset, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidInput,
+    NotReset,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray.interface import SLO
 from vlagents_ray.protocol.messages import BACKGROUND_OPS, Priority
 from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.parts import EngineParts
@@ -17,9 +25,11 @@ from vlagents_ray.serve.engine.responses import public_error
 from vlagents_ray.serve.in_time import RobotReport, RobotTimes
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.preparation import Preparations
+from vlagents_ray.serve.queue.replica_pace import stated_slack_s
 from vlagents_ray.serve.requests import Opening, Origin, PendingRequest, ReservedAct
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import follows
+from vlagents_ray.slo import Slo
 
 # Operations after which their connection has no further session.
 _USE_NO_SESSION = ("close", *BACKGROUND_OPS)
@@ -119,9 +129,16 @@ class Intake:
         return None
 
     def _record_report(self, session: Session[LoadedModel], pending: PendingRequest) -> None:
-        """Add what the robot of an act reports to its session and to the metrics."""
+        """Read the slack of an act's robot, and add what the robot reports to its session and to
+        the metrics.
+        """
         obs = pending.request.obs
-        report = RobotReport.of(obs.info) if obs is not None and obs.info else None
+        if obs is None or not obs.info:
+            return
+        slack_s = stated_slack_s(obs.info)
+        if slack_s is not None:
+            pending.needed = min(pending.arrived + slack_s, pending.deadline)
+        report = RobotReport.of(obs.info)
         if report is None:
             return
         times = session.times
@@ -135,6 +152,7 @@ class Intake:
         """Check a reset, and reserve an episode of its session."""
         request, origin, session_id = pending.request, pending.origin, pending.session_id
         choice, kwargs = self._source.split_options(request.kwargs)
+        slo = _stated_slo(kwargs.pop(SLO, None))
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
         # If the checkpoint is not loaded, the request is checked after loading.
         model = self._models.loaded(choice)
@@ -143,7 +161,7 @@ class Intake:
 
         session = self._sessions.open(session_id, origin)
         first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
-        return Opening(choice, kwargs, follows_newest, first, previous)
+        return Opening(choice, kwargs, follows_newest, first, previous, slo)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that
@@ -252,6 +270,16 @@ class SessionSearch:
         else:
             fits = began <= pending.latest_begin
         return pending.origin if fits else None
+
+
+def _stated_slo(option: object) -> Slo | None:
+    """Return the SLO that a reset states, if it does; raise `InvalidInput` if that is wrong."""
+    if option is None:
+        return None
+    try:
+        return Slo.from_json(option)
+    except ConfigError as error:
+        raise InvalidInput(str(error)) from error
 
 
 def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:

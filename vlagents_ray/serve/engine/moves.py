@@ -9,6 +9,7 @@ from typing import Any
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.queue.replica_pace import RobotPlan
 from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Origin
 from vlagents_ray.serve.sessions import Session, SessionState
 
@@ -45,6 +46,7 @@ class SessionMoves:
             weights=[weights.number, weights.fingerprint],
             follows=session.follows,
             instruction=session.instruction,
+            robot=session.plan.to_list(),
         )
 
     def adopt(self, session_id: str, state: SessionState, timeout_s: float = 0.0) -> None:
@@ -92,6 +94,7 @@ class SessionMoves:
             moves=moves,
             announced=True,
             origin=origin,
+            plan=RobotPlan.from_list(state.robot),
         )
         self._sessions.expect(arriving)
         try:

@@ -12,6 +12,7 @@ from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import ModelManager
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.queue.replica_pace import ReplicaPace
 from vlagents_ray.serve.sessions import DrainList, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import WeightUpdates
 
@@ -27,6 +28,7 @@ class EngineParts:
     models: ModelManager
     weights: WeightUpdates
     queue: BatchQueue
+    pace: ReplicaPace
     health: Health
     stats: MetricsBuffer
     drain_list: DrainList

@@ -23,7 +23,7 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.interface import Act
+from vlagents_ray.interface import REPLAN, SLO, Act
 from vlagents_ray.protocol.messages import Priority, Reply
 from vlagents_ray.serve.engine.ability_call import AbilityCall
 from vlagents_ray.serve.engine.intake import Intake
@@ -39,6 +39,7 @@ from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import too_late
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.queue.preparation import Preparations
+from vlagents_ray.serve.queue.replica_pace import RobotPlan, need_of
 from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, ReservedAct, deliver
 from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import WeightsVersion
@@ -85,6 +86,7 @@ class Runner:
         self._models = parts.models
         self._weights = parts.weights
         self._queue = parts.queue
+        self._pace = parts.pace
         self._stats = parts.stats
         self._finder = parts.finder
         self._clock = parts.clock
@@ -294,6 +296,11 @@ class Runner:
                     observes.observe(obs)
 
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
+        session.plan = RobotPlan()
+        if opening.slo is not None:
+            need = need_of(opening.slo, 1 if model.contract is None else model.contract.chunk or 1)
+            info[SLO] = self._pace.check(need)
+            session.plan = RobotPlan(need, is_stated=True)
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.set_agent(agent)
@@ -494,12 +501,29 @@ class Runner:
             if reply.error is None:
                 reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
+                if pending.needed or session.plan.need is not None:
+                    self._set_pace(pending, session, reply)
             if defer and (robots or pending.priority is not Priority.ROBOT):
                 self._unsent.append((pending, reply))
             else:
                 answers.append((pending, reply))
         self._stats.batch(len(acting), rows)
         return answers
+
+    def _set_pace(
+        self, pending: PendingRequest, session: Session[LoadedModel], reply: Reply
+    ) -> None:
+        """Learn from an act what its robot needs, and tell a robot that states its slack when to
+        replan.
+        """
+        act, plan = reply.act, session.plan
+        if act is None:
+            return
+        plan.observe(len(act.rows()), pending.arrived, pending.needed)
+        if pending.needed and plan.need is not None:
+            replan_s = self._pace.replan_s(plan.need, pending.arrived)
+            if replan_s > 0:
+                act.info[REPLAN] = replan_s * 1e3
 
 
 def _not_taken(pending: PendingRequest) -> VLAgentsError:

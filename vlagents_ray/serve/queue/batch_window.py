@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
+from typing import Any
 
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.fleet import CostCurve
@@ -86,7 +87,7 @@ class BatchCost:
         """Return the fixed cost of a batch, s; `inf` until batches of different sizes were
         added.
         """
-        line = self._line()
+        line = self.line()
         return math.inf if line is None else line[0]
 
     def curve(self, largest: int) -> CostCurve | None:
@@ -98,7 +99,7 @@ class BatchCost:
         if not self._means_s:
             return None
         durations_s = dict(self._means_s)
-        line = self._line()
+        line = self.line()
         if line is not None and largest not in durations_s:
             fixed_s, row_s = line
             durations_s[largest] = fixed_s + row_s * largest
@@ -111,7 +112,7 @@ class BatchCost:
             table.append((size, longest_s))
         return CostCurve(table=tuple(table)) if table[0][1] > 0 else None
 
-    def _line(self) -> tuple[float, float] | None:
+    def line(self) -> tuple[float, float] | None:
         """Return the fixed duration of a batch and that of a row, s; None until batches of
         different sizes were added.
         """
@@ -185,6 +186,17 @@ class BatchWindow:
         if self._curve is None and self._mean_s > 0:
             return CostCurve(fixed_s=self._mean_s)
         return self._curve
+
+    def describe_costs(self) -> dict[str, Any] | None:
+        """Return the measured durations for the metadata, ms by batch size, with the fixed one and
+        that of a row; None if there were no slow batches.
+        """
+        if self._curve is None:
+            return None
+        line = self._cost.line()
+        fixed_ms, row_ms = (None, None) if line is None else (1e3 * line[0], 1e3 * line[1])
+        table = {str(size): 1e3 * duration_s for size, duration_s in self._curve.table}
+        return {"fixed_ms": fixed_ms, "row_ms": row_ms, "ms_by_size": table}
 
     def _draw_curve(self) -> None:
         """Draw the curve of durations again: often while it is new."""

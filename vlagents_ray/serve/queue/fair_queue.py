@@ -8,11 +8,11 @@ priority by no more than one batch, and a client alone fills the batch. A sessio
 env) has at most one request in a batch, and its requests keep their order.
 
 A robot that executes an action chunk can state its slack: the time until its rows run out
-(`PendingRequest.needed`). One whose slack is long waits behind those that are *urgent*: robots whose
-answers are needed within two full batches, and those that state no slack. Urgent ones take turns,
-the others follow by the time at which they need their answers, and become urgent as that comes
-near. So a client gains nothing by stating less slack than it has. A batch takes no request that can
-wait, and no simulation, if its most urgent answer would be late only because of that row.
+(`PendingRequest.needed`). One whose slack is long waits behind those that are *urgent*: robots
+whose answers are needed within two full batches, and those that state no slack. Urgent ones take
+turns, the others follow by the time at which they need their answers, and become urgent as that
+comes near. So a client gains nothing by stating less slack than it has. A batch takes no request
+that can wait, and no simulation, if its most urgent answer would be late only because of that row.
 
 Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
 of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
@@ -110,8 +110,8 @@ class FairQueue:
     """
 
     costs_s: Sequence[float] = ()
-    """The duration of a batch by its number of requests, s, from 0 to the largest; empty if unknown:
-    all robots are urgent then.
+    """The duration of a batch by its number of requests, s, from 0 to the largest; empty if
+    unknown: all robots are urgent then.
     """
 
     def __init__(self) -> None:

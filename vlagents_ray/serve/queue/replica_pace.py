@@ -8,23 +8,30 @@ request is useful, and the robot waits at home, with fresher observations.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.interface import SLACK
 from vlagents_ray.serve.fleet import (
     IDLE,
+    USABLE,
     CostCurve,
     ReplicaLoad,
     RobotNeed,
     answer_s,
     replica_load,
 )
+from vlagents_ray.slo import Slo
 
 _READ_S = 0.5  # time after which the needs of all sessions are read again
 # Share by which the observed rate of a robot must differ from the known one to replace it, so that
 # the needs of equal robots are equal.
 _DIFFERS = 0.1
+_MOST_SLACK_MS = 60_000.0  # so that no request waits for longer in a queue that is never empty
 
 
 @dataclass(slots=True)
@@ -34,6 +41,21 @@ class RobotPlan:
     need: RobotNeed | None = None  # None until it is known
     is_stated: bool = False  # whether the robot's own SLO states the rate
     asked: float = 0.0  # time at which its last act arrived, s; 0.0 before the first one
+
+    def to_list(self) -> list[Any]:
+        """Return the plan for another replica, to which the session moves."""
+        need = self.need
+        if need is None:
+            return []
+        return [need.hz, need.rows, need.age_s, self.is_stated]
+
+    @classmethod
+    def from_list(cls, values: Sequence[Any]) -> RobotPlan:
+        """Return the plan of a session that has moved here, from the result of `to_list`."""
+        if not values:
+            return cls()
+        hz, rows, age_s, is_stated = values
+        return cls(RobotNeed(hz, rows, age_s), is_stated)
 
     def observe(self, rows: int, arrived: float, needed: float) -> None:
         """Learn from an act what the robot needs.
@@ -60,6 +82,29 @@ class RobotPlan:
         known = self.need
         if known is None or known.rows != rows or abs(hz - known.hz) > _DIFFERS * known.hz:
             self.need = RobotNeed(hz, rows)
+
+
+def need_of(slo: Slo, rows: int) -> RobotNeed:
+    """Return what a robot with that SLO needs, if an answer has `rows` rows."""
+    return RobotNeed(slo.hz, rows, None if slo.age_ms is None else slo.age_ms / 1e3)
+
+
+def stated_slack_s(info: Mapping[str, Any]) -> float | None:
+    """Return the slack in the info of an observation, s; None if it states none.
+
+    Raises:
+        InvalidInput: It is not a finite number of at least 0.
+    """
+    slack_ms = info.get(SLACK)
+    if slack_ms is None:
+        return None
+    # A NaN fails the comparison.
+    if type(slack_ms) not in (int, float) or not 0 <= slack_ms < math.inf:
+        raise InvalidInput(
+            f"info[{SLACK!r}]: expected a finite number of at least 0 ms, got "
+            f"{reprlib.repr(slack_ms)}; leave it out if the time is unknown"
+        )
+    return min(float(slack_ms), _MOST_SLACK_MS) / 1e3
 
 
 class ReplicaPace:
@@ -99,7 +144,25 @@ class ReplicaPace:
             self._load = self._load_of(needs)
         return self._load
 
-    def load_with(self, newcomer: RobotNeed) -> ReplicaLoad:
+    def check(self, newcomer: RobotNeed) -> dict[str, Any]:
+        """Return whether one more robot can be in time here, as the info of its reset."""
+        load = self._load_with(newcomer)
+        if load.in_time:
+            return {"load": load.load, "in_time": True}
+        if load.load == math.inf:
+            reason = (
+                f"expected actions at {newcomer.hz:g} Hz, but the policy takes "
+                f"{load.latency_s * 1e3:.0f} ms for a request alone; lower the rate, or use longer "
+                "chunks"
+            )
+            return {"load": None, "in_time": False, "reason": reason}
+        reason = (
+            f"expected a load of at most {USABLE:g} with this robot, got {load.load:.2f}; add a "
+            "replica, or lower the robots' rates"
+        )
+        return {"load": load.load, "in_time": False, "reason": reason}
+
+    def _load_with(self, newcomer: RobotNeed) -> ReplicaLoad:
         """Return the load with one more robot; it is `inf` if that cannot be in time even alone."""
         curve = self._curve()
         if curve is None:

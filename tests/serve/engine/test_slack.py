@@ -1,0 +1,130 @@
+"""What an engine does with what robots say of themselves: their SLO and their slack."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from in_flight import answered, checked, ignore
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.interface import REPLAN, SLACK, SLO
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.engine.engine import Engine
+
+ROWS = 50
+
+
+class Chunks(Agent):
+    """Returns a chunk after 5 ms, and keeps the options of its reset."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {"options": sorted(kwargs)}
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(0.005)
+        return Act(np.zeros((ROWS, 2), np.float32))
+
+
+@pytest.fixture
+def engine() -> Iterator[Engine]:
+    made = Engine(Chunks())
+    made.start()
+    yield made
+    made.close()
+
+
+def reset(engine: Engine, session: str, **options: Any) -> dict[str, Any]:
+    reply = answered(engine, session, Request("reset", Obs(), kwargs=options))
+    assert reply.error is None
+    return dict(reply.info)
+
+
+def act(engine: Engine, session: str, **info: Any) -> Act:
+    reply = answered(engine, session, Request("act", Obs(info=info)))
+    assert reply.error is None
+    return reply.act
+
+
+def test_an_slo_is_answered_at_the_reset_and_not_passed_to_the_policy(engine: Engine) -> None:
+    reset(engine, "a")
+    for _ in range(5):
+        act(engine, "a")
+    info = reset(engine, "a", slo={"hz": 10}, seed=1)
+    assert info["options"] == ["seed"]
+    assert info[SLO]["in_time"] is True
+    assert 0 < info[SLO]["load"] < 0.9
+
+
+def test_a_robot_that_cannot_be_served_is_told_so_at_its_reset(engine: Engine) -> None:
+    reset(engine, "a")
+    for _ in range(5):
+        act(engine, "a")
+    told = reset(engine, "b", slo={"hz": 10_000})[SLO]
+    assert told["in_time"] is False
+    assert "lower the rate" in told["reason"]
+
+
+@pytest.mark.parametrize("wrong", [{}, {"hz": 0}, {"hz": 10, "ages": 1}, 10])
+def test_a_wrong_slo_is_refused(engine: Engine, wrong: Any) -> None:
+    with pytest.raises(InvalidInput, match=r"slo.*expected .* got"):
+        checked(engine, "a", Request("reset", Obs(), kwargs={SLO: wrong}), ignore)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, math.nan, math.inf, "10", True, [1.0]])
+def test_a_wrong_slack_is_refused(engine: Engine, wrong: Any) -> None:
+    reset(engine, "a")
+    with pytest.raises(InvalidInput, match=r"slack_ms.*expected .* got"):
+        checked(engine, "a", Request("act", Obs(info={SLACK: wrong})), ignore)
+
+
+def test_an_answer_is_needed_when_the_slack_is_over_or_the_deadline(engine: Engine) -> None:
+    reset(engine, "a")
+    one = checked(engine, "a", Request("act", Obs(info={SLACK: 250})), ignore)
+    assert one.needed == pytest.approx(one.arrived + 0.25)
+    one = checked(engine, "a", Request("act", Obs(info={SLACK: 250}), deadline_ms=100.0), ignore)
+    assert one.needed == one.deadline
+
+
+def test_a_lone_robot_replans_as_often_as_it_wants(engine: Engine) -> None:
+    reset(engine, "a", slo={"hz": 10})
+    assert all(REPLAN not in act(engine, "a", slack_ms=2000.0).info for _ in range(5))
+
+
+def test_robots_of_a_busy_replica_are_told_when_to_replan(engine: Engine) -> None:
+    names = [f"robot{number}" for number in range(400)]
+    for name in names:
+        reset(engine, name, slo={"hz": 10})
+    for name in names[:5]:
+        act(engine, name, slack_ms=2000.0)
+    engine.pace._read = -math.inf  # as after half a second
+    replan_ms = act(engine, names[0], slack_ms=2000.0).info[REPLAN]
+    # 400 robots of 5 ms each.
+    assert 1000 < replan_ms < 5000
+    assert REPLAN not in act(engine, names[0]).info, "it states no slack"
+
+
+def test_an_slo_moves_with_its_session(engine: Engine) -> None:
+    reset(engine, "a", slo={"hz": 10, "age_ms": 500})
+    act(engine, "a", slack_ms=2000.0)
+    state = engine.moves.export("a", engine.clock())
+    plan = engine.sessions.get("a").plan
+    assert list(state.robot) == [10, ROWS, 0.5, True]
+    engine.sessions.close("a")
+    engine.sessions.free("a")
+    engine.moves.adopt("a", state)
+    assert engine.sessions.get("a").plan.need == plan.need
+
+
+def test_the_costs_of_batches_are_measured(engine: Engine) -> None:
+    reset(engine, "a")
+    for _ in range(5):
+        act(engine, "a")
+    costs = engine.queue.window.describe_costs()
+    assert costs is not None
+    assert costs["ms_by_size"]["1"] >= 5.0

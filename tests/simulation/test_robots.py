@@ -1,0 +1,77 @@
+"""Robots that share a policy, in virtual time: what holds for every seed, and how many are in time.
+
+`python -m tests.simulation.robots --seeds 100000` plays more seeds, and `--fleets` prints the
+largest fleets.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.simulation.robots import GRAPHS, PI0, SMALL, Robot, World, fleet, play, play_drawn
+from vlagents_ray.serve.fleet import CostCurve
+
+
+def test_no_request_is_lost_and_none_overtakes_an_urgent_one() -> None:
+    answered = sum(play_drawn(seed).answered for seed in range(300))
+    assert answered > 300 * 20, "the worlds left too little to be judged"
+
+
+@pytest.mark.parametrize("costs", [PI0, GRAPHS, SMALL])
+@pytest.mark.parametrize("rows", [1, 8, 50])
+def test_a_lone_robot_is_answered_as_soon_with_slack_as_without(
+    costs: CostCurve, rows: int
+) -> None:
+    worlds = [
+        World(costs, [Robot("lone", 10.0, rows)], seed=1, slack=slack).run(20.0)
+        for slack in (False, True)
+    ]
+    before, after = worlds
+    assert after.answered == before.answered
+    assert after.robots[0].ages == before.robots[0].ages
+
+
+@pytest.mark.parametrize(
+    ("kinds", "robots"),
+    [([(50, 10.0)], 330), ([(50, 10.0), (8, 10.0)], 56), ([(50, 10.0), (1, 5.0)], 24)],
+)
+def test_slack_serves_a_third_more_robots_with_chunks_of_50(
+    kinds: list[tuple[int, float]], robots: int
+) -> None:
+    """Each number is more than 1.3 times the largest fleet without the use of slack."""
+    assert play(PI0, robots, True, *kinds).share() >= 0.98
+    assert play(PI0, round(robots / 1.3), False, *kinds).share() < 0.98
+
+
+@pytest.mark.parametrize("kinds", [[(50, 10.0)], [(8, 10.0)], [(50, 10.0), (8, 10.0)]])
+def test_at_half_load_no_action_is_older_for_it(kinds: list[tuple[int, float]]) -> None:
+    half = {50: 120, 8: 16}[kinds[0][0]] if len(kinds) == 1 else 19
+    before, after = (play(PI0, half, slack, *kinds) for slack in (False, True))
+    assert after.age_p95_s() <= before.age_p95_s() + 1e-6
+    assert after.share() == before.share() == 1.0
+
+
+def test_a_robot_that_claims_to_have_no_slack_gains_nothing_over_today() -> None:
+    ages_s = []
+    for slack in (False, True):
+        robots = fleet(100, (50, 10.0))
+        robots[0].lies = True
+        robots[0].obeys = False
+        world = World(PI0, robots, seed=3, slack=slack)
+        world.measured_from = 10.0
+        world.run(40.0)
+        assert world.share() == 1.0
+        ages_s.append(sum(robots[1].ages) / len(robots[1].ages))
+    assert ages_s[1] <= ages_s[0], "the others have no older actions for it"
+
+
+def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
+    robots = fleet(200, (50, 10.0))
+    for robot in robots:
+        robot.states_slo = False
+        robot.plan.need, robot.plan.is_stated = None, False
+    world = World(PI0, robots, seed=4).run(30.0)
+    needs = {robot.plan.need for robot in robots}
+    assert all(need is not None and need.rows == 50 for need in needs)
+    assert all(need is not None and abs(need.hz - 10.0) <= 1.0 for need in needs)
+    assert world.queue.depth() <= 32, "they wait at home, not in the queue"

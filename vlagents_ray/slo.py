@@ -1,0 +1,100 @@
+"""What a robot needs of its policy to be served in time: its service level objective (SLO).
+
+A control loop sends it with its reset, as the option `slo`; the server compares it with what the
+replica can do, and answers in the reset's info (`SLO` in `vlagents_ray.interface`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from vlagents_ray.errors import ConfigError, shown
+from vlagents_ray.naming import did_you_mean
+
+SHARE = 0.98
+"""The share of ticks with an action in time that a robot needs if it states none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slo:
+    """The service level objective of a robot.
+
+    Args:
+        hz: The rate of its control loop, Hz.
+        age_ms: The largest age of an executed action, from the capture of its observation, ms;
+            None: any.
+        share: The least share in time: of the ticks at which the policy was to act, those with an
+            action in time, above 0 and at most 1.
+
+    Raises:
+        ConfigError: A value is no number, or out of its range.
+    """
+
+    hz: float
+    age_ms: float | None = None
+    share: float = SHARE
+
+    def __post_init__(self) -> None:
+        if not (_is_number(self.hz) and self.hz > 0):
+            raise ConfigError(
+                f"slo.hz: expected a rate above 0 Hz, got {shown(self.hz)}; give the rate of the "
+                "control loop"
+            )
+        if self.age_ms is not None and not (_is_number(self.age_ms) and self.age_ms > 0):
+            raise ConfigError(
+                f"slo.age_ms: expected milliseconds above 0, got {shown(self.age_ms)}; leave it "
+                "out if actions of any age will do"
+            )
+        if not (_is_number(self.share) and 0 < self.share <= 1):
+            raise ConfigError(
+                f"slo.share: expected a share above 0 and at most 1, got {shown(self.share)}; give "
+                f"{SHARE} for 98 % of the ticks"
+            )
+
+    @classmethod
+    def from_json(cls, value: object) -> Slo:
+        """Return the objective that a message or a file states.
+
+        Args:
+            value: A JSON object with `hz`, and optionally `age_ms` and `share`.
+
+        Raises:
+            ConfigError: It is no such object, or has a wrong value.
+        """
+        if not isinstance(value, Mapping):
+            raise ConfigError(
+                f'slo: expected an object such as {{"hz": 10}}, got {shown(value)}; give at least '
+                "hz"
+            )
+
+        names = [field.name for field in fields(cls)]
+        for name in value:
+            if name not in names:
+                hint = did_you_mean(str(name)[:80], names) or "; leave it out"
+                raise ConfigError(f"slo: expected some of {names}, got {shown(name)}{hint}")
+        if "hz" not in value:
+            raise ConfigError(
+                f"slo: expected hz, got {shown(value)}; give the rate of the control loop"
+            )
+        return cls(**value)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the objective as a JSON object, without `age_ms` if actions of any age will do."""
+        document: dict[str, Any] = {"hz": self.hz}
+        if self.age_ms is not None:
+            document["age_ms"] = self.age_ms
+        document["share"] = self.share
+        return document
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number; a boolean is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer without a float
+        return False
