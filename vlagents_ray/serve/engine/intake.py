@@ -7,7 +7,8 @@ the request. An act whose session is not here is admitted again after a search a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -114,7 +115,8 @@ class Intake:
             model = session.model  # another thread may set it to None
             if model is not None:
                 model.check(request)
-            self._record_report(session, pending)
+            if request.obs is not None and request.obs.info:
+                self._record_report(session, pending, request.obs.info)
             preparation = None
             if self._preparations is not None and self._queue.window.overlaps:
                 preparation = self._preparations.begin(session.prepares, request.obs)
@@ -128,17 +130,16 @@ class Intake:
             origin.sessions.setdefault(session_id, None)
         return None
 
-    def _record_report(self, session: Session[LoadedModel], pending: PendingRequest) -> None:
+    def _record_report(
+        self, session: Session[LoadedModel], pending: PendingRequest, info: Mapping[str, Any]
+    ) -> None:
         """Read the slack of an act's robot, and add what the robot reports to its session and to
         the metrics.
         """
-        obs = pending.request.obs
-        if obs is None or not obs.info:
-            return
-        slack_s = stated_slack_s(obs.info)
+        slack_s = stated_slack_s(info)
         if slack_s is not None:
             pending.needed = min(pending.arrived + slack_s, pending.deadline)
-        report = RobotReport.of(obs.info)
+        report = RobotReport.of(info)
         if report is None:
             return
         times = session.times
