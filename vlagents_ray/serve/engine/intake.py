@@ -103,9 +103,7 @@ class Intake:
             known = origin.sessions.get(session_id)
             episode = before.episode if isinstance(before, ReservedAct) else known
             if episode is None:
-                episode = known
-            if episode is None:
-                episode = _latest_episode(pending, session)
+                episode = _latest_episode(pending, session) if known is None else known
             if known is None and origin.owner:
                 origin.sessions[session_id] = episode
             if (episode if step is None else step) >= session.expected:
