@@ -465,6 +465,34 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     assert obeys(b) == ("episode 1", 1)
 
 
+@pytest.mark.parametrize("fault", ["dead", "frozen"])
+@pytest.mark.parametrize("silent_s", [0.0, 60.0])
+def test_no_search_asks_a_replica_that_was_silent_a_moment_ago(
+    replicas: Callable[[int], Replicas],
+    fault: str,
+    silent_s: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session_migration, "_ANSWER_S", 1.0)
+    monkeypatch.setattr(session_migration, "_SILENT_S", silent_s)
+    served = replicas(3)
+    a, b, c = served.engines
+    ask(b, "reset", name="robot-b", instruction="at b")
+    ask(c, "reset", name="robot-c", instruction="at c")
+
+    at_fault: set[int] = getattr(served, fault)
+    at_fault.add(1)
+    assert isinstance(ask(a, "act", "robot-b").error, UnknownSession)
+    at_fault.clear()
+
+    assert obeys(a, "robot-c") == ("at c", 1), "those that answer are asked at once"
+    if silent_s:
+        assert isinstance(ask(a, "act", "robot-b").error, UnknownSession)
+        assert "robot-b" in b.sessions
+    else:
+        assert obeys(a, "robot-b") == ("at b", 1)
+
+
 def test_a_session_on_its_way_to_another_replica_is_waited_for(
     replicas: Callable[[int], Replicas],
 ) -> None:
