@@ -51,6 +51,7 @@ __all__ = [
     "Interruptible",
     "Observes",
     "Prepares",
+    "ReadsSlo",
     "Sleeps",
     "Trainable",
     "ability",
@@ -247,6 +248,16 @@ class HasControl(InProcess, Protocol):
 
     control: Any
     """The `vlagents_ray.chunking.control.RobotControl` of the robot."""
+
+
+@runtime_checkable
+class ReadsSlo(InProcess, Protocol):
+    """The policy's server compares what a robot needs with what it can do."""
+
+    reads_slo: bool
+    """Whether `reset` accepts the option `slo`, the fields of a `vlagents_ray.slo.Slo`, and answers
+    with an entry `slo` of its info: {"load": …, "in_time": …, "reason": …}.
+    """
 
 
 # ----- Finding out what an agent can do.

@@ -95,7 +95,10 @@ CHUNK, ROW = "chunk", "row"  # int: the chunk's number in the episode, and the r
 AGE_MS = "age_ms"
 # float: seconds since the oldest unanswered request was sent first; 0.0 if there is none.
 SILENT = "silent_s"
-OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT)
+# bool: whether an answer of the policy had a row for this tick; absent if the policy was not to act
+# (see `vlagents_ray.chunking.timeliness`).
+IN_TIME = "in_time"
+OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT, IN_TIME)
 """The names of `Act.info` that only a chunk player on the robot writes, and that a control loop
 reads.
 """

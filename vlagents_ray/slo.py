@@ -28,6 +28,7 @@ class Slo:
             None: any.
         share: The least share in time: of the ticks at which the policy was to act, those with an
             action in time, above 0 and at most 1.
+        rows: The rows of a chunk that it executes at most; None: all of them.
 
     Raises:
         ConfigError: A value is no number, or out of its range.
@@ -36,6 +37,7 @@ class Slo:
     hz: float
     age_ms: float | None = None
     share: float = SHARE
+    rows: int | None = None
 
     def __post_init__(self) -> None:
         if not (_is_number(self.hz) and self.hz > 0):
@@ -54,12 +56,18 @@ class Slo:
                 f"{SHARE} for 98 % of the ticks"
             )
 
+        if self.rows is not None and (type(self.rows) is not int or self.rows < 1):
+            raise ConfigError(
+                f"slo.rows: expected a whole number of at least 1, got {shown(self.rows)}; leave it "
+                "out if whole chunks are executed"
+            )
+
     @classmethod
     def from_json(cls, value: object) -> Slo:
         """Return the objective that a message or a file states.
 
         Args:
-            value: A JSON object with `hz`, and optionally `age_ms` and `share`.
+            value: A JSON object with `hz`, and optionally `age_ms`, `share` and `rows`.
 
         Raises:
             ConfigError: It is no such object, or has a wrong value.
@@ -82,12 +90,9 @@ class Slo:
         return cls(**value)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the objective as a JSON object, without `age_ms` if actions of any age will do."""
-        document: dict[str, Any] = {"hz": self.hz}
-        if self.age_ms is not None:
-            document["age_ms"] = self.age_ms
-        document["share"] = self.share
-        return document
+        """Return the objective as a JSON object, without what is None."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def _is_number(value: object) -> bool:

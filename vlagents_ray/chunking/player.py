@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import threading
 import time
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from vlagents_ray.abilities import HasStatistics, Observes, ability
+from vlagents_ray.abilities import HasStatistics, Observes, ReadsSlo, ability
 from vlagents_ray.chunking.buffer import (
     ENSEMBLE,
     ENSEMBLE_M,
@@ -41,16 +42,24 @@ from vlagents_ray.chunking.fallback import (
     refused,
     unanswered,
 )
+from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
 from vlagents_ray.interface import (
+    AGE_MS,
     CAUSE,
     DEADLINE,
     EXECUTED,
+    EXECUTED_AGE,
+    IN_TIME,
     INTERVENTION,
     OF_THE_LOOP,
+    REPLAN,
     SAFE,
     SILENT,
+    SLACK,
+    SLO,
+    TICKS,
     WANTED,
     Act,
     Agent,
@@ -63,6 +72,12 @@ _CLOSE_S = 2.0
 # The largest number of actions between two requests that are recorded as executed in place of the
 # policy's.
 _MAX_REPLACEMENTS = 256
+_TIMED_TICKS = 10  # the number of ticks from whose intervals the rate of the loop is measured
+_KEPT_WIRE = 0.9  # the part of the longest time on the way that is left after another answer
+_LONGEST_REPLAN_MS = 1e9  # the longest delay of a request that a server may ask for
+# A request that the server asked to delay is sent while the plan has this many more rows than the
+# ticks that an answer takes.
+_SPARE_ROWS = 2
 
 
 class AsyncCaller:
@@ -215,6 +230,9 @@ class ChunkPlayer(Agent):
     control: RobotControl
     """The state of the robot, which selects the source of motion at each `act`."""
 
+    timeliness: Timeliness
+    """The share of the episode's ticks that had an action of the policy in time."""
+
     def __init__(
         self,
         agent: Agent,
@@ -262,6 +280,17 @@ class ChunkPlayer(Agent):
         # When the oldest unanswered request was sent, s of `time.monotonic`; None if there is none.
         self._waiting_since: float | None = None
         self._reason = WAITING  # why the plan has no row, if it has none
+        # Whether the policy has yet to answer after the plan was dropped, as the robot was stopped
+        # or moved, or the guard refused a row.
+        self._begins_again = False
+        self.timeliness = Timeliness()
+        self._reported = (0, 0)  # ticks and starved ticks that earlier requests have reported
+        self._executed_age_ms: float | None = None  # of the last row since the last request
+        # When the last ticks began, s of `time.monotonic`.
+        self._tick_begins: deque[float] = deque(maxlen=_TIMED_TICKS)
+        self._wire_ms = 0.0  # the longest time that a request and its answer were on the way, ms
+        # Time before which the server needs no further request, s of `time.monotonic`.
+        self._replan_at = 0.0
         self._captured = CaptureClock()
         self._motion = Motion(self.check)
 
@@ -289,6 +318,9 @@ class ChunkPlayer(Agent):
         self._begin()
         obs = stamped(obs, {})
         self._captured(obs)  # before the reset of the policy, which may take long
+        slo = kwargs.get(SLO)
+        if slo is not None and self.settings.horizon is not None:
+            kwargs[SLO] = {"rows": self.settings.horizon, **slo}
         info = self._agent.reset(obs, instruction, **kwargs)
         self._choose_safe()
 
@@ -299,6 +331,12 @@ class ChunkPlayer(Agent):
                 self._caller = AsyncCaller(self._agent)
         self._tick = 0
         return info
+
+    @property
+    def reads_slo(self) -> bool:
+        """Whether the policy's server reads an SLO at a reset."""
+        reads = ability(self._agent, ReadsSlo)
+        return reads is not None and reads.reads_slo
 
     def interrupt(self) -> None:
         """Drop the plan: the robot was stopped or moved, and did not execute the last action of
@@ -343,6 +381,7 @@ class ChunkPlayer(Agent):
         if tick is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
+        self._tick_begins.append(begun)
         self._motion.tick()
         self._is_replaced = False
         if self.control.update():
@@ -359,7 +398,10 @@ class ChunkPlayer(Agent):
         self._tick = tick + 1
 
         if not is_operated:
-            return self._policy_act(obs, tick)
+            act = self._policy_act(obs, tick)
+            self.timeliness.count(act.info)
+            self._executed_age_ms = act.info.get(AGE_MS, self._executed_age_ms)
+            return act
         act = self._operator_act(obs)
         if SAFE not in act.info:  # the operator's action is executed in place of a row
             self._record_replacement(act.action)
@@ -447,7 +489,12 @@ class ChunkPlayer(Agent):
 
         # This also holds for every answer with a single action.
         is_last_row = step.chunk.end == self._plan.executed + 1
-        return is_last_row or tick - self._request.tick >= (self.settings.execute or 1)
+        if is_last_row:
+            return True
+        if tick - self._request.tick < (self.settings.execute or 1):
+            return False
+        can_wait = self._plan.known > self._delay.ticks + _SPARE_ROWS
+        return not (can_wait and time.monotonic() < self._replan_at)
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
         """Add the answer of the policy to the plan, if there is one; raise an error that another
@@ -461,12 +508,34 @@ class ChunkPlayer(Agent):
                     self._delay.add(tick - self._request.tick)
                     self._take(answer)
                 self._waiting_since = None
+                self._record_timing(answer)
             except InvalidAction as error:
                 self._reason = refused(error)
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
         self._reason = unanswered(answer)
+        self._begins_again = False
+
+    def _record_timing(self, answer: Act) -> None:
+        """Record how long an answer was on the way, and when the server needs the next request."""
+        timing = answer.info.get("timing") or {}
+        self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
+        replan_ms = answer.info.get(REPLAN)
+        is_time = isinstance(replan_ms, (int, float)) and 0 < replan_ms <= _LONGEST_REPLAN_MS
+        self._replan_at = time.monotonic() + replan_ms / 1e3 if is_time else 0.0
+
+    def _slack_ms(self) -> float:
+        """Return the time, ms, that the server has for the answer to a request of this tick: until
+        the last row that is left, without the time on the way.
+        """
+        begins = list(self._tick_begins)
+        intervals_s = sorted(end - begin for begin, end in itertools.pairwise(begins))
+        if not intervals_s:
+            return 0.0
+        period_ms = 1e3 * intervals_s[len(intervals_s) // 2]
+        rows_after_this = max(0, self._plan.known - 1)
+        return max(0.0, rows_after_this * period_ms - self._wire_ms)
 
     def _take(self, act: Act) -> None:
         """Add the chunk of an answer to the plan."""
@@ -479,6 +548,7 @@ class ChunkPlayer(Agent):
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, info, tick, seen_at))
         self._chunks += 1
         self._reason = WAITING if added else LATE
+        self._begins_again = False
 
     def _request_info(self) -> dict[str, Any]:
         """Return the entries that the next request adds to the info of its observation."""
@@ -488,6 +558,15 @@ class ChunkPlayer(Agent):
             self._replacements.clear()
         if self.settings.timeout_s is not None:
             info[DEADLINE] = self.settings.timeout_s * 1e3
+
+        if self._caller is not None:  # otherwise the robot waits for each answer
+            timeliness, (ticks, starved) = self.timeliness, self._reported
+            info[SLACK] = self._slack_ms()
+            info[TICKS] = [timeliness.ticks - ticks, timeliness.starved - starved]
+            self._reported = timeliness.ticks, timeliness.starved
+            if self._executed_age_ms is not None:
+                info[EXECUTED_AGE] = self._executed_age_ms
+                self._executed_age_ms = None
 
         # While an operator acts, their actions replace those of the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
@@ -526,17 +605,23 @@ class ChunkPlayer(Agent):
         control_held = self.control.held
         step = None if control_held is not None else self._next()
         why = control_held or (STALE if self._is_old(self._captured(obs)) else self._reason)
+        timing: dict[str, Any] = {}
+        is_robots = control_held is not None or why is STALE or self._begins_again
+        if step is not None or not is_robots:
+            timing[IN_TIME] = step is not None
 
         if step is not None:
             try:
                 action, rows = self._motion.follow(self._plan, obs)
             except InvalidAction as error:
                 self._plan.drop()  # the other rows assume the result of this action
+                self._begins_again = True
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
             else:
                 act = step.played(action, tick, self._silent_s())
+                act.info.update(timing)
                 if not rows:  # on the way to the row
                     return replace(act, done=False)
                 self._plan.advance()
@@ -555,12 +640,14 @@ class ChunkPlayer(Agent):
                 action = np.zeros(0, np.float32)
             if control_held is not None:  # the policy's action will not be executed
                 self._record_replacement(action)
-        return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
+        info = {SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s(), **timing}
+        return Act(action, info=info)
 
     def _begin_again(self, why: Held) -> None:
         """Drop the plan and the pending answer, and wait for the answer to a new observation."""
         self._plan.drop()
         self._drops_answer = True
+        self._begins_again = True
         self._reason = why
 
     def _silent_s(self) -> float:

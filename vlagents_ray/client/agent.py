@@ -323,6 +323,11 @@ class RemoteAgent(Agent):
         """Whether the policy's chunks continue the executed plan; see `ContinuesPlans`."""
         return bool((self.metadata or {}).get("continues_plans"))
 
+    @property
+    def reads_slo(self) -> bool:
+        """Whether the server reads an SLO at a reset; see `ReadsSlo`."""
+        return bool((self.metadata or {}).get("reads_slo"))
+
     def close(self) -> None:
         """End the session. A later `reset` begins another one."""
         self._connection.end_session(self._session, self._session.id)

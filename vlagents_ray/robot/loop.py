@@ -18,19 +18,29 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from vlagents_ray.abilities import HasCheck, HasControl, HasStatistics, Interruptible, ability
+from vlagents_ray.abilities import (
+    HasCheck,
+    HasControl,
+    HasStatistics,
+    Interruptible,
+    ReadsSlo,
+    ability,
+)
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.fallback import Cause, Held
+from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import (
     CAPTURED,
     CAUSE,
+    IN_TIME,
     INTERVENTION,
     PLANNED,
     SAFE,
     SILENT,
+    SLO,
     WANTED,
     Act,
     Agent,
@@ -45,6 +55,7 @@ from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
+from vlagents_ray.slo import Slo
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
@@ -318,6 +329,9 @@ class LoopReport:
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if it was marked on the live page
+    timeliness: Timeliness = field(default_factory=Timeliness)
+    # The server's answer to the SLO of the run: `load`, `in_time`, `reason`; empty if it gave none.
+    slo: dict[str, Any] = field(default_factory=dict)
 
     @property
     def safe_ticks(self) -> int:
@@ -398,6 +412,8 @@ class LoopOptions:
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         report: A new report, for a caller that reads it also if the loop ends with an exception;
             by default the loop makes one.
+        slo: What the robot needs of its server, which says at the reset whether it can be served
+            in time; by default, the rate of the loop.
 
     Raises:
         ConfigError: `restart` has a wrong value.
@@ -411,6 +427,7 @@ class LoopOptions:
     viewer: EpisodeViewer | None = None
     real_time: bool = False
     report: LoopReport | None = None
+    slo: Slo | None = None
 
     def __post_init__(self) -> None:
         if self.restart is not None and self.restart not in get_args(Restart):
@@ -516,7 +533,14 @@ def run_loop(
         try:
             obs = _observed(robot)
             fit.require(obs, None)
-            agent.reset(obs, instruction, **options.reset_options)
+            reset_options = dict(options.reset_options)
+            reads = ability(agent, ReadsSlo)
+            if reads is not None and reads.reads_slo:
+                reset_options[SLO] = (options.slo or Slo(hz)).to_json()
+            reset_info = agent.reset(obs, instruction, **reset_options)
+            report.slo = reset_info.get(SLO) or {}
+            if not report.slo.get("in_time", True):
+                logger.warning("slo: %s", report.slo.get("reason"))
 
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
@@ -613,6 +637,7 @@ class _Run:
         timing in any case.
         """
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
+        missed = pacer.missed
         collected_at = time.monotonic()
         end_tick = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
@@ -638,6 +663,8 @@ class _Run:
                         "in a ChunkPlayer"
                     )
                 self.report.done = act.done
+                self._count(act, missed=pacer.missed - missed)
+                missed = pacer.missed
 
                 # This comes before the sign of life of this tick, which may be late.
                 hold = self._reason_to_hold(act)
@@ -661,6 +688,18 @@ class _Run:
                 self.report.apply_p50_ms = float(np.median(self.apply_s)) * 1e3
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+    def _count(self, act: Act, missed: int) -> None:
+        """Count whether the tick, and those `missed` before it, had an action of the policy in
+        time.
+        """
+        info: Mapping[str, Any] = act.info
+        if not self.agent_has_control and self.control.state == "autonomous":
+            # An agent without a plan answers at the tick itself.
+            info = {IN_TIME: SAFE not in info, **info}
+        self.report.timeliness.count(info)
+        if IN_TIME in info:
+            self.report.timeliness.count_missed(missed)
 
     def _give_signs_of_life(self, act: Act) -> None:
         """Report to the watchdog that the loop is alive, and when the server last was."""

@@ -80,6 +80,7 @@ def policy_metadata(
         "wrappers": args.wrappers,
         "contract": None if contract is None else contract.to_json(),
         "continues_plans": models.continues_plans,
+        "reads_slo": True,  # at a reset
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
         "program": program | models.files,

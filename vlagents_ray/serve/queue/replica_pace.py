@@ -86,7 +86,8 @@ class RobotPlan:
 
 def need_of(slo: Slo, rows: int) -> RobotNeed:
     """Return what a robot with that SLO needs, if an answer has `rows` rows."""
-    return RobotNeed(slo.hz, rows, None if slo.age_ms is None else slo.age_ms / 1e3)
+    executed_rows = rows if slo.rows is None else min(rows, slo.rows)
+    return RobotNeed(slo.hz, executed_rows, None if slo.age_ms is None else slo.age_ms / 1e3)
 
 
 def stated_slack_s(info: Mapping[str, Any]) -> float | None:

@@ -1,0 +1,278 @@
+"""Which ticks count as in time, and what a player tells its server of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyUnavailable
+from vlagents_ray.chunking import player as player_module
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.chunking.timeliness import Timeliness
+from vlagents_ray.interface import (
+    AGE_MS,
+    EXECUTED_AGE,
+    IN_TIME,
+    INTERVENTION,
+    REPLAN,
+    SAFE,
+    SLACK,
+    TICKS,
+)
+from vlagents_ray.slo import Slo
+
+
+class Answers(Agent):
+    """Answers with `rows` rows when it is let; the first request, that of a reset, at once."""
+
+    contract = Contract(action=ActionSpec(dim=1, delta=True))
+
+    def __init__(self, rows: int) -> None:
+        self.rows = rows
+        self.infos: list[dict[str, Any]] = []  # of the observations of its requests
+        self.answer_info: dict[str, Any] = {}
+        self.failure: Exception | None = None
+        self.options: dict[str, Any] = {}
+        self.let = 1  # requests that it answers
+        self.answered = 0
+        self.reads_slo = True
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        self.options = kwargs
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.infos.append(obs.info)
+        wait_for(lambda: self.let >= len(self.infos), every_s=0.0005)
+        self.answered += 1
+        if self.failure is not None:
+            raise self.failure
+        return Act(np.ones((self.rows, 1), np.float32), info=dict(self.answer_info))
+
+
+class Driver:
+    """A robot whose operator counts what moves it."""
+
+    def __init__(self, rows: int, **options: Any) -> None:
+        self.agent = Answers(rows)
+        self.player = ChunkPlayer(self.agent, PlayerSettings(mode="async", **options))
+        self.player.reset(Obs(), "stack")
+        self.ticks = self.starved = 0
+        self._waits_after_stop = False
+
+    def tick(self) -> Act:
+        """Act, and count the tick by what the robot executed."""
+        act = self.player.act(Obs())
+        if self.player.control.state != "autonomous":
+            self._waits_after_stop = True
+            return act
+        moved = SAFE not in act.info
+        if moved:
+            self._waits_after_stop = False
+        if not self._waits_after_stop:
+            self.ticks += 1
+            self.starved += not moved
+        return act
+
+    def answer(self) -> None:
+        """Let the policy answer the request in progress, and wait until the player can take it."""
+        caller = self.player._caller
+        assert caller is not None
+        if not caller.busy:
+            return
+        agent = self.agent
+        wait_for(
+            lambda: not caller.busy or len(agent.infos) > agent.answered,
+            every_s=0.0005,
+        )
+        self.agent.let = max(self.agent.let, len(self.agent.infos))
+        wait_for(lambda: not caller.busy, every_s=0.0005)
+
+    def request(self, number: int) -> dict[str, Any]:
+        """Return the info of a request, the first of which is that of the reset, once it is
+        there.
+        """
+        wait_for(lambda: len(self.agent.infos) > number, every_s=0.0005)
+        return self.agent.infos[number]
+
+    def stop(self) -> None:
+        """Stop the robot and let it go on."""
+        self.player.interrupt()
+        self._waits_after_stop = True
+
+    def close(self) -> None:
+        self.agent.let = 10**9
+        self.player.close()
+
+
+@given(
+    rows=st.sampled_from([1, 2, 8]),
+    steps=st.lists(
+        st.sampled_from(["tick", "tick", "tick", "answer", "pause", "resume", "stop"]),
+        max_size=40,
+    ),
+)
+@settings(max_examples=40, deadline=None)
+def test_the_player_counts_what_an_observer_of_the_robot_counts(
+    rows: int, steps: list[str]
+) -> None:
+    driver = Driver(rows)
+    try:
+        for step in steps:
+            if step == "tick":
+                act = driver.tick()
+                assert act.info.get(IN_TIME, SAFE not in act.info) is (SAFE not in act.info)
+            elif step in ("pause", "resume"):
+                getattr(driver.player.control, step)()
+            else:
+                getattr(driver, step)()
+        assert driver.player.timeliness.ticks == driver.ticks
+        assert driver.player.timeliness.starved == driver.starved
+    finally:
+        driver.close()
+
+
+def test_a_lost_server_starves_its_robot() -> None:
+    driver = Driver(2)
+    driver.agent.failure = PolicyUnavailable("gone")
+    for _ in range(4):
+        driver.tick()
+        driver.answer()
+    assert driver.player.timeliness.to_json()["starved"] == 2
+    driver.close()
+
+
+def test_a_row_that_the_guard_refuses_was_in_time() -> None:
+    def refuse(action: np.ndarray, last: np.ndarray | None, obs: Obs | None = None) -> np.ndarray:
+        if action.any():
+            raise player_module.InvalidAction("too far")
+        return action
+
+    agent = Answers(4)
+    player = ChunkPlayer(agent, PlayerSettings(mode="async"), check=refuse)
+    player.reset(Obs(), "stack")
+    act = player.act(Obs())
+    assert act.info[IN_TIME] is True
+    assert SAFE in act.info
+    assert player.timeliness.share == 1.0
+    agent.let = 10**9
+    player.close()
+
+
+def test_a_request_reports_the_ticks_since_the_last_one_and_the_slack() -> None:
+    driver = Driver(4)
+    for _ in range(2):
+        driver.tick()
+    assert driver.request(0).keys().isdisjoint({SLACK, TICKS})  # `reset` waits for it
+    first = driver.request(1)
+    assert first[TICKS] == [1, 0]  # asked at the second tick, after the first
+    assert first[EXECUTED_AGE] >= 0
+
+    driver.player._tick_begins.extend(float(tick) for tick in range(20))  # of 1 Hz
+    for _ in range(4):
+        driver.tick()
+    driver.answer()
+    driver.tick()
+    last = driver.request(2)
+    ticks, starved = last[TICKS]
+    assert (ticks, starved) == (5, 2)  # the rows of the first answer ended
+    driver.close()
+
+
+@pytest.mark.parametrize(("rows_left", "slack_ms"), [(1, 0.0), (2, 1000.0), (5, 4000.0)])
+def test_the_slack_is_the_time_of_the_rows_that_are_left(rows_left: int, slack_ms: float) -> None:
+    driver = Driver(rows_left)
+    driver.player._tick_begins.extend(float(tick) for tick in range(20))
+    assert driver.player._slack_ms() == slack_ms
+    driver.player._wire_ms = 300.0
+    assert driver.player._slack_ms() == max(0.0, slack_ms - 300.0)
+    driver.close()
+
+
+def test_a_player_asks_no_sooner_than_the_server_wants_but_never_starves_for_it() -> None:
+    driver = Driver(10)
+    driver.agent.answer_info = {REPLAN: 1e6}
+    driver.agent.let = 10**9
+    for _ in range(3):
+        driver.tick()
+        driver.answer()
+    requests = len(driver.agent.infos)
+
+    played = 0
+    while len(driver.agent.infos) == requests:
+        driver.tick()
+        driver.answer()
+        played += 1
+        assert played < 10
+    assert played > 3
+    assert driver.player.timeliness.starved == 0
+    driver.close()
+
+
+@pytest.mark.parametrize("replan_ms", ["soon", None, float("nan"), float("inf"), -1.0, 10**400])
+def test_a_wrong_time_of_the_next_request_delays_none(replan_ms: Any) -> None:
+    driver = Driver(10)
+    driver.agent.answer_info = {REPLAN: replan_ms}
+    driver.agent.let = 10**9
+    for _ in range(4):
+        driver.tick()
+        driver.answer()
+    assert len(driver.agent.infos) >= 3
+    driver.close()
+
+
+def test_an_operators_ticks_do_not_count() -> None:
+    timeliness = Timeliness()
+    timeliness.count({INTERVENTION: True})
+    timeliness.count({IN_TIME: True, AGE_MS: 30.0})
+    timeliness.count({IN_TIME: False})
+    timeliness.count_missed(2)
+    assert (timeliness.ticks, timeliness.starved, timeliness.share) == (4, 3, 0.25)
+    assert timeliness.to_json()["age_p95_ms"] == 30.0
+
+
+def test_a_player_states_the_rows_that_it_executes_at_most() -> None:
+    agent = Answers(8)
+    player = ChunkPlayer(agent, PlayerSettings(mode="async", horizon=3))
+    assert player.reads_slo
+    player.reset(Obs(), "stack", slo={"hz": 10.0})
+    assert agent.options == {"slo": {"hz": 10.0, "rows": 3}}
+    agent.let = 10**9
+    player.close()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        None,
+        [],
+        {},
+        {"hz": 0},
+        {"hz": "10"},
+        {"hz": True},
+        {"hz": float("nan")},
+        {"hz": 10**400},
+        {"hz": 10, "age_ms": -1},
+        {"hz": 10, "rows": 0},
+        {"hz": 10, "rows": 2.5},
+        {"hz": 10, "share": 0},
+        {"hz": 10, "share": 1.1},
+        {"hz": 10, "age": 5},
+        {"hz": 10, "x" * 10_000: 5},
+    ],
+)
+def test_an_slo_that_cannot_be_is_refused(wrong: Any) -> None:
+    with pytest.raises(ConfigError, match=r"slo.*: expected .*, got ") as refused:
+        Slo.from_json(wrong)
+    assert len(str(refused.value)) < 400
+
+
+def test_an_slo_is_what_its_json_says() -> None:
+    slo = Slo(10, rows=8, age_ms=150.0, share=0.9)
+    assert Slo.from_json(slo.to_json()) == slo
+    assert Slo(5).to_json() == {"hz": 5, "share": 0.98}
