@@ -58,8 +58,8 @@ class Slo:
 
         if self.rows is not None and (type(self.rows) is not int or self.rows < 1):
             raise ConfigError(
-                f"slo.rows: expected a whole number of at least 1, got {shown(self.rows)}; leave it "
-                "out if whole chunks are executed"
+                f"slo.rows: expected a whole number of at least 1, got {shown(self.rows)}; leave "
+                "it out if whole chunks are executed"
             )
 
     @classmethod

@@ -31,7 +31,9 @@ async def handler(
             begun = time.monotonic()
             msgpack_numpy.unpackb(await websocket.recv())
             inference = time.monotonic()
-            action: dict[str, Any] = {"actions": policy(), "policy_timing": {"infer_ms": 0.0}}
+            # (1, 7), or (chunk, 7).
+            actions = policy().reshape(-1, 7)
+            action: dict[str, Any] = {"actions": actions, "policy_timing": {"infer_ms": 0.0}}
             action["server_timing"] = {"infer_ms": (time.monotonic() - inference) * 1000}
             if previous is not None:
                 action["server_timing"]["prev_total_ms"] = previous * 1000

@@ -6,6 +6,8 @@ It imports only the standard library and numpy, as it runs in other environments
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import functools
 import importlib.util
 import json
@@ -15,7 +17,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -62,27 +64,61 @@ class Policy:
 
     A batch of B takes `base_ms + per_item_ms * B`. Only one batch is computed at a time, as on an
     accelerator.
+
+    Args:
+        base_ms: Duration of a batch of any size, ms.
+        per_item_ms: Further duration of each row, ms.
+        batch: Largest batch.
+        chunk: Actions of an answer.
+        accelerator: A file that is locked during a batch: processes with the same one share an
+            accelerator, which computes for one of them at a time.
     """
 
-    def __init__(self, base_ms: float = 0.0, per_item_ms: float = 0.0, batch: int = 1) -> None:
+    def __init__(
+        self,
+        base_ms: float = 0.0,
+        per_item_ms: float = 0.0,
+        batch: int = 1,
+        chunk: int = 1,
+        accelerator: str | None = None,
+    ) -> None:
         self.base_ms, self.per_item_ms, self.batch = base_ms, per_item_ms, batch
+        self.chunk, self.accelerator = chunk, accelerator
         self._busy = threading.Lock()
 
     def __call__(self, rows: int = 1) -> np.ndarray:
-        """Compute a batch; returns (rows, 7) float32."""
-        actions = np.zeros((rows, 7), np.float32)
-        actions[:, 0] = rows
-        with self._busy:
+        """Compute a batch; returns (rows, 7) float32, or (rows, chunk, 7) with several actions an
+        answer.
+        """
+        shape = (rows, 7) if self.chunk == 1 else (rows, self.chunk, 7)
+        actions = np.zeros(shape, np.float32)
+        actions[..., 0] = rows
+        with self._busy, self._accelerator():
             if taken := self.ms(rows):
                 time.sleep(taken / 1e3)
         return actions
+
+    @contextlib.contextmanager
+    def _accelerator(self) -> Iterator[None]:
+        if self.accelerator is None:
+            yield
+            return
+        with open(self.accelerator, "w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
 
     def ms(self, rows: int) -> float:
         """Return the time that a batch takes, ms; 0: none."""
         return self.base_ms + self.per_item_ms * rows if self.base_ms or self.per_item_ms else 0.0
 
-    def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int]]:
-        return Policy, (self.base_ms, self.per_item_ms, self.batch)
+    def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int, int, str | None]]:
+        return Policy, (
+            self.base_ms,
+            self.per_item_ms,
+            self.batch,
+            self.chunk,
+            self.accelerator,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ class VlagentsPolicy(Agent):
 
     def act(self, obs: Obs) -> Act:
         super().act(obs)
-        return self._single_step_act("robot", self.policy()[0])
+        return self._chunk_act("robot", self.policy().reshape(-1, 7))
 
 
 class VlagentsTabletop(EvalEnv):

@@ -53,6 +53,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.robot.watchdog import Watchdog
+from vlagents_ray.slo import SHARE, Slo
 from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
@@ -245,6 +246,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             viewer=viewer,
             real_time=options.real_time,
             report=report,
+            slo=Slo(hz, age_ms=options.slo_age_ms, share=options.slo_share),
         )
         try:
             run_loop(
@@ -426,6 +428,8 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
         f"{report.jitter['ticks']:.0f}"
     )
 
+    _say_timeliness(report, say)
+
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda item: -item[1]):
         if ticks:
@@ -437,6 +441,22 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     for bark in report.barks:
         say(f"stopped: {bark}")
     say(f"against jitter: {', '.join(report.means)}")
+
+
+def _say_timeliness(report: LoopReport, say: Callable[[str], None]) -> None:
+    """Print the share of ticks in time, the ages of actions, and the server's answer to the SLO."""
+    figures = report.timeliness.to_json()
+    if not figures["ticks"]:
+        return
+    line = f"in time: {figures['share']:.2%} of {figures['ticks']} ticks of the policy"
+    if "age_p50_ms" in figures:
+        line += (
+            f"; age of its actions p50 {figures['age_p50_ms']:.0f} ms, p95 "
+            f"{figures['age_p95_ms']:.0f} ms, p99 {figures['age_p99_ms']:.0f} ms"
+        )
+    say(line)
+    if not report.slo.get("in_time", True):
+        say(f"the server foresaw that this robot is not served in time: {report.slo['reason']}")
 
 
 class _RunKeys:
@@ -706,6 +726,20 @@ def command_parser() -> tuple[
         **one_of(*get_args(Restart)),
         help="restart after a stop: manual by Enter, C or SIGUSR1, or auto when the server answers "
         "again (default: manual; for a simulated robot: auto)",
+    )
+    real(
+        "--slo-age-ms",
+        type=seconds,
+        metavar="MS",
+        help="age, in milliseconds, above which an executed action is of little use: the server "
+        "says before the first motion whether it can serve the robot so",
+    )
+    real(
+        "--slo-share",
+        type=number(above=True, maximum=1),
+        default=SHARE,
+        metavar="SHARE",
+        help="share of the ticks that need an action in time (default: %(default)s)",
     )
     real(
         "--silent-s",

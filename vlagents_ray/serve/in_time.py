@@ -18,11 +18,9 @@ from typing import Any, NamedTuple
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import EXECUTED_AGE, TICKS
 from vlagents_ray.protocol.messages import Priority
+from vlagents_ray.slo import SHARE
 
 WINDOW_S = 10  # time over which shares, ages and the goodput are computed, s
-TARGET_SHARE = 0.98
-"""The share of its ticks that a robot must have in time if its SLO does not name one."""
-
 # The largest number of ticks and age of one report. A robot that was offline for weeks stays below
 # them, as it would be refused for ever otherwise.
 _MOST_TICKS = 2**31
@@ -91,7 +89,7 @@ class RobotTimes:
     def __init__(self, priority: Priority = Priority.ROBOT) -> None:
         """Start without reports, for a session of that priority."""
         self.priority = priority
-        self.target_share = TARGET_SHARE  # share of the ticks in time that the robot needs
+        self.target_share = SHARE  # share of the ticks in time that the robot needs
         self.ticks = 0  # in total
         self.starved = 0  # in total
         self._lock = threading.Lock()

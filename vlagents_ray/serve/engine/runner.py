@@ -35,6 +35,7 @@ from vlagents_ray.serve.engine.responses import (
     require_serializable,
     timing,
 )
+from vlagents_ray.serve.in_time import RobotTimes
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import too_late
 from vlagents_ray.serve.queue.batch_queue import Taken
@@ -301,6 +302,8 @@ class Runner:
             need = need_of(opening.slo, 1 if model.contract is None else model.contract.chunk or 1)
             info[SLO] = self._pace.check(need)
             session.plan = RobotPlan(need, is_stated=True)
+            session.times = session.times or RobotTimes(pending.priority)
+            session.times.target_share = opening.slo.share
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.set_agent(agent)

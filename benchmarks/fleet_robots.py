@@ -1,0 +1,219 @@
+"""Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
+JSON`.
+
+The process connects its robots, and writes "ready". Each line that it then reads has a begin and an
+end, {"begin": s, "end": s} of `time.monotonic`; at the end it writes what happened at each robot's
+ticks. A robot whose policy is late holds still at that tick, and goes on at the next one: the load
+does not slow down with the server.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import msgpack
+import numpy as np
+import requests
+
+from benchmarks.own_clients import observation
+from vlagents_ray.chunking.fallback import Cause
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.interface import AGE_MS, CAUSE, REPLAN, SAFE, SLACK, Act, Agent, Obs
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.robot.pacing import Pacer
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
+
+CONNECT_S = 120.0
+TIMEOUT_S = 20.0
+_AGES = 2000  # most ages of a robot that are written
+_OPENPI_KEYS = {
+    "cameras": {"camera_0": "observation/image", "camera_1": "observation/wrist_image"},
+    "state": {"joints": "observation/state"},
+    "instruction": "prompt",
+}
+_VLAGENTS_KEYS = {
+    "cameras": {name: f"robot/cameras/{name}" for name in ("camera_0", "camera_1")},
+    "state": {"joints": "robot/joints"},
+    "instruction": "language_instruction",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """One robot."""
+
+    url: str
+    hz: float
+    chunk: int  # rows of an answer
+    rows: int | None = None  # rows of an answer that it executes at most; None: all
+    way: str = "websocket"  # of our client; else "openpi", "vlagents", "ray serve"
+    states_slack: bool = True  # whether the server learns how long the answer can wait
+    real_time_chunking: bool = False
+    age_ms: float | None = None  # largest age of an action in its SLO
+    share: float = 0.98  # share of its ticks that its SLO wants in time
+
+
+class WithoutSlack(Agent):
+    """A client of ours as it was before servers knew of slack."""
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._agent.contract
+
+    def initialize(self) -> None:
+        self._agent.initialize()
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        kwargs.pop("slo", None)
+        return self._agent.reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Act:
+        info = {key: value for key, value in obs.info.items() if key != SLACK}
+        act = self._agent.act(replace(obs, info=info))
+        act.info.pop(REPLAN, None)
+        return act
+
+    def close(self) -> None:
+        self._agent.close()
+
+
+class RayServeClient(Agent):
+    """A client of plain Ray Serve with `@serve.batch`, `benchmarks/peers/ray_serve_peer.py`."""
+
+    def __init__(self, url: str, chunk: int) -> None:
+        self._url, self._chunk = url, chunk
+        self._connection = requests.Session()
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=7, delta=True), chunk=self._chunk)
+
+    def act(self, obs: Obs) -> Act:
+        arrays = {**obs.cameras, **obs.state}
+        packed = {
+            name: (array.tobytes(), str(array.dtype), array.shape) for name, array in arrays.items()
+        }
+        answer = self._connection.post(self._url, msgpack.packb(packed), timeout=TIMEOUT_S)
+        answer.raise_for_status()
+        return Act(np.frombuffer(answer.content, np.float32).reshape(self._chunk, 7))
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def connect(robot: Robot) -> Agent:
+    """Return the client of a robot, not connected yet."""
+    if robot.way == "ray serve":
+        return RayServeClient(robot.url, robot.chunk)
+    if robot.way in ("openpi", "vlagents"):
+        settings = {
+            "protocol": robot.way,
+            "urls": [robot.url],
+            "mapping": _OPENPI_KEYS if robot.way == "openpi" else _VLAGENTS_KEYS,
+            "contract": {"action": {"dim": 7, "delta": True}, "chunk": robot.chunk},
+            "timeout_s": TIMEOUT_S,
+        }
+        return build_agent("upstream", settings)
+    agent = RemoteAgent(
+        robot.url,
+        transport=robot.way,  # type: ignore[arg-type]
+        codec="jpeg",
+        timeout_s=TIMEOUT_S,
+        connect_timeout_s=CONNECT_S,
+    )
+    return agent if robot.states_slack else WithoutSlack(agent)
+
+
+class RunningRobot:
+    """A robot with its player."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        settings = PlayerSettings(
+            mode="async",
+            horizon=robot.rows,
+            real_time_chunking=robot.real_time_chunking,
+            timeout_s=TIMEOUT_S,
+            safe="zero",
+        )
+        self._player = ChunkPlayer(connect(robot), settings)
+        self._obs = observation()
+        self._player.initialize()
+
+    def run(self, begin: float, end: float) -> dict[str, Any]:
+        """Run from a random moment within a period of `begin` until `end`; returns the figures."""
+        robot = self._robot
+        slo = {"hz": robot.hz, "age_ms": robot.age_ms, "share": robot.share}
+        known = {key: value for key, value in slo.items() if value is not None}
+        options = {"slo": known} if robot.way in ("websocket", "http", "shm") else {}
+        time.sleep(max(0.0, begin + random.uniform(0, 1 / robot.hz) - time.monotonic()))
+        ticks, starved, failed = 0, 0, ""
+        ages: list[float] = []
+        late: list[tuple[float, int]] = []  # moments of starved ticks, s after `begin`
+        try:
+            reset = self._player.reset(replace(self._obs, info={}), "measure", **options)
+        except VLAgentsError as error:
+            return {"ticks": 1, "starved": 1, "ages": [], "late": [], "failed": str(error)}
+
+        pacer = Pacer(robot.hz)
+        while time.monotonic() < end:
+            tick = pacer.wait()
+            act = self._player.act(replace(self._obs, info={}))
+            ticks += 1
+            if SAFE not in act.info:
+                ages.append(act.info[AGE_MS])
+                continue
+            starved += 1
+            late.append((time.monotonic() - begin, tick))
+            cause: Cause = act.info[CAUSE]
+            if cause not in ("waiting", "late"):
+                failed = act.info[SAFE]
+        return {
+            "ticks": ticks + pacer.missed,
+            "starved": starved + pacer.missed,
+            "missed": pacer.missed,
+            "ages": ages if len(ages) <= _AGES else random.sample(ages, _AGES),
+            "late": late,
+            "failed": failed,
+            "slo": reset.get("slo"),
+        }
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._player.close()
+
+
+def main(text: str) -> None:
+    """Run the process."""
+    die_with_parent()
+    out = own_stdout()
+    robots = [Robot(**each) for each in json.loads(text)]
+    with contextlib.ExitStack() as stack:
+        threads = stack.enter_context(ThreadPoolExecutor(len(robots)))
+        running: Sequence[RunningRobot] = [
+            stack.enter_context(contextlib.closing(RunningRobot(robot))) for robot in robots
+        ]
+        print(json.dumps("ready"), file=out, flush=True)
+        for line in sys.stdin:
+            run = partial(RunningRobot.run, **json.loads(line))
+            figures = list(threads.map(run, running))
+            print(json.dumps(figures), file=out, flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
