@@ -281,6 +281,33 @@ def test_a_broken_reply_is_malformed(act: object) -> None:
         decode_replies(_frame({"act": act}, b"1234"))[0]
 
 
+@pytest.mark.parametrize("field", ["request_id", "info", "step", "draining", "timing"])
+@pytest.mark.parametrize("kind", ["info", "error", "act"])
+def test_a_field_that_a_reply_leaves_out_has_its_default(kind: str, field: str) -> None:
+    act = {"action": {"$": ["nd", 0, "<f4", [1]]}, "done": False, "info": {}}
+    of_kind: dict[str, object] = {"error": {"code": "not_reset", "detail": "reset it"}, "act": act}
+    whole = {
+        "request_id": "r",
+        "info": {"a": 1},
+        "step": "3",
+        "draining": True,
+        "timing": {"queue_ms": 1.0},
+    }
+    if kind in of_kind:
+        whole[kind] = of_kind[kind]
+    part = {name: value for name, value in whole.items() if name != field}
+
+    (expected,) = decode_replies(_frame(whole, b"1234"))
+    (reply,) = decode_replies(_frame({"replies": [part]}, b"1234"))
+
+    default = Reply("", info=expected.info if kind != "info" else {})
+    for name in ("request_id", "info", "step", "draining", "timing"):
+        wanted = default if name == field else expected
+        assert getattr(reply, name) == getattr(wanted, name), name
+    assert type(reply.error) is type(expected.error)
+    assert (reply.act is None) is (expected.act is None)
+
+
 def test_pixels_are_limited_before_memory_is_taken() -> None:
     jpeg = bytearray(
         encode_requests([Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)}))], JPEG)
