@@ -80,12 +80,6 @@ GIVEN = "given_rows"
 # In an observation, (N, D): the actions executed since the last request that the policy did not
 # choose.
 EXECUTED = "executed_actions"
-<<<<<<< HEAD
-=======
-# In the Act of a server whose robots ask more often than it can answer, float: the time, ms, after
-# which the next request of this session is useful.
-REPLAN = "replan_ms"
->>>>>>> 14e3c865 (Say on the robot how many ticks were in time, state its SLO, and measure fleets of robots)
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the
 # loaded checkpoint.
 POLICY = "policy"
