@@ -178,8 +178,8 @@ def _serving(
         scheme = {RAY_SERVE: "http", VLAGENTS: "rpyc"}.get(system, "ws")
         urls = []
         for _ in range(servers):
-            server = stack.enter_context(others.serving(client, plan.python, {}, policy))
-            urls.append("{}://{}:{}".format(scheme, *server.address))
+            peer = stack.enter_context(others.serving(client, plan.python, {}, policy))
+            urls.append("{}://{}:{}".format(scheme, *peer.address))
         _wait_until_listening(urls)
         yield urls * robots if servers == 1 else urls
 

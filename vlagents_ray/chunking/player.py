@@ -522,8 +522,9 @@ class ChunkPlayer(Agent):
         timing = answer.info.get("timing") or {}
         self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
         replan_ms = answer.info.get(REPLAN)
-        is_time = isinstance(replan_ms, (int, float)) and 0 < replan_ms <= _LONGEST_REPLAN_MS
-        self._replan_at = time.monotonic() + replan_ms / 1e3 if is_time else 0.0
+        self._replan_at = 0.0
+        if isinstance(replan_ms, (int, float)) and 0 < replan_ms <= _LONGEST_REPLAN_MS:
+            self._replan_at = time.monotonic() + replan_ms / 1e3
 
     def _slack_ms(self) -> float:
         """Return the time, ms, that the server has for the answer to a request of this tick: until
