@@ -75,9 +75,6 @@ _MAX_REPLACEMENTS = 256
 _TIMED_TICKS = 10  # the number of ticks from whose intervals the rate of the loop is measured
 _KEPT_WIRE = 0.9  # the part of the longest time on the way that is left after another answer
 _LONGEST_REPLAN_MS = 1e9  # the longest delay of a request that a server may ask for
-# A request that the server asked to delay is sent while the plan has this many more rows than the
-# ticks that an answer takes.
-_SPARE_ROWS = 2
 
 
 class AsyncCaller:
@@ -289,6 +286,7 @@ class ChunkPlayer(Agent):
         # When the last ticks began, s of `time.monotonic`.
         self._tick_begins: deque[float] = deque(maxlen=_TIMED_TICKS)
         self._wire_ms = 0.0  # the longest time that a request and its answer were on the way, ms
+        self._inference_ms = 0.0  # the time of the last batch, ms
         # Time before which the server needs no further request, s of `time.monotonic`.
         self._replan_at = 0.0
         self._captured = CaptureClock()
@@ -493,8 +491,11 @@ class ChunkPlayer(Agent):
             return True
         if tick - self._request.tick < (self.settings.execute or 1):
             return False
-        can_wait = self._plan.known > self._delay.ticks + _SPARE_ROWS
-        return not (can_wait and time.monotonic() < self._replan_at)
+        if time.monotonic() >= self._replan_at:
+            return True
+        # It waits no longer than an urgent request can be answered in time. The wait in the queue
+        # does not count: otherwise robots would ask the more often the longer the queue is.
+        return self._slack_ms() <= self._inference_ms + self._period_ms()
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
         """Add the answer of the policy to the plan, if there is one; raise an error that another
@@ -521,6 +522,7 @@ class ChunkPlayer(Agent):
         """Record how long an answer was on the way, and when the server needs the next request."""
         timing = answer.info.get("timing") or {}
         self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
+        self._inference_ms = timing.get("inference_ms", 0.0)
         replan_ms = answer.info.get(REPLAN)
         self._replan_at = 0.0
         if isinstance(replan_ms, (int, float)) and 0 < replan_ms <= _LONGEST_REPLAN_MS:
@@ -530,13 +532,13 @@ class ChunkPlayer(Agent):
         """Return the time, ms, that the server has for the answer to a request of this tick: until
         the last row that is left, without the time on the way.
         """
-        begins = list(self._tick_begins)
-        intervals_s = sorted(end - begin for begin, end in itertools.pairwise(begins))
-        if not intervals_s:
-            return 0.0
-        period_ms = 1e3 * intervals_s[len(intervals_s) // 2]
         rows_after_this = max(0, self._plan.known - 1)
-        return max(0.0, rows_after_this * period_ms - self._wire_ms)
+        return max(0.0, rows_after_this * self._period_ms() - self._wire_ms)
+
+    def _period_ms(self) -> float:
+        """Return the period of the loop, ms, from its last ticks; 0 before the second one."""
+        intervals_s = sorted(end - begin for begin, end in itertools.pairwise(self._tick_begins))
+        return 1e3 * intervals_s[len(intervals_s) // 2] if intervals_s else 0.0
 
     def _take(self, act: Act) -> None:
         """Add the chunk of an answer to the plan."""
