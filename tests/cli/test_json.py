@@ -20,6 +20,8 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.registry import names
 
+ROOT = Path(__file__).parents[2]
+
 
 def offering(command: Any, name: str = "") -> Iterator[str]:
     """The names of the commands that have the option."""
@@ -46,6 +48,7 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "policies": [],
         "envs": ["tabletop"],
         "doctor": [],
+        "plan": [str(ROOT / "examples/fleet.yaml")],
         "report": [str(out)],
         "verify": [str(tmp_path / "b.zip"), "--replay", "0"],
     }

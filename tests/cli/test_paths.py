@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 
+ROOT = Path(__file__).parents[2]
+
 EPISODE = ["--policy", "scripted", "--episodes", "1", "--workers", "0", "--video", "none"]
 # Command and option -> words in which "{path}" is the path. "done" is a folder with results.
 COMMANDS: dict[tuple[str, str], list[str]] = {
@@ -46,6 +48,8 @@ COMMANDS: dict[tuple[str, str], list[str]] = {
     ("bundle", "--out"): ["done", "--out", "{path}"],
     ("verify", "bundle"): ["{path}"],
     ("verify", "--out"): ["absent.zip", "--out", "{path}"],
+    ("plan", "file"): ["{path}"],
+    ("plan", "--out"): [str(ROOT / "examples/fleet.yaml"), "--out", "{path}"],
     ("tune", "file"): ["{path}"],
     ("tune", "--frames"): ["d.yaml", "--frames", "{path}"],
     ("env make", "requirements"): ["{path}"],

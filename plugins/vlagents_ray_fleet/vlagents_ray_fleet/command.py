@@ -29,7 +29,7 @@ def plan_command(
         float,
         typer.Option(min=1, max=86_400, callback=finite, help="Of the simulation, virtual time."),
     ] = 60.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulation.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of the simulation.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Compute the replicas, batch sizes and GPUs with which all robots of a fleet are in time."""
