@@ -89,7 +89,9 @@ class FleetPlan:
 
     def fleet(self, robots: int) -> list[Kind]:
         """Return the kind of each robot, in turns by their weights."""
-        turn = [kind for kind in self.kinds for _ in range(kind.weight)]
+        turn: list[Kind] = []
+        for kind in self.kinds:
+            turn += [kind] * kind.weight
         return [turn[robot % len(turn)] for robot in range(robots)]
 
 
@@ -211,8 +213,9 @@ def _point(plan: FleetPlan, system: str, robots: int, urls: Sequence[str]) -> di
     with contextlib.ExitStack() as stack:
         processes = []
         for first in range(0, robots, _ROBOTS_A_PROCESS):
-            part = [asdict(robot) for robot in fleet[first : first + _ROBOTS_A_PROCESS]]
-            command = [sys.executable, "-m", "benchmarks.fleet_robots", json.dumps(part)]
+            robots_of_process = fleet[first : first + _ROBOTS_A_PROCESS]
+            arguments = json.dumps([asdict(robot) for robot in robots_of_process])
+            command = [sys.executable, "-m", "benchmarks.fleet_robots", arguments]
             processes.append(stack.enter_context(LineProcess("robots", command, our_environment())))
         for process in processes:
             process.read(CONNECT_S)
@@ -221,7 +224,10 @@ def _point(plan: FleetPlan, system: str, robots: int, urls: Sequence[str]) -> di
             begin = time.monotonic() + _AHEAD_S
             for process in processes:
                 process.send(json.dumps({"begin": begin, "end": begin + seconds}))
-            return [robot for process in processes for robot in process.read(seconds + _LATE_S)]
+            figures: list[dict[str, Any]] = []
+            for process in processes:
+                figures += process.read(seconds + _LATE_S)
+            return figures
 
         run(_WARM_S)
         client_pids = [process.pid for process in processes]
@@ -260,12 +266,15 @@ def _cpu_s(pids: Sequence[int]) -> float:
 def _summary(robots: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the figures of some robots: the share of their ticks, and the ages of actions, ms."""
     shares = [1 - robot["starved"] / max(1, robot["ticks"]) for robot in robots]
-    ages = np.array([age for robot in robots for age in robot["ages"]] or [np.nan])
     ticks = sum(robot["ticks"] for robot in robots)
+    starved = sum(robot["starved"] for robot in robots)
+    ages = np.concatenate([robot["ages"] for robot in robots])
+    if not len(ages):
+        ages = np.array([np.nan])
     p50, p95, p99 = (float(age) for age in np.quantile(ages, (0.5, 0.95, 0.99)))
     return {
         "served": sum(share >= SERVED for share in shares),
-        "share": 1 - sum(robot["starved"] for robot in robots) / max(1, ticks),
+        "share": 1 - starved / max(1, ticks),
         "least_share": min(shares),
         "missed": sum(robot.get("missed", 0) for robot in robots),
         "age_p50_ms": p50,
@@ -284,7 +293,7 @@ def most_served(points: Sequence[Mapping[str, Any]], system: str) -> int:
     return max(served, default=0)
 
 
-def show_fleet(found: Mapping[str, Any]) -> None:
+def show_fleet(measured: Mapping[str, Any]) -> None:
     """Print a row for each system and number of robots."""
     rows = table(
         "system",
@@ -299,8 +308,8 @@ def show_fleet(found: Mapping[str, Any]) -> None:
         "client CPU s a robot-hour",
         "server",
     )
-    loads = {point["robots"]: point["load"] for point in found["arithmetic"]}
-    for point in found["points"]:
+    loads = {point["robots"]: point["load"] for point in measured["arithmetic"]}
+    for point in measured["points"]:
         rows.add_row(
             point["system"],
             str(point["robots"]),
@@ -315,19 +324,19 @@ def show_fleet(found: Mapping[str, Any]) -> None:
             f"{point['server_cpu_s']:.0f}",
         )
     out.print(rows)
-    show_skipped(found)
+    show_skipped(measured)
 
 
 def parse_kinds(text: str) -> list[Kind]:
     """Parse HZ:ROWS or HZ:ROWS:WEIGHT with commas between them."""
     kinds = []
-    for part in parse_list(text):
-        numbers = part.split(":")
+    for kind in parse_list(text):
+        numbers = kind.split(":")
         try:
             kinds.append(Kind(float(numbers[0]), *(int(number) for number in numbers[1:])))
         except (TypeError, ValueError) as error:
             raise ConfigError(
-                f"--kinds: expected HZ:ROWS or HZ:ROWS:WEIGHT, as in 10:50, got {part!r}"
+                f"--kinds: expected HZ:ROWS or HZ:ROWS:WEIGHT, as in 10:50, got {kind!r}"
             ) from error
     return kinds
 
@@ -377,11 +386,11 @@ def main(
             transport=transport,
             real_time_chunking=rtc,
         )
-        found = measure_fleet(plan, progress)
-        show_fleet(found)
+        measured = measure_fleet(plan, progress)
+        show_fleet(measured)
         for system in names:
-            out.print(f"{system}: at most {most_served(found['points'], system)} robots")
-        save({**origin, **found}, out_file)
+            out.print(f"{system}: at most {most_served(measured['points'], system)} robots")
+        save({**origin, **measured}, out_file)
 
 
 if __name__ == "__main__":

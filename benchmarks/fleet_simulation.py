@@ -167,7 +167,7 @@ def events(tally: Tally, until_s: float) -> list[Event]:
         "a rolling update": UPDATE_S,
     }
     ends = [*list(begins.values())[1:], until_s - 1]
-    found = []
+    met = []
     for (name, begin), next_begin in zip(begins.items(), ends, strict=True):
         end = min(next_begin, until_s - 1)  # the last second may lack some ticks
         if end <= begin:
@@ -177,7 +177,7 @@ def events(tally: Tally, until_s: float) -> list[Event]:
         shares = in_time[seconds] / ticks
         shares[in_time[seconds] + starved[seconds] == 0] = 1.0
         late = np.flatnonzero(shares < IN_TIME)
-        found.append(
+        met.append(
             Event(
                 name=name,
                 begun_s=begin,
@@ -186,7 +186,7 @@ def events(tally: Tally, until_s: float) -> list[Event]:
                 recovered_s=float(late[-1] + 1) if len(late) else 0.0,
             )
         )
-    return found
+    return met
 
 
 def limits(shape: Shape, requests_hz: float) -> list[Limit]:
@@ -203,7 +203,7 @@ def limits(shape: Shape, requests_hz: float) -> list[Limit]:
     controller_cores = CONTROLLER_CORES[2] + _slope(CONTROLLER_CORES) * (shape.replicas - 2)
     controlled = 2 + (1 - CONTROLLER_CORES[2]) / _slope(CONTROLLER_CORES)
     a_core = 1000 / SERVER_MS_AN_ACT
-    found = [
+    reached = [
         Limit(
             "comparisons of sessions between replicas",
             f"{comparisons:,.0f} calls a second, {cores:.2f} of a core in each replica",
@@ -247,7 +247,7 @@ def limits(shape: Shape, requests_hz: float) -> list[Limit]:
             f"its CPU with 2 and 12 replicas, {of_node:.0f} of which are on a node here",
         ),
     ]
-    return sorted(found, key=lambda limit: limit.limit_robots)
+    return sorted(reached, key=lambda limit: limit.limit_robots)
 
 
 def _slope(values: dict[int, float]) -> float:

@@ -31,7 +31,7 @@ class Slo:
         rows: The rows of a chunk that it executes at most; None: all of them.
 
     Raises:
-        ConfigError: A value is no number, or out of its range.
+        ConfigError: A value is not a number, or is out of its range.
     """
 
     hz: float
@@ -70,7 +70,7 @@ class Slo:
             value: A JSON object with `hz`, and optionally `age_ms`, `share` and `rows`.
 
         Raises:
-            ConfigError: It is no such object, or has a wrong value.
+            ConfigError: It is not such an object, or has a wrong value.
         """
         if not isinstance(value, Mapping):
             raise ConfigError(
@@ -96,7 +96,7 @@ class Slo:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a value is a finite number; a boolean is none."""
+    """Return whether a value is a finite number; a boolean does not count as one."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:

@@ -229,6 +229,17 @@ def test_a_wrong_time_of_the_next_request_delays_none(replan_ms: Any) -> None:
     driver.close()
 
 
+@pytest.mark.parametrize("timing", [None, 5, "soon", []])
+def test_an_agent_may_use_the_name_of_the_timing_for_something_else(timing: Any) -> None:
+    driver = Driver(4)
+    driver.agent.answer_info = {"timing": timing}
+    driver.agent.let = 10**9
+    for _ in range(3):
+        assert SAFE not in driver.tick().info
+        driver.answer()
+    driver.close()
+
+
 def test_an_operators_ticks_do_not_count() -> None:
     timeliness = Timeliness()
     timeliness.count({INTERVENTION: True})

@@ -159,7 +159,7 @@ class World:
 
     def _ask(self, robot: Robot, slack_s: float, at: float, done: Callable[[], None]) -> None:
         arrived = self.now + WIRE_S
-        one = PendingRequest(
+        pending = PendingRequest(
             robot.name,
             Request("act"),
             message_of_one(),
@@ -169,36 +169,36 @@ class World:
         )
         if robot.states_slack and self.slack:
             slack_s = 0.0 if robot.lies else max(0.0, slack_s - 2 * WIRE_S)
-            one.needed = arrived + slack_s
+            pending.needed = arrived + slack_s
         if self.deadlines and self.draw.random() < self.deadlines:
-            one.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])
-        one.observer_data = {"done": done, "robot": robot}
-        robot.waiting = one
+            pending.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])
+        pending.observer_data = {"done": done, "robot": robot}
+        robot.waiting = pending
         self.sent += 1
-        self.at(arrived, lambda: self._put(one))
+        self.at(arrived, lambda: self._put(pending))
 
     def _simulate(self, simulation: Simulation) -> None:
-        one = PendingRequest(
+        pending = PendingRequest(
             simulation.name, Request("act"), message_of_one(), Priority.SIMULATION, self.now
         )
 
         def done() -> None:
             simulation.answered += 1
-            simulation.longest_s = max(simulation.longest_s, self.now - one.arrived)
+            simulation.longest_s = max(simulation.longest_s, self.now - pending.arrived)
             self.at(self.now + 0.005, lambda: self._simulate(simulation))
 
-        one.observer_data = {"done": done}
+        pending.observer_data = {"done": done}
         self.sent += 1
-        self._put(one)
+        self._put(pending)
 
-    def _put(self, one: PendingRequest) -> None:
+    def _put(self, pending: PendingRequest) -> None:
         costs_s = self.queue.window.costs_s
-        one.observer_data["patient"] = (
-            one.priority is Priority.ROBOT
+        pending.observer_data["patient"] = (
+            pending.priority is Priority.ROBOT
             and bool(costs_s)
-            and one.needed > self.now + 2 * costs_s[-1]
+            and pending.needed > self.now + 2 * costs_s[-1]
         )
-        self.queue.put(one)
+        self.queue.put(pending)
         if not self.busy:
             self._turn()
 
@@ -222,48 +222,56 @@ class World:
     def _check(self, batch: list[PendingRequest]) -> None:
         """What must be true of each batch."""
         assert len(batch) <= LARGEST
-        assert len({one.session_id for one in batch}) == len(batch), "two of one session"
+        assert len({pending.session_id for pending in batch}) == len(batch), (
+            "two of pending session"
+        )
         costs_s = self.queue.window.costs_s
         if not costs_s:
             return
         urgent_s = self.now + 2 * costs_s[-1]
         left = [
-            one
-            for one in self.queue._waiting.heads()
-            if one.priority is Priority.ROBOT
-            and one.needed <= urgent_s
-            and not one.over
-            and one.deadline >= self.now
+            pending
+            for pending in self.queue._waiting.heads()
+            if pending.priority is Priority.ROBOT
+            and pending.needed <= urgent_s
+            and not pending.over
+            and pending.deadline >= self.now
         ]
-        patient = [one for one in batch if one.observer_data["patient"] and one.needed > urgent_s]
-        assert not (left and patient), "an urgent request is behind one that can wait"
+        patient = [
+            pending
+            for pending in batch
+            if pending.observer_data["patient"] and pending.needed > urgent_s
+        ]
+        assert not (left and patient), "an urgent request is behind pending that can wait"
 
     def _finish(self, batch: list[PendingRequest], took: float) -> None:
         self.queue.end()
         self.busy = False
-        for one in batch:
+        for pending in batch:
             self.answered += 1
-            one.over = True
-            robot: Robot | None = one.observer_data.get("robot")
+            pending.over = True
+            robot: Robot | None = pending.observer_data.get("robot")
             if robot is None:
-                one.observer_data["done"]()
+                pending.observer_data["done"]()
                 continue
-            robot.plan.observe(robot.rows, one.arrived, one.needed)
+            robot.plan.observe(robot.rows, pending.arrived, pending.needed)
             replan_s = 0.0
-            if one.needed and robot.plan.need is not None:
-                replan_s = self.pace.replan_s(robot.plan.need, one.arrived)
+            if pending.needed and robot.plan.need is not None:
+                replan_s = self.pace.replan_s(robot.plan.need, pending.arrived)
             arrives = self.now + WIRE_S
             # Without the wait in the queue, which is long only for those who have the time.
             robot.round_trip_s = 2 * WIRE_S + took
-            self.at(arrives, lambda one=one, replan_s=replan_s: self._answer(one, replan_s))
+            self.at(
+                arrives, lambda pending=pending, replan_s=replan_s: self._answer(pending, replan_s)
+            )
         self._turn()
 
-    def _answer(self, one: PendingRequest, replan_s: float) -> None:
-        robot: Robot = one.observer_data["robot"]
+    def _answer(self, pending: PendingRequest, replan_s: float) -> None:
+        robot: Robot = pending.observer_data["robot"]
         robot.waiting = None
         if robot.obeys:
             robot.waits_until = self.now + replan_s
-        one.observer_data["done"]()
+        pending.observer_data["done"]()
 
     def _receive(self, robot: Robot, tick: int, at: float, phase: float) -> None:
         """The rows of an answer: those of ticks that are over are skipped."""

@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, get_args
 
@@ -520,9 +520,10 @@ class ChunkPlayer(Agent):
 
     def _record_timing(self, answer: Act) -> None:
         """Record how long an answer was on the way, and when the server needs the next request."""
-        timing = answer.info.get("timing") or {}
-        self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
-        self._inference_ms = timing.get("inference_ms", 0.0)
+        timing = answer.info.get("timing")
+        if isinstance(timing, Mapping):  # else it is not that of a `RemoteAgent`
+            self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
+            self._inference_ms = timing.get("inference_ms", 0.0)
         replan_ms = answer.info.get(REPLAN)
         self._replan_at = 0.0
         if isinstance(replan_ms, (int, float)) and 0 < replan_ms <= _LONGEST_REPLAN_MS:
@@ -609,8 +610,8 @@ class ChunkPlayer(Agent):
         step = None if control_held is not None else self._next()
         why = control_held or (STALE if self._is_old(self._captured(obs)) else self._reason)
         timing: dict[str, Any] = {}
-        is_robots = control_held is not None or why is STALE or self._begins_again
-        if step is not None or not is_robots:
+        is_not_expected = control_held is not None or why is STALE or self._begins_again
+        if step is not None or not is_not_expected:
             timing[IN_TIME] = step is not None
 
         if step is not None:

@@ -58,11 +58,11 @@ def fleet(gpus: int = 8, **values: Any) -> FleetFile:
 
 def shares_of_gpus(solved: FleetPlan) -> list[float]:
     """Return how much of each used GPU its replicas have."""
-    return [
-        sum(piece.parts * replicas for piece, replicas in layout.pieces) / solved.parts
-        for layout, count in solved.gpus
-        for _ in range(count)
-    ]
+    shares: list[float] = []
+    for layout, count in solved.gpus:
+        used_parts = sum(piece.parts * replicas for piece, replicas in layout.pieces)
+        shares += [used_parts / solved.parts] * count
+    return shares
 
 
 @pytest.mark.parametrize("name", FLEETS)

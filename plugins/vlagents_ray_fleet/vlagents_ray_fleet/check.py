@@ -6,7 +6,7 @@ import random
 from dataclasses import dataclass
 
 from vlagents_ray_fleet.plan import FleetPlan
-from vlagents_ray_fleet.simulation import USUAL, Behaviour, Tally, World
+from vlagents_ray_fleet.simulation import USUAL, Behaviour, Stream, Tally, World
 
 _WARM_UP_S = 5.0  # within which all robots start
 
@@ -55,25 +55,25 @@ def check(
         for _ in range(model.replicas):
             world.add_replica(demand.model, costs, model.batch_size)
         tallies = [Tally() for _ in demand.uses]
-        streams = [
-            [
-                world.add_stream(
-                    demand.model, use.need, use.transport_s, draw.uniform(0, _WARM_UP_S), tally
+        streams: list[list[Stream]] = []
+        for use, tally in zip(demand.uses, tallies, strict=True):
+            of_use = []
+            for _ in range(use.count):
+                begins_s = draw.uniform(0, _WARM_UP_S)
+                of_use.append(
+                    world.add_stream(demand.model, use.need, use.transport_s, begins_s, tally)
                 )
-                for _ in range(use.count)
-            ]
-            for use, tally in zip(demand.uses, tallies, strict=True)
-        ]
+            streams.append(of_use)
         world.run(_WARM_UP_S + seconds)
         world.finish()
 
         requests += sum(replica.requests for replica in world.replicas[demand.model])
-        for use, tally, own, predicted in zip(
+        for use, tally, group_streams, predicted in zip(
             demand.uses, tallies, streams, model.groups, strict=True
         ):
             in_time = sum(
                 stream.ticks > 0 and 1 - stream.starved / stream.ticks >= use.share
-                for stream in own
+                for stream in group_streams
             )
             groups.append(
                 GroupCheck(

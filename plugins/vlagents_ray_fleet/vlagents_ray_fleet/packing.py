@@ -86,21 +86,23 @@ def layouts(
             needed_gb = memory_gb[piece.model]
             most = min(free // piece.parts, int(free_gb / needed_gb + 1e-9))
             for count in range(1, most + 1):
-                rest = extend(index + 1, free - count * piece.parts, free_gb - count * needed_gb)
-                for others in rest:
+                contents_behind = extend(
+                    index + 1, free - count * piece.parts, free_gb - count * needed_gb
+                )
+                for others in contents_behind:
                     yield ((piece, count), *others)
 
-    found = []
+    layouts = []
     for content in extend(0, parts, gpu_memory_gb):
         if _has_room(content, by_model, parts, memory_gb, gpu_memory_gb):
             continue
-        found.append(Layout(content))
-        if len(found) > _MOST_LAYOUTS:
+        layouts.append(Layout(content))
+        if len(layouts) > _MOST_LAYOUTS:
             raise ConfigError(
                 f"gpus: expected at most {_MOST_LAYOUTS} ways to fill a GPU with these models; "
                 "raise finest_fraction, or set gpu_fraction of some models"
             )
-    return found
+    return layouts
 
 
 def _has_room(

@@ -75,12 +75,12 @@ class Demand:
         hands: list[dict[RobotNeed, int]] = [{} for _ in range(replicas)]
         first = 0
         for use in self.uses:
-            every, rest = divmod(use.count, replicas)
+            every, remainder = divmod(use.count, replicas)
             for index in range(replicas):
-                count = every + ((index - first) % replicas < rest)
+                count = every + ((index - first) % replicas < remainder)
                 if count:
                     hands[index][use.need] = hands[index].get(use.need, 0) + count
-            first = (first + rest) % replicas
+            first = (first + remainder) % replicas
         return hands
 
     def fullest(self, replicas: int, fraction: float) -> ReplicaLoad:
@@ -151,17 +151,7 @@ class FleetPlan:
         return {
             "models": [asdict(model) for model in self.models],
             "gpus": [
-                {
-                    "gpus": count,
-                    "replicas": [
-                        {
-                            "model": piece.model,
-                            "replicas": replicas,
-                            "gpu_fraction": round(piece.parts / self.parts, 4),
-                        }
-                        for piece, replicas in layout.pieces
-                    ],
-                }
+                {"gpus": count, "replicas": self._replicas_on(layout)}
                 for layout, count in self.gpus
             ],
             "gpus_used": self.gpus_used,
@@ -173,6 +163,17 @@ class FleetPlan:
             "complete": self.is_complete,
         }
 
+    def _replicas_on(self, layout: Layout) -> list[dict[str, Any]]:
+        """Return the replicas on a GPU with this layout as values of JSON."""
+        return [
+            {
+                "model": piece.model,
+                "replicas": replicas,
+                "gpu_fraction": round(piece.parts / self.parts, 4),
+            }
+            for piece, replicas in layout.pieces
+        ]
+
 
 def plan(fleet: FleetFile) -> FleetPlan:
     """Compute the plan of a fleet.
@@ -183,19 +184,19 @@ def plan(fleet: FleetFile) -> FleetPlan:
     Raises:
         ConfigError: A robot cannot be in time even alone on a GPU, or no robot can be served.
     """
-    wanted = {name: robots.count for name, robots in fleet.robots.items()}
+    robots_wanted = {name: robots.count for name, robots in fleet.robots.items()}
     curves = {name: model.costs.curve() for name, model in fleet.models.items()}
-    whole = _demands(fleet, wanted, curves)
+    whole = _demands(fleet, robots_wanted, curves)
     needed = _fewest(whole, fleet.gpus)
     if needed.gpus <= fleet.gpus.count:
-        return _with_slack(whole, fleet.gpus, needed, needed.gpus, wanted, wanted)
+        return _with_slack(whole, fleet.gpus, needed, needed.gpus, robots_wanted, robots_wanted)
 
-    total = sum(wanted.values())
+    total = sum(robots_wanted.values())
     most, too_many = 0, total
     best: tuple[list[Demand], Packing, dict[str, int]] | None = None
     while too_many - most > 1:
         robots = (most + too_many) // 2
-        counts = _in_proportion(wanted, robots)
+        counts = _in_proportion(robots_wanted, robots)
         demands = _demands(fleet, counts, curves)
         packing = _fewest(demands, fleet.gpus)
         if packing.gpus <= fleet.gpus.count:
@@ -209,7 +210,7 @@ def plan(fleet: FleetFile) -> FleetPlan:
             f"{fleet.gpus.count}, which serve none of them in time"
         )
     demands, packing, counts = best
-    return _with_slack(demands, fleet.gpus, packing, needed.gpus, counts, wanted)
+    return _with_slack(demands, fleet.gpus, packing, needed.gpus, counts, robots_wanted)
 
 
 def _demands(
@@ -243,10 +244,10 @@ def _demands(
     return demands
 
 
-def _in_proportion(wanted: Mapping[str, int], robots: int) -> dict[str, int]:
+def _in_proportion(robots_wanted: Mapping[str, int], robots: int) -> dict[str, int]:
     """Return `robots` robots in about the proportions of the wanted ones."""
-    total = sum(wanted.values())
-    exact = {group: count * robots / total for group, count in wanted.items()}
+    total = sum(robots_wanted.values())
+    exact = {group: count * robots / total for group, count in robots_wanted.items()}
     counts = {group: math.floor(value) for group, value in exact.items()}
     by_rest = sorted(exact, key=lambda group: counts[group] - exact[group])
     for group in by_rest[: robots - sum(counts.values())]:
@@ -335,7 +336,9 @@ def _too_slow(demand: Demand) -> str:
 def _fewest(demands: Sequence[Demand], pool: GpuPool) -> Packing:
     """Return the packing of these robots on the fewest GPUs, however many are at hand."""
     parts = _parts(pool, demands)
-    choices = [choice for demand in demands for choice in _choices(demand, pool, parts)]
+    choices: list[Choice] = []
+    for demand in demands:
+        choices += _choices(demand, pool, parts)
     return fewest_gpus(choices, _layouts(choices, demands, pool, parts))
 
 
@@ -353,7 +356,7 @@ def _with_slack(
     fewest: Packing,
     gpus_needed: int,
     counts: Mapping[str, int],
-    wanted: Mapping[str, int],
+    robots_wanted: Mapping[str, int],
 ) -> FleetPlan:
     """Return the plan on as many GPUs as the packing has, with the least load."""
     parts = _parts(pool, demands)
@@ -379,7 +382,7 @@ def _with_slack(
         gpus_at_hand=pool.count,
         gpus_needed=gpus_needed,
         robots=counts,
-        robots_wanted=wanted,
+        robots_wanted=robots_wanted,
         demands=tuple(demands),
     )
 

@@ -85,10 +85,12 @@ def test_a_wrong_slack_is_refused(engine: Engine, wrong: Any) -> None:
 
 def test_an_answer_is_needed_when_the_slack_is_over_or_the_deadline(engine: Engine) -> None:
     reset(engine, "a")
-    one = checked(engine, "a", Request("act", Obs(info={SLACK: 250})), ignore)
-    assert one.needed == pytest.approx(one.arrived + 0.25)
-    one = checked(engine, "a", Request("act", Obs(info={SLACK: 250}), deadline_ms=100.0), ignore)
-    assert one.needed == one.deadline
+    pending = checked(engine, "a", Request("act", Obs(info={SLACK: 250})), ignore)
+    assert pending.needed == pytest.approx(pending.arrived + 0.25)
+    pending = checked(
+        engine, "a", Request("act", Obs(info={SLACK: 250}), deadline_ms=100.0), ignore
+    )
+    assert pending.needed == pending.deadline
 
 
 def test_a_lone_robot_replans_as_often_as_it_wants(engine: Engine) -> None:
