@@ -56,10 +56,9 @@ _CLIENTS = {  # by the names of `benchmarks.peers`
     VLAGENTS: "vlagents JPEG",
 }
 SERVED = 0.98  # share in time of a robot that counts as served
-_WARM_S = 3.0
 _AHEAD_S = 0.5
 _LATE_S = 90.0
-_ROBOTS_A_PROCESS = 8
+_ROBOTS_A_PROCESS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +81,7 @@ class FleetPlan:
     base_ms: float = 29.3
     row_ms: float = 8.06
     batch: int = 16
+    warm: float = 10.0  # s before each measurement: all robots start at once
     seconds: float = 20.0  # of each measurement
     transport: str = "websocket"
     real_time_chunking: bool = False
@@ -220,20 +220,18 @@ def _point(plan: FleetPlan, system: str, robots: int, urls: Sequence[str]) -> di
         for process in processes:
             process.read(CONNECT_S)
 
-        def run(seconds: float) -> list[dict[str, Any]]:
-            begin = time.monotonic() + _AHEAD_S
-            for process in processes:
-                process.send(json.dumps({"begin": begin, "end": begin + seconds}))
-            figures: list[dict[str, Any]] = []
-            for process in processes:
-                figures += process.read(seconds + _LATE_S)
-            return figures
-
-        run(_WARM_S)
         client_pids = [process.pid for process in processes]
         server_pids = server_processes(os.getpid(), client_pids)
+        begin = time.monotonic() + _AHEAD_S
+        counted = begin + plan.warm
+        times = {"begin": begin, "counted": counted, "end": counted + plan.seconds}
+        for process in processes:
+            process.send(json.dumps(times))
+        time.sleep(max(0.0, counted - time.monotonic()))
         clients_before, server_before = _cpu_s(client_pids), _cpu_s(server_pids)
-        figures = run(plan.seconds)
+        figures: list[dict[str, Any]] = []
+        for process in processes:
+            figures += process.read(plan.seconds + _LATE_S)
         clients_s = _cpu_s(client_pids) - clients_before
         server_s = _cpu_s(server_pids) - server_before
 
@@ -354,6 +352,9 @@ def main(
         str, typer.Option(help=f"One of {', '.join(CURVES)}, or BASE:ROW in ms.")
     ] = "pi0",
     batch: Annotated[int, typer.Option(min=1, help="Largest batch.")] = 16,
+    warm: Annotated[
+        float, typer.Option(min=0, help="Seconds before each: all robots start at once.")
+    ] = 10.0,
     seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     rtc: Annotated[bool, typer.Option("--rtc", help="Send the rest of the plan.")] = False,
@@ -382,6 +383,7 @@ def main(
             base_ms=base_ms,
             row_ms=row_ms,
             batch=batch,
+            warm=warm,
             seconds=seconds,
             transport=transport,
             real_time_chunking=rtc,

@@ -1,10 +1,10 @@
 """Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
 JSON`.
 
-The process connects its robots, and writes "ready". Each line that it then reads has a begin and an
-end, {"begin": s, "end": s} of `time.monotonic`; at the end it writes what happened at each robot's
-ticks. A robot whose policy is late holds still at that tick, and goes on at the next one: the load
-does not slow down with the server.
+The process connects its robots, and writes "ready". Each line that it then reads is a run,
+{"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes what happened at each
+robot's ticks from `counted` on. A robot whose policy is late holds still at that tick, and goes on
+at the next one: the load does not slow down with the server.
 """
 
 from __future__ import annotations
@@ -155,8 +155,15 @@ class RunningRobot:
         self._obs = observation()
         self._player.initialize()
 
-    def run(self, begin: float, end: float) -> dict[str, Any]:
-        """Run from a random moment within a period of `begin` until `end`; returns the figures."""
+    def run(self, begin: float, counted: float, end: float) -> dict[str, Any]:
+        """Run from a random moment within a period of `begin` until `end`; returns the figures.
+
+        Args:
+            begin: The begin of the episode, s of `time.monotonic`, as all times.
+            counted: From when on ticks are counted: a fleet that starts at once has other figures
+                than one that runs.
+            end: The end of the run.
+        """
         robot = self._robot
         slo = {"hz": robot.hz, "age_ms": robot.age_ms, "share": robot.share}
         known = {key: value for key, value in slo.items() if value is not None}
@@ -171,9 +178,14 @@ class RunningRobot:
             return {"ticks": 1, "starved": 1, "ages": [], "late": [], "failed": str(error)}
 
         pacer = Pacer(robot.hz)
-        while time.monotonic() < end:
+        missed_before = 0
+        while (now := time.monotonic()) < end:
             tick = pacer.wait()
             act = self._player.act(replace(self._obs, info={}))
+            if now < counted:
+                missed_before = pacer.missed
+                continue
+
             ticks += 1
             if SAFE not in act.info:
                 ages.append(act.info[AGE_MS])
@@ -183,10 +195,11 @@ class RunningRobot:
             cause: Cause = act.info[CAUSE]
             if cause not in ("waiting", "late"):
                 failed = act.info[SAFE]
+        missed = pacer.missed - missed_before
         return {
-            "ticks": ticks + pacer.missed,
-            "starved": starved + pacer.missed,
-            "missed": pacer.missed,
+            "ticks": ticks + missed,
+            "starved": starved + missed,
+            "missed": missed,
             "ages": ages if len(ages) <= _AGES else random.sample(ages, _AGES),
             "late": late,
             "failed": failed,

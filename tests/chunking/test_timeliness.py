@@ -168,7 +168,8 @@ def test_a_request_reports_the_ticks_since_the_last_one_and_the_slack() -> None:
     driver = Driver(4)
     for _ in range(2):
         driver.tick()
-    assert driver.request(0).keys().isdisjoint({SLACK, TICKS})  # `reset` waits for it
+    of_the_reset = driver.request(0)
+    assert (of_the_reset[SLACK], of_the_reset[TICKS]) == (0.0, [0, 0])
     first = driver.request(1)
     assert first[TICKS] == [1, 0]  # asked at the second tick, after the first
     assert first[EXECUTED_AGE] >= 0
@@ -215,6 +216,19 @@ def test_a_player_asks_no_sooner_than_the_server_wants_but_never_starves_for_it(
     assert driver.player._plan.known == 3
     assert driver.player.timeliness.starved == 0
     driver.close()
+
+
+def test_the_answer_at_the_reset_sets_the_pace_too() -> None:
+    """Otherwise a fleet that begins at once asks twice at once."""
+    agent = Answers(10)
+    agent.answer_info = {REPLAN: 1e6, "timing": {"inference_ms": 0.0, "wire_ms": 0.0}}
+    agent.let = 10**9
+    player = ChunkPlayer(agent, PlayerSettings(mode="async"))
+    player.reset(Obs(), "stack")
+    for _ in range(5):
+        assert SAFE not in player.act(Obs()).info
+    assert len(agent.infos) == 1
+    player.close()
 
 
 @pytest.mark.parametrize("replan_ms", ["soon", None, float("nan"), float("inf"), -1.0, 10**400])

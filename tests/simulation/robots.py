@@ -58,6 +58,8 @@ class Robot:
     captured: float = 0.0  # tick of the observation of its rows, s
     ticks: int = 0
     starved: int = 0
+    held: int = 0  # ticks without a row, at which the plan waits with the robot
+    last_starved: float = 0.0  # time of the last of them, s
     ages: list[float] = field(default_factory=list)
     waiting: PendingRequest | None = None
     waits_until: float = 0.0  # time before which a request is of no use, s
@@ -91,7 +93,9 @@ class World:
         slack: bool = True,
         deadlines: float = 0.0,
         jitter: float = 0.02,
+        begin_s: float | None = None,
     ) -> None:
+        self.begin_s = begin_s  # time within which robots begin; None: one round of their chunks
         self.draw = random.Random(seed)
         self.costs, self.slack = costs, slack
         self.deadlines, self.jitter = deadlines, jitter
@@ -126,8 +130,8 @@ class World:
     def run(self, seconds: float) -> World:
         """Play so long."""
         for robot in self.robots:
-            # Robots begin one after the other.
-            phase = self.draw.random() * max(1.0, robot.rows / robot.hz)
+            round_s = max(1.0, robot.rows / robot.hz)
+            phase = self.draw.random() * (round_s if self.begin_s is None else self.begin_s)
             self.at(phase, lambda robot=robot, phase=phase: self._tick(robot, phase, 0))
         for simulation in self.simulations:
             self.at(self.draw.random() * 0.1, lambda one=simulation: self._simulate(one))
@@ -144,9 +148,14 @@ class World:
                 robot.ages.append(self.now - robot.captured)
             if self.now >= self.measured_from:
                 robot.ticks += 1
-        elif robot.planned >= 0 and self.now >= self.measured_from:
-            robot.ticks += 1
-            robot.starved += 1
+        elif robot.planned < 0:
+            robot.held += 1
+        else:
+            robot.held += 1
+            robot.last_starved = self.now
+            if self.now >= self.measured_from:
+                robot.ticks += 1
+                robot.starved += 1
         self.at(at + period, lambda: self._tick(robot, phase, tick + 1))
 
         slack_s = max(0.0, phase + (robot.planned + 1) * period - at) if robot.planned >= 0 else 0.0
@@ -155,7 +164,8 @@ class World:
         starves = slack_s < robot.round_trip_s + period
         if robot.waiting is not None or (self.now < robot.waits_until and not starves):
             return
-        self._ask(robot, slack_s, at, lambda: self._receive(robot, tick, at, phase))
+        held = robot.held
+        self._ask(robot, slack_s, at, lambda: self._receive(robot, tick - held, at))
 
     def _ask(self, robot: Robot, slack_s: float, at: float, done: Callable[[], None]) -> None:
         arrived = self.now + WIRE_S
@@ -257,7 +267,7 @@ class World:
             robot.plan.observe(robot.rows, pending.arrived, pending.needed)
             replan_s = 0.0
             if pending.needed and robot.plan.need is not None:
-                replan_s = self.pace.replan_s(robot.plan.need, pending.arrived)
+                replan_s = self.pace.replan_s(robot.plan.need, pending.arrived, pending.needed)
             arrives = self.now + WIRE_S
             # Without the wait in the queue, which is long only for those who have the time.
             robot.round_trip_s = 2 * WIRE_S + took
@@ -273,8 +283,11 @@ class World:
             robot.waits_until = self.now + replan_s
         pending.observer_data["done"]()
 
-    def _receive(self, robot: Robot, tick: int, at: float, phase: float) -> None:
-        """The rows of an answer: those of ticks that are over are skipped."""
+    def _receive(self, robot: Robot, executed: int, at: float) -> None:
+        """The rows of an answer: those of actions that were executed since its observation are
+        skipped.
+        """
+        tick = executed + robot.held
         if robot.rows == 1:
             tick += 1
             robot.ages.append(self.now - at)
@@ -341,6 +354,33 @@ def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float]) -> int:
         middle = (low + high) // 2
         low, high = (middle, high) if fits(middle) else (low, middle)
     return low
+
+
+def start_at_once(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) -> World:
+    """A fleet whose robots all begin within 0.1 s, for a minute."""
+    robots = fleet(number, *kinds)
+    return World(costs, robots, seed=number, slack=slack, begin_s=0.1).run(60.0)
+
+
+def print_starts() -> None:
+    """Print what robots miss that all begin at once."""
+    print("robots  rows     slack  starved s a robot (mean, most)  s until none is starved")
+    for kinds, numbers in (
+        (((50, 10.0),), (64, 128, 192, 256, 320, 400)),
+        (((8, 10.0),), (16, 32, 40)),
+        (((50, 10.0), (8, 10.0)), (48, 64, 80, 96)),
+    ):
+        rows = ",".join(str(rows) for rows, _ in kinds)
+        for number, slack in itertools.product(numbers, (False, True)):
+            robots = start_at_once(PI0, number, slack, *kinds).robots
+            starved_s = [robot.starved / robot.hz for robot in robots]
+            last_s = max(robot.last_starved for robot in robots)
+            in_time = sum(robot.starved <= 0.02 * robot.ticks for robot in robots)
+            print(
+                f"{number:6}  {rows:8} {slack!s:6} {sum(starved_s) / number:6.2f} "
+                f"{max(starved_s):6.2f}  {last_s:6.1f}  {in_time} with 98 % of a minute",
+                flush=True,
+            )
 
 
 def print_fleets() -> None:
@@ -414,6 +454,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=0, help="number of worlds to play")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--fleets", action="store_true", help="print the largest fleets in time")
+    parser.add_argument("--starts", action="store_true", help="print starts of all robots at once")
     options = parser.parse_args()
 
     began = time.monotonic()
@@ -423,6 +464,8 @@ def main() -> None:
         if seed % 1000 == 999:
             print(f"{seed + 1} seeds, {time.monotonic() - began:.0f} s", flush=True)
     print(f"{options.seeds} seeds, {answered} answers")
+    if options.starts:
+        print_starts()
     if options.fleets:
         print_fleets()
 

@@ -8,7 +8,17 @@ from __future__ import annotations
 
 import pytest
 
-from tests.simulation.robots import GRAPHS, PI0, SMALL, Robot, World, fleet, play, play_drawn
+from tests.simulation.robots import (
+    GRAPHS,
+    PI0,
+    SMALL,
+    Robot,
+    World,
+    fleet,
+    play,
+    play_drawn,
+    start_at_once,
+)
 from vlagents_ray.serve.fleet import CostCurve
 
 
@@ -41,6 +51,26 @@ def test_slack_serves_a_third_more_robots_with_chunks_of_50(
     """Each number is more than 1.3 times the largest fleet without the use of slack."""
     assert play(PI0, robots, True, *kinds).share() >= 0.98
     assert play(PI0, round(robots / 1.3), False, *kinds).share() < 0.98
+
+
+@pytest.mark.parametrize(
+    ("costs", "kinds", "robots"),
+    [
+        (PI0, [(50, 10.0)], 400),
+        (PI0, [(8, 10.0)], 40),
+        (PI0, [(50, 10.0), (8, 10.0)], 72),
+        (PI0, [(50, 10.0), (1, 5.0)], 26),
+        (GRAPHS, [(50, 10.0)], 290),
+        (GRAPHS, [(8, 10.0)], 28),
+        (SMALL, [(50, 10.0)], 400),
+    ],
+)
+def test_robots_that_begin_at_once_do_not_ask_at_once_for_ever(
+    costs: CostCurve, kinds: list[tuple[int, float]], robots: int
+) -> None:
+    """The sizes are about nine tenths of the largest fleets."""
+    for robot in start_at_once(costs, robots, True, *kinds).robots:
+        assert robot.starved <= 0.02 * robot.ticks, robot.name
 
 
 @pytest.mark.parametrize("kinds", [[(50, 10.0)], [(8, 10.0)], [(50, 10.0), (8, 10.0)]])

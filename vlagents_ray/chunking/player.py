@@ -323,10 +323,12 @@ class ChunkPlayer(Agent):
         self._choose_safe()
 
         if self.settings.deadline_s is not None:
-            self._record_request(0, obs)
-            self._take(self._agent.act(obs))
             if self._caller is None:
                 self._caller = AsyncCaller(self._agent)
+            self._record_request(0, obs)
+            answer = self._agent.act(stamped(obs, self._request_info()))
+            self._take(answer)
+            self._record_timing(answer)
         self._tick = 0
         return info
 
