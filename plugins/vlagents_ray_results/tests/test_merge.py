@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import base64
 import functools
+import itertools
 import json
 import os
 import sqlite3
@@ -20,7 +21,7 @@ from in_process_evaluation import play
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.storage import require_below
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.replay import find
@@ -166,6 +167,77 @@ def test_a_policy_with_another_checkpoint_or_other_weights_is_named(
             store.note_policy("policy", {"policy": "act", **said(folder.name)})
     with pytest.raises(ConfigError, match=told):
         merge(tmp_path / "out", folders)
+
+
+# A statement of a value, by what it is about: of the policy's server (metadata), or of the env.
+STATEMENTS: dict[str, Callable[[str], dict[str, object] | EnvInfo]] = {
+    "program": lambda value: {"program": {"policy.py": value}},
+    "settings": lambda value: {"config": {"gain": value}},
+    "wrappers": lambda value: {"wrappers": [value]},
+    "weights": lambda value: {"weights": {"digest": value, "revision": None}},
+    "description": lambda value: EnvInfo({"simulator": value}, {}),
+    "contract": lambda value: EnvInfo({}, {"task": value}),
+}
+
+
+def stated(store: Store, subject: str, value: str) -> None:
+    """Record a statement; nothing is known of the subject if the value is empty."""
+    statement = STATEMENTS[subject](value)
+    of_the_env = isinstance(statement, EnvInfo)
+    metadata = {"policy": "act", "checkpoint": "a"}
+    if not of_the_env and value:
+        metadata |= statement
+    store.note_policy("policy", metadata)
+    env = statement if of_the_env and value else EnvInfo({}, {})
+    store.note_env(store.cases[0].place, env)
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
+@pytest.mark.parametrize("subject", STATEMENTS)
+def test_a_part_of_which_nothing_is_known_hides_no_difference_of_the_others(
+    tmp_path: Path, config: Config, subject: str, order: tuple[str, ...]
+) -> None:
+    folders = []
+    for number, value in enumerate(order):
+        folders.append(tmp_path / f"part{number}")
+        with Store(resolve(config(out=folders[-1], seed=100 * number))) as store:
+            store.begin_run({})
+            stated(store, subject, value)
+    with pytest.raises(ConfigError, match=r"was .*[xy].*, is .*[xy]"):
+        merge(tmp_path / "out", folders)
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
+@pytest.mark.parametrize("subject", STATEMENTS)
+def test_a_run_of_which_nothing_is_known_hides_no_difference_of_the_others(
+    tmp_path: Path, config: Config, subject: str, order: tuple[str, ...]
+) -> None:
+
+    def resume_twice() -> None:
+        for number, value in enumerate(order):
+            with Store(resolve(config(resume=number > 0))) as store:
+                store.begin_run({})
+                stated(store, subject, value)
+                store.end_run("complete")
+
+    with pytest.raises(ConfigError, match=r"was .*[xy].*, is .*[xy]"):
+        resume_twice()
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(["", "x", "y"])))
+@pytest.mark.parametrize("subject", ["program", "settings", "wrappers", "weights"])
+def test_a_report_keeps_a_policy_apart_also_after_a_folder_of_which_nothing_is_known(
+    tmp_path: Path, config: Config, subject: str, order: tuple[str, ...]
+) -> None:
+    folders = []
+    for env, value in zip((LINE, OTHER_LINE, "tabletop/lift"), order, strict=True):
+        out = tmp_path / f"part{len(folders)}"
+        with Store(resolve(config(out=out, envs=[env]))) as store:
+            store.begin_run({})
+            stated(store, subject, value)
+        folders.append(Results.load(out))
+    names = [case.policy for case in combined(folders).cases]
+    assert names == ["policy (part0)", "policy (part1)", "policy (part2)"]
 
 
 def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(

@@ -24,6 +24,7 @@ from vlagents_ray.evaluate.results.changes import (
     listed,
     policy_changes,
     program_changes,
+    with_known,
 )
 from vlagents_ray.evaluate.results.combination import require_distinct
 from vlagents_ray.evaluate.results.database import FILE, create, insert
@@ -148,6 +149,7 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
                 f"of the folders before it {before.get(difference)!r}; give one of them another "
                 "name in its evaluation"
             )
+        known["metadata"] = json.dumps(with_known(before, now))
     return changes
 
 
@@ -187,8 +189,12 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
 
-        for name in ("described", "contract", "code", "program"):
-            known[name] = known[name] or row[name]
+        # An empty description or contract says nothing, so that a later one is compared with the
+        # first that does. An empty program is that of an installed environment.
+        for name in ("described", "contract", "code"):
+            if known[name] in (None, "{}"):
+                known[name] = row[name]
+        known["program"] = known["program"] or row["program"]
         _extend(known, row, folder)
     return list(changes)
 

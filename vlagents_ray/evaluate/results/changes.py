@@ -138,6 +138,22 @@ def _settings_changes(subject: str, was: Mapping[str, Any], now: Mapping[str, An
     return changes
 
 
+def with_known(now: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return metadata of a policy, with the program, settings and weights that only another server
+    of the policy reports.
+
+    A third server is then compared with everything that is known. Otherwise a server that reports
+    nothing, between two that differ, would hide their difference.
+    """
+    known = dict(now)
+    for name in ("program", "config", "wrappers"):
+        if known.get(name) is None and other.get(name) is not None:
+            known[name] = other[name]
+    if not (known.get("weights") or {}).get("digest") and other.get("weights"):
+        known["weights"] = other["weights"]
+    return known
+
+
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
     """Return the digests of a policy's files by name; None if its server reports none. In a sweep,
     the files of its checkpoint are left out.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.results.changes import changed
+from vlagents_ray.evaluate.results.changes import changed, with_known
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, Worker
 from vlagents_ray.evaluate.results.summary import reported
 
@@ -127,10 +127,12 @@ def _clashing_policies(folders: Sequence[Results]) -> set[str]:
             clashing.add(case.policy)
 
     swept = {case.policy for case in all_cases if case.step is not None}
-    first_metadata: dict[str, dict[str, Any]] = {}  # by policy, from the first folder that has it
+    # By policy, from the first folder that has it, with what only later ones report.
+    first_metadata: dict[str, dict[str, Any]] = {}
     for results in folders:
         for name, metadata in results.policies.items():
             first = first_metadata.setdefault(name, metadata)
             if changed(first, metadata, swept=name in swept) is not None:
                 clashing.add(name)
+            first_metadata[name] = with_known(first, metadata)
     return clashing

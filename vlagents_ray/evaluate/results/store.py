@@ -35,6 +35,7 @@ from vlagents_ray.evaluate.results.changes import (
     policy_program,
     program_changes,
     program_id,
+    with_known,
 )
 from vlagents_ray.evaluate.results.database import (
     FILE,
@@ -299,12 +300,15 @@ class Store(AbstractContextManager["Store"]):
             self._compared_envs.add(place)
             self._require_same_env(cases, env_info)
 
-        described = json.dumps(env_info.described, default=str)
+        # An empty description or contract says nothing, so that an earlier one stays known.
+        described = json.dumps(env_info.described, default=str) if env_info.described else None
+        contract = canonical(env_info.contract) if env_info.contract else None
         code = {} if env_info.code is None else env_info.code.to_json()
-        values = (described, canonical(env_info.contract), canonical(code))
+        values = (described, contract, canonical(code))
         with self._db:
             self._db.executemany(
-                "UPDATE cases SET described = ?, contract = ?, code = ? WHERE case_id = ?",
+                "UPDATE cases SET described = coalesce(?, described, '{}'), "
+                "contract = coalesce(?, contract, '{}'), code = ? WHERE case_id = ?",
                 [(*values, case.fingerprint) for case in cases],
             )
 
@@ -353,8 +357,9 @@ class Store(AbstractContextManager["Store"]):
             )
 
         self._policy_programs[name] = program_id(policy_program(metadata, swept=swept))
+        recorded = metadata if earlier is None else with_known(metadata, earlier)
         with self._db:
-            value = json.dumps(metadata, default=str)
+            value = json.dumps(recorded, default=str)
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self) -> sqlite3.Connection:
