@@ -40,6 +40,7 @@ from vlagents_ray_learn.weights_endpoint import PART, PATH
 logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the request of the versions
+_PART_S = 60.0  # time limit for sending a part, 1 MiB
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
 _DISTRIBUTION = "vlagents-ray-learn"
 # Unacknowledged parts, 1 MiB each, over the network. With one, each part would take a round trip.
@@ -338,7 +339,7 @@ class ServerTarget:
                 # If the connection is closed, the server has rejected the push, and its answer has
                 # the reason.
                 with suppress(ConnectionClosed, OSError):
-                    socket.send(message, _ANSWER_S)
+                    socket.send(message, _PART_S)
                 unanswered += 1
                 if unanswered >= window:
                     answer = self._receive_answer(socket)

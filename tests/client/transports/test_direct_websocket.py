@@ -1,5 +1,5 @@
 """A connection that its server ends politely, as RFC 6455 has it: a last message, and then the
-line.
+line; and one whose server does not read.
 """
 
 from __future__ import annotations
@@ -8,17 +8,20 @@ import contextlib
 import logging
 import os
 import queue
-import socket
+import ssl
 import threading
+import time
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from certificates import authority
+from deaf_server import deaf_server
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, ConnectionClosedOK
 from websockets.http11 import Request, Response
-from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.client.credentials import Credentials
@@ -142,30 +145,46 @@ def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> No
     assert not [line for line in client if "the-secret-key" in line]
 
 
-def test_a_proxy_that_takes_nothing_does_not_hold_up_the_sender() -> None:
-    def shake_hands() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            protocol = ServerProtocol()
-            protocol.receive_data(connection.recv(65536))
-            [request] = protocol.events_received()
-            assert isinstance(request, Request)
-            protocol.send_response(protocol.accept(request))
-            connection.sendall(b"".join(protocol.data_to_send()))
-            given_up.wait(30)
+@pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
+@pytest.mark.parametrize("has_tls", [False, True], ids=["plain", "tls"])
+def test_a_proxy_that_hardly_reads_does_not_hold_up_the_sender(
+    has_tls: bool, read_bytes: int, tmp_path: Path
+) -> None:
+    """The kernel's own limit would begin again at each read, and has no effect on TLS."""
+    context, credentials = None, Credentials("")
+    if has_tls:
+        own = authority(tmp_path, "lab")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(*own.sign("server"))
+        credentials = Credentials("", own.file)
 
-    given_up = threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=shake_hands)
-        thread.start()
-        proxied = ProxiedSocket(f"ws://127.0.0.1:{listener.getsockname()[1]}/", Credentials(""), 5)
-        with pytest.raises((ConnectionClosed, OSError)):
-            proxied.send(bytes(32 * 1024 * 1024), 0.2)
-        in_time = not given_up.is_set() and thread.is_alive()
-        given_up.set()
-        thread.join()
+    with deaf_server(read_bytes, context=context) as port:
+        proxied = ProxiedSocket(f"{'wss' if has_tls else 'ws'}://127.0.0.1:{port}/", credentials, 5)
+        begun = time.monotonic()
+        with pytest.raises(ConnectionAbortedError, match=r"took no message within 0\.5 s"):
+            proxied.send(bytes(32 * 1024 * 1024), 0.5)
         proxied.close()
-    assert in_time  # not because the other side ended
+        assert time.monotonic() - begun < 5  # without a limit, at least 400 s
+
+
+@pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
+def test_a_connection_that_cannot_send_is_closed_in_time(read_bytes: int) -> None:
+    """Its closing frame waits behind a message that another thread sends."""
+    with deaf_server(read_bytes) as port:
+        proxied = ProxiedSocket(f"ws://127.0.0.1:{port}/", Credentials(""), 5)
+
+        def send() -> None:
+            with contextlib.suppress(ConnectionClosed, OSError):
+                proxied.send(bytes(32 * 1024 * 1024), 60)
+
+        sending = threading.Thread(target=send)
+        sending.start()
+        time.sleep(0.2)
+        begun = time.monotonic()
+        proxied.close()
+        sending.join(10)
+        assert not sending.is_alive()
+        assert time.monotonic() - begun < 5
 
 
 @pytest.mark.parametrize(("statuses", "accepted"), [([408, 404, 503], True), ([400], False)])

@@ -32,6 +32,7 @@ from vlagents_ray.client.credentials import (
     require_plain,
     tls_failure,
 )
+from vlagents_ray.client.limited_websocket import LimitedWebSocket
 from vlagents_ray.client.transports.base import (
     DIRECT_S,
     FAST_S,
@@ -71,6 +72,7 @@ logger = logging.getLogger(__name__)
 # restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
+_CLOSE_S = 1.0  # maximum time of a closing handshake
 _PING_SENT_S = 1.0  # s for the rest of a ping of which the kernel has taken a part
 _READ_BYTES = 256 * 1024
 # The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
@@ -88,11 +90,11 @@ class ProxiedSocket:
         """Connect; raises the errors of `websockets`."""
         # In websockets 17.1, `connect` must be used as a context manager.
         self._open = contextlib.ExitStack()
-        self._connection = self._open.enter_context(
+        connection = self._open.enter_context(
             connect(
                 url,
                 open_timeout=timeout_s,
-                close_timeout=1,
+                close_timeout=_CLOSE_S,
                 compression=None,
                 max_size=DEFAULT_LIMITS.body_bytes,
                 ssl=credentials.context(url),
@@ -100,15 +102,11 @@ class ProxiedSocket:
                 logger=WEBSOCKET_LOG,
             )
         )
-        self.close = self._open.close
+        self._websocket = LimitedWebSocket(connection)
 
     def send(self, message: bytes, timeout_s: float) -> None:
-        """Send a message within a time limit."""
-        # The kernel enforces the limit, since websockets sends without one: a hung proxy would
-        # block a robot for minutes.
-        limit = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
-        self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-        self._connection.send(message)
+        """Send a message within a time limit, after which the connection ends."""
+        self._websocket.send(message, timeout_s)
 
     def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None:
         """Send a message, given as consecutive pieces, within a time limit."""
@@ -116,7 +114,12 @@ class ProxiedSocket:
 
     def recv(self, timeout_s: float) -> bytes:
         """Return the next message as bytes, even if it is text."""
-        return self._connection.recv(timeout=timeout_s, decode=False)
+        return self._websocket.connection.recv(timeout=timeout_s, decode=False)
+
+    def close(self) -> None:
+        """Close the connection, within the time limit of the closing handshake."""
+        self._websocket.close(2 * _CLOSE_S)
+        self._open.close()
 
 
 def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:

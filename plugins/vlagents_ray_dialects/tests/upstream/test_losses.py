@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deaf_server import deaf_server
 from eval_fakes import wait_for
 from in_process_evaluation import play
 from in_process_replicas import Replicas
@@ -17,12 +19,15 @@ from upstream_servers import CLOSED, SLOW, answer, upstream
 from websockets.exceptions import ConnectionClosedError
 
 from vlagents_ray.abilities import ChecksHealth, ability
-from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
+from vlagents_ray.errors import ConnectionLost, NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray_dialects.messages import openpi, vla_eval
 from vlagents_ray_dialects.upstream import Upstream, websocket
+from vlagents_ray_dialects.upstream.client import ClientOptions
+from vlagents_ray_dialects.upstream.policy import PROTOCOLS
 
 PLAIN = {"state": {"position": "observation/state"}, "instruction": "prompt"}
 CAMERA = {"front": "observation/image"}
@@ -250,3 +255,38 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
     assert len(servers) == 3
     [case] = results.cases
     assert [(one.result.status, one.attempts) for one in case.episodes] == [("done", 1)] * 20
+
+
+LARGE = np.zeros((2304, 3000, 3), np.uint8)
+# What a server of each protocol sends first, and the observation that it does not take; None for a
+# protocol without WebSockets.
+DEAF: dict[str, tuple[bytes | None, dict[str, Any]]] = {
+    "openpi": (openpi.encode({}), {"observation/image": LARGE, "prompt": "x"}),
+    "openpi-batch": (openpi.encode({}), {"observation/image": LARGE, "prompt": "x"}),
+    "roboarena": (openpi.encode({}), {"observation/image": LARGE, "prompt": "x"}),
+    "vla_eval": (
+        vla_eval.encode(
+            vla_eval.VlaEvalMessage("hello", {"protocol_version": vla_eval.PROTOCOL_VERSION}, 1)
+        ),
+        {"images": {"front": LARGE}, "task_description": "x"},
+    ),
+    "openvla": (None, {"image": LARGE, "instruction": "x"}),
+}
+
+
+@pytest.mark.parametrize("read_bytes", [0, 4096], ids=["takes nothing", "takes little"])
+@pytest.mark.parametrize("protocol", DEAF)
+def test_an_upstream_that_hardly_reads_keeps_no_act_beyond_its_time(
+    protocol: str, read_bytes: int
+) -> None:
+    """It hangs with its sockets open; a policy's thread waits for it, and with it all robots."""
+    greeting, observation = DEAF[protocol]
+    with deaf_server(read_bytes, greeting=greeting) as port:
+        url = f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}"
+        client = PROTOCOLS[protocol](ClientOptions(url, timeout_s=0.5))
+        client.connect(5.0)
+        begun = time.monotonic()
+        with pytest.raises(ConnectionLost):
+            client.ask([observation])
+        client.close()
+        assert time.monotonic() - begun < 5  # without a limit, at least 250 s

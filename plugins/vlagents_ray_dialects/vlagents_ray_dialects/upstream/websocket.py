@@ -16,8 +16,9 @@ from typing import Any, ClassVar
 import numpy as np
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.protocol import State
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
+from vlagents_ray.client.limited_websocket import LimitedWebSocket
 from vlagents_ray.errors import PolicyUnavailable, Unauthorized, VLAgentsError, shown
 from vlagents_ray_dialects.messages import openpi, vla_eval
 from vlagents_ray_dialects.messages.outgoing import Outgoing
@@ -51,12 +52,13 @@ class WebSocketClient(UpstreamClient):
         self._headers: dict[str, str] = {}
         if options.key is not None:
             self._headers["Authorization"] = f"{self.key_scheme} {options.key}"
-        self._connection: ClientConnection | None = None
+        self._websocket: LimitedWebSocket | None = None
         self._open = contextlib.ExitStack()
 
     @property
     def is_open(self) -> bool:
-        return self._connection is not None and self._connection.protocol.state is State.OPEN
+        websocket = self._websocket
+        return websocket is not None and websocket.connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
         """Connect.
@@ -77,7 +79,7 @@ class WebSocketClient(UpstreamClient):
                 logger=_LOG,
                 **_NO_PINGS,
             )
-            self._connection = self._open.enter_context(opening)
+            self._websocket = LimitedWebSocket(self._open.enter_context(opening))
         except InvalidStatus as error:
             if error.response.status_code in _REFUSED:
                 raise Unauthorized(
@@ -91,8 +93,9 @@ class WebSocketClient(UpstreamClient):
             raise self.unreachable(error) from error
 
     def send(self, message: bytes) -> None:
+        """Send a message; raise `ConnectionLost` if the upstream does not take it in time."""
         try:
-            self._opened().send(message)
+            self._opened().send(message, self.options.timeout_s)
         except (ConnectionClosed, OSError) as error:
             raise self.lost(error) from error
 
@@ -104,21 +107,23 @@ class WebSocketClient(UpstreamClient):
         """
         wait_s = self.options.timeout_s if timeout_s is None else timeout_s
         try:
-            return self._opened().recv(timeout=wait_s)
+            return self._opened().connection.recv(timeout=wait_s)
         except TimeoutError as error:
             raise self.lost(f"no answer within {wait_s:.3g} s") from error
         except (ConnectionClosed, OSError) as error:
             raise self.lost(error) from error
 
     def close(self) -> None:
-        self._connection = None
+        websocket, self._websocket = self._websocket, None
+        if websocket is not None:
+            websocket.close(2 * _CLOSE_S)
         self._open.close()
 
-    def _opened(self) -> ClientConnection:
+    def _opened(self) -> LimitedWebSocket:
         """Return the connection; raise `ConnectionLost` if it is closed."""
-        if self._connection is None:
+        if self._websocket is None:
             raise self.closed()
-        return self._connection
+        return self._websocket
 
 
 class OpenPiClient(WebSocketClient):
