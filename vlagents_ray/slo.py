@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, shown
+from vlagents_ray.errors import ConfigError, printable, shown
 from vlagents_ray.naming import did_you_mean
 
+_REASON_CHARACTERS = 1000  # of a server's reason why a robot is not served in time
 SHARE = 0.98
 """The share of ticks with an action in time that a robot needs if it states none."""
 
@@ -93,6 +94,25 @@ class Slo:
         """Return the objective as a JSON object, without what is None."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
+
+
+def read_answer(answer: object) -> dict[str, Any]:
+    """Return a server's answer to an SLO: `load`, `in_time`, and a `reason` if it is not in time.
+
+    It is empty if there is none, or if it has another form: a run does not depend on it. The reason
+    is a text of another party, and has no line feeds, with which it could forge a line of a log.
+    """
+    in_time = answer.get("in_time") if isinstance(answer, Mapping) else None
+    if not isinstance(answer, Mapping) or not isinstance(in_time, bool):
+        return {}
+
+    load = answer.get("load")
+    told: dict[str, Any] = {"load": load if _is_number(load) else None, "in_time": in_time}
+    if not in_time:
+        reason = answer.get("reason", "")
+        text = reason[:_REASON_CHARACTERS] if isinstance(reason, str) else shown(reason)
+        told["reason"] = " ".join(printable(text).split())
+    return told
 
 
 def _is_number(value: object) -> bool:

@@ -32,6 +32,8 @@ METADATA: dict[str, Any] = {
     "continues_plans": False,
     "local": None,
     "stream": None,
+    "weights": {"digest": "d", "statistics": {"state": {"min": [0.0], "max": [1.0]}}},
+    "reads_slo": True,
 }
 ADDRESSES = {
     "local": {"socket": "vlagents-ray-none", "boot_id": "another machine", "keyed": False},
@@ -209,6 +211,7 @@ def act_once(url: str, transport: str = "http") -> Act:
     with RemoteAgent(
         url, transport=transport, timeout_s=TIME_LIMIT_S, connect_timeout_s=TIME_LIMIT_S
     ) as agent:
+        agent.initialize()
         agent.reset(Obs(), "x")
         return agent.act(Obs())
 

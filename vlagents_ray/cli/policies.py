@@ -17,7 +17,7 @@ from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, MalformedMessage, shown
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, chosen_workers, resolve
@@ -348,10 +348,16 @@ def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
     # The server may be starting.
     with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
         metadata = agent.metadata
+    name, config = metadata.get("policy"), metadata.get("config", {})
+    if not isinstance(name, str) or not isinstance(config, dict):
+        raise MalformedMessage(
+            f"{url}: metadata: expected the policy's name and its config, got {shown(name)} and "
+            f"{shown(config)}"
+        )
     has_name = "name" in policy.model_fields_set
     fields |= {
-        "name": policy.name if has_name else metadata["policy"],
-        "config": metadata.get("config", {}),
+        "name": policy.name if has_name else name,
+        "config": config,
         "checkpoint": metadata.get("checkpoint"),
     }
     return policy.model_copy(update=fields)

@@ -22,7 +22,9 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
     InvalidObservation,
+    MalformedMessage,
     PolicyFailed,
+    shown,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
@@ -176,11 +178,18 @@ class RemoteAgent(Agent):
         return self._connection.contract
 
     def initialize(self) -> None:
-        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does
-        not.
+        """Connect, waiting for the server to become ready.
+
+        Raises:
+            PolicyUnavailable: The server does not become ready.
+            MalformedMessage: Its metadata have a value of another type.
         """
         self._connection.open()
         weights = (self._connection.metadata or {}).get("weights") or {}
+        if not isinstance(weights, dict):
+            raise MalformedMessage(
+                f"{self.url}: metadata: weights: expected an object, got {shown(weights)}"
+            )
         self.statistics = weights.get("statistics")
 
     def reset(

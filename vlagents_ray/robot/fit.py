@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import reordered
-from vlagents_ray.errors import ConfigError, ContractMismatch
+from vlagents_ray.errors import ConfigError, ContractMismatch, shown
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
@@ -28,6 +28,16 @@ _WIDTH = 32  # the number of characters of a drawn range
 _ACCEPTED_FILES = (
     "LeRobot's meta/stats.json, openpi's norm_stats.json or GR00T's statistics.json, with min "
     "and max or q01 and q99"
+)
+# What is raised for statistics of another form.
+_UNREADABLE = (
+    OSError,
+    ArithmeticError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RecursionError,
 )
 Span = tuple[np.ndarray, np.ndarray]  # lowest and highest of D numbers, (D,) each
 
@@ -66,8 +76,8 @@ class Trained:
                 [robot_statistics] = statistics.values()
                 if {"state", "action"} <= set(robot_statistics):
                     statistics = robot_statistics
-            trained = cls.from_statistics(statistics)
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            trained = cls._read(statistics)
+        except _UNREADABLE as error:
             raise ConfigError(
                 f"statistics {path}: expected {_ACCEPTED_FILES}, got {type(error).__name__}: "
                 f"{error}"
@@ -79,9 +89,9 @@ class Trained:
         return trained
 
     @classmethod
-    def from_statistics(cls, statistics: Mapping[str, Any]) -> Trained:
+    def from_statistics(cls, statistics: object) -> Trained:
         """Return the ranges in statistics, such as those in a server's metadata
-        (`vlagents_ray.abilities.HasStatistics`).
+        (`vlagents_ray.abilities.HasStatistics`), which may be of any type.
 
         Args:
             statistics: The ranges by the names "observation.state" or "state", and "action" or
@@ -89,10 +99,26 @@ class Trained:
 
         Returns:
             The ranges of state and action, None for one that the statistics lack.
+
+        Raises:
+            ConfigError: They are not statistics.
         """
+        try:
+            return cls._read(statistics)
+        except _UNREADABLE as error:
+            raise ConfigError(
+                "the policy's statistics: expected ranges, min and max or q01 and q99, by name, "
+                f"got {shown(statistics)} ({type(error).__name__}); name a file of them instead"
+            ) from error
+
+    @classmethod
+    def _read(cls, statistics: Any) -> Trained:
+        """Return the ranges in statistics; raises one of `_UNREADABLE` for other values."""
         state = _first_range(statistics, ("observation.state", "state"))
         action = _first_range(statistics, ("action", "actions"))
         state_names = tuple(statistics["parts"]) if "parts" in statistics else None
+        if not all(isinstance(name, str) for name in state_names or ()):
+            raise TypeError("parts")
         return cls(state, action, state_names)
 
     def vector(self, obs: Obs, default_names: Sequence[str]) -> np.ndarray | None:
@@ -271,6 +297,8 @@ def _range(statistics: Mapping[str, Any]) -> Span:
     low_key, high_key = ("min", "max") if "min" in statistics else ("q01", "q99")
     low = np.ravel(np.asarray(statistics[low_key], np.float64))
     high = np.ravel(np.asarray(statistics[high_key], np.float64))
+    if low.shape != high.shape:
+        raise ValueError(f"{low_key} of {len(low)} numbers, {high_key} of {len(high)}")
     return low, high
 
 

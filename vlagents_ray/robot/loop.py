@@ -55,7 +55,7 @@ from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
-from vlagents_ray.slo import Slo
+from vlagents_ray.slo import Slo, read_answer
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
@@ -538,9 +538,11 @@ def run_loop(
             if reads is not None and reads.reads_slo:
                 reset_options[SLO] = (options.slo or Slo(hz)).to_json()
             reset_info = agent.reset(obs, instruction, **reset_options)
-            report.slo = reset_info.get(SLO) or {}
+            # A policy in this process may return anything.
+            told: object = reset_info.get(SLO) if isinstance(reset_info, dict) else None
+            report.slo = read_answer(told)
             if not report.slo.get("in_time", True):
-                logger.warning("slo: %s", report.slo.get("reason"))
+                logger.warning("slo: %s", report.slo["reason"])
 
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
