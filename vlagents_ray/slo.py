@@ -14,6 +14,8 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, printable, shown
 from vlagents_ray.naming import did_you_mean
 
+# Of a rate, Hz, and of an age, ms: the server computes with their reciprocals and products.
+_LEAST, _MOST = 1e-6, 1e9
 _REASON_CHARACTERS = 1000  # of a server's reason why a robot is not served in time
 SHARE = 0.98
 """The share of ticks with an action in time that a robot needs if it states none."""
@@ -41,15 +43,17 @@ class Slo:
     rows: int | None = None
 
     def __post_init__(self) -> None:
-        if not (_is_number(self.hz) and self.hz > 0):
+        if not (_is_number(self.hz) and _LEAST <= self.hz <= _MOST):
             raise ConfigError(
-                f"slo.hz: expected a rate above 0 Hz, got {shown(self.hz)}; give the rate of the "
-                "control loop"
+                f"slo.hz: expected a rate from {_LEAST:g} to {_MOST:g} Hz, got {shown(self.hz)}; "
+                "give the rate of the control loop"
             )
-        if self.age_ms is not None and not (_is_number(self.age_ms) and self.age_ms > 0):
+        if self.age_ms is not None and not (
+            _is_number(self.age_ms) and _LEAST <= self.age_ms <= _MOST
+        ):
             raise ConfigError(
-                f"slo.age_ms: expected milliseconds above 0, got {shown(self.age_ms)}; leave it "
-                "out if actions of any age will do"
+                f"slo.age_ms: expected {_LEAST:g} to {_MOST:g} ms, got {shown(self.age_ms)}; leave "
+                "it out if actions of any age will do"
             )
         if not (_is_number(self.share) and 0 < self.share <= 1):
             raise ConfigError(

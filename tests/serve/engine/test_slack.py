@@ -70,10 +70,33 @@ def test_a_robot_that_cannot_be_served_is_told_so_at_its_reset(engine: Engine) -
     assert "lower the rate" in told["reason"]
 
 
-@pytest.mark.parametrize("wrong", [{}, {"hz": 0}, {"hz": 10, "ages": 1}, 10])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({}, {"hz": 0}, {"hz": 10, "ages": 1}, 10),
+        *({"hz": 5e-324}, {"hz": 1e308}, {"hz": 10, "age_ms": 5e-324}, {"hz": 10**400}),
+    ],
+)
 def test_a_wrong_slo_is_refused(engine: Engine, wrong: Any) -> None:
     with pytest.raises(InvalidInput, match=r"slo.*expected .* got"):
         checked(engine, "a", Request("reset", Obs(), kwargs={SLO: wrong}), ignore)
+
+
+@pytest.mark.parametrize("hz", [1e-6, 1, 1e9])
+@pytest.mark.parametrize("age_ms", [1e-6, 100, 1e9])
+@pytest.mark.parametrize("rows", [1, 10**400])
+def test_the_least_and_the_largest_slo_is_answered_and_disturbs_no_other_robot(
+    engine: Engine, hz: float, age_ms: float, rows: int
+) -> None:
+    reset(engine, "a")
+    act(engine, "a")
+    told = reset(engine, "extreme", slo={"hz": hz, "age_ms": age_ms, "rows": rows})[SLO]
+    assert type(told["in_time"]) is bool
+    for slack_ms in (5e-324, 1e308):
+        act(engine, "extreme", slack_ms=slack_ms)
+    engine.pace._read = -math.inf  # as after half a second
+    assert reset(engine, "b", slo={"hz": 10})[SLO]["in_time"] is True
+    act(engine, "b", slack_ms=100.0)
 
 
 @pytest.mark.parametrize("wrong", [-1.0, math.nan, math.inf, "10", True, [1.0]])
