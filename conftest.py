@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import logging
 import os
@@ -13,6 +14,8 @@ from pathlib import Path
 import many  # noqa: F401 - registers profiles
 import pytest
 import shared_ray as shared
+import typer.main
+import typer.testing
 from needs import (
     assets,
     left_out,
@@ -23,6 +26,7 @@ from needs import (
     skip_what_is_missing,
 )
 from process_resources import (
+    freeze_heap,
     own_ray_folder,
     pytest_pyfunc_call,
     pytest_runtest_teardown,
@@ -141,10 +145,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Keep what was imported and collected, which lives to the end, out of every garbage
-    collection of a test.
-    """
-    gc.freeze()
+    """Collect garbage again, but only that of tests."""
+    freeze_heap()
     gc.enable()
 
 
@@ -155,6 +157,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     skip_what_is_missing(item)
     if item.path not in _shared_files:
         shared.stop()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def commands_built_once() -> Iterator[None]:
+    """Build the commands of an application once in a process. Typer's runner, which calls it in a
+    process as often as tests want, would build all of them for each call.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        build = functools.cache(typer.main.get_command)
+        patch.setattr(typer.testing, "_get_command", build)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -29,11 +29,22 @@ def tree(module: str) -> ast.Module:
     return ast.parse(FILES[module].read_text())
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """The statements below a node; the expressions in them, which are most of a tree, are left
+    out.
+    """
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        below = getattr(node, name, None)
+        for one in below if isinstance(below, list) else ():
+            yield one
+            yield from statements(one)
+
+
 def imports(module: str) -> Iterator[str]:
     """The modules that one imports, those included that only a type checker, or a function,
     does.
     """
-    for node in ast.walk(tree(module)):
+    for node in statements(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module is not None:
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
@@ -159,7 +170,10 @@ ABOVE_PLUGINS = {
 
 
 def _imports_plugin(path: Path) -> bool:
-    for node in ast.walk(ast.parse(path.read_text())):
+    text = path.read_text()
+    if not any(name in text for name in PLUGINS):
+        return False
+    for node in statements(ast.parse(text)):
         if isinstance(node, ast.ImportFrom):
             modules = [node.module or ""]
         elif isinstance(node, ast.Import):

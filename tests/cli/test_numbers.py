@@ -17,11 +17,12 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.config.deployment import ServerArgs
 
 SLIPS = ("1000000000000000000", "-1", "nan", "inf", "-inf", "text", "")
+COMMANDS: Any = typer.main.get_command(app)
 
 
 def numeric_options() -> Iterator[tuple[tuple[str, ...], str, Any]]:
     """Yield (command, option, its parameter) for each numeric option of each command."""
-    yield from _numeric(typer.main.get_command(app), ())
+    yield from _numeric(COMMANDS, ())
 
 
 def _numeric(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], str, Any]]:
@@ -45,7 +46,7 @@ def words_before(command: Any) -> list[str]:
 
 
 def command_at(path: tuple[str, ...]) -> Any:
-    command: Any = typer.main.get_command(app)
+    command = COMMANDS
     for name in path:
         command = command.commands[name]
     return command

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from process_resources import count_frozen
 
 from vlagents_ray import (
     Act,
@@ -143,7 +144,9 @@ def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
 
 
 @pytest.mark.parametrize("frozen", [False, True])
-def test_the_process_is_left_as_it_was(*, frozen: bool) -> None:
+def test_the_process_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch, *, frozen: bool) -> None:
+    monkeypatch.setattr(gc, "get_freeze_count", count_frozen)
+
     def settings() -> tuple[object, ...]:
         nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         return gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval(), nice

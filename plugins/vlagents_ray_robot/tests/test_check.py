@@ -193,7 +193,7 @@ def test_the_command_checks_a_simulated_arm_without_a_person(
     page = tmp_path / "report.html"
     name = f"mujoco:{model_file('franka')}" if status == 0 else "mujoco:missing.xml"
     assert (
-        main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--out", str(page)])
+        main([name, "--robot-set", "like=franka", "--robot-set", "fps=1", "--out", str(page)])
         == status
     )
     said = capsys.readouterr()

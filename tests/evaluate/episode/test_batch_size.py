@@ -14,6 +14,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.envs.base import ERROR, BatchEnv, EvalEnv, SequentialBatch
 from vlagents_ray.errors import EnvFailed, InvalidAction
 from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import run as evaluation
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.interface import Act, Agent, Obs
@@ -127,6 +128,12 @@ class Extreme(Agent):
 
     def act_batch(self, observations: list[Obs], sessions: Any) -> list[Act]:
         return [session.act(obs) for obs, session in zip(observations, sessions, strict=True)]
+
+
+@pytest.fixture(autouse=True)
+def no_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for no signal after a failure, as none is sent here; test_in_process.py sends one."""
+    monkeypatch.setattr(evaluation, "SIGNAL_S", 0.0)
 
 
 @pytest.fixture

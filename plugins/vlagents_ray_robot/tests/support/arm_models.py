@@ -27,8 +27,8 @@ def model_file(arm: str) -> Path:
 
 def simulated_arm(arm: str, **options: Any) -> MujocoArm:
     """Make an arm in simulated time, with cameras that are slow enough for rendering in
-    software.
+    software: a picture takes 0.1 s, and nothing looks at pictures while the arm moves.
     """
     return MujocoArm(
-        model_file(arm), like=arm, **{"clock": SimulatedClock(), "fps": 5.0, **options}
+        model_file(arm), like=arm, **{"clock": SimulatedClock(), "fps": 1.0, **options}
     )
