@@ -24,7 +24,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations environments families docs verified programs extras locks dist sbom fmt lint type clean
+.PHONY: setup demo reference bench gpu gpu-pack check quick collected test integrations environments families docs verified programs extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -105,9 +105,14 @@ quick: $(TOOLS)/.installed
 
 # Lint and types in another make: this one chose their environment before there was a whole one.
 test: setup
-	@$(MAKE) --no-print-directory --jobs=2 lint type
+	@$(MAKE) --no-print-directory --jobs=2 lint type collected
 	@echo '== tests'
 	$(call PLAY,not (integration))
+
+# While mypy has one core: pytest rewrites and compiles the test files, and Hypothesis finds the constants of the sources.
+# Otherwise each of the processes that run tests would, at the same time.
+collected: $(TOOLS)/.installed
+	@printed=$$($(TOOLS)/bin/python -m pytest --collect-only -qq -m 'not (integration)' 2>&1) || { echo "$$printed"; exit 1; }
 
 # All of them, whatever becomes of the first.
 integrations: setup

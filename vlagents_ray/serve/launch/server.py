@@ -353,18 +353,13 @@ def _ray(
                 yield {"host": LOOPBACK, "port": listener.inside}
             elif tls is None:
                 yield {"host": host, "port": port}
-            elif tls.client_ca is None:
+            else:
                 yield {
                     "host": host,
                     "port": port,
                     "ssl_certfile": str(tls.certificate),
                     "ssl_keyfile": str(tls.key),
                 }
-            else:
-                raise ConfigError(
-                    "TLS with certificates of clients needs HAProxy: pip install "
-                    "'vlagents-ray[serve]'"
-                )
         return
 
     if tls is not None:
@@ -415,8 +410,8 @@ def own_ray(
         HAProxy's listener for clients; None if Serve listens itself.
 
     Raises:
-        ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's
-            settings.
+        ConfigError: The port is in use, certificates of clients need HAProxy, which is not
+            installed, or the environment excludes Ray's token or HAProxy's settings.
     """
     if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
@@ -440,6 +435,10 @@ def own_ray(
 
         listener = None
         binary = haproxy.haproxy_binary() if ingress else None
+        if binary is None and tls is not None and tls.client_ca is not None:
+            raise ConfigError(
+                "TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'"
+            )
         if not ingress:
             fixed["RAY_SERVE_ENABLE_HA_PROXY"] = "0"
         elif binary is not None:
