@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from arm_models import simulated_arm
 from ros_arm import COMMANDS, JOINTS, Wire, header
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import entries
 from vlagents_ray_robot import DISTRIBUTION
 from vlagents_ray_robot.lerobot_robot import LeRobotRobot, OneAtATime
@@ -31,6 +33,7 @@ class Bus:
 
     def __init__(self) -> None:
         self.broken = False
+        self.pose = POSE
         self.goals: dict[str, float] = {}
         self.inside = 0
         self.shared = False  # two transfers at once
@@ -47,7 +50,7 @@ class Bus:
         assert name == "Present_Position"
         if self.broken:
             raise ConnectionError("There is no status packet!")
-        return dict(zip(MOTORS, POSE.tolist(), strict=True))
+        return dict(zip(MOTORS, self.pose.tolist(), strict=True))
 
     def _transfer(self, work: Callable[[], Any]) -> Any:
         self.inside += 1
@@ -74,6 +77,7 @@ class FakeFollower:
         self.max_relative_target = max_relative_target
         self.camera_broken = False
         self.camera: Callable[[], object] = lambda: None
+        self.config: Any = None
 
     def get_observation(self) -> dict[str, Any]:
         bus = getattr(self, "bus", self.wire)
@@ -94,7 +98,7 @@ class FakeFollower:
         )
 
 
-def robot_of(follower: FakeFollower) -> LeRobotRobot:
+def robot_of(follower: FakeFollower | FakeTwoArms) -> LeRobotRobot:
     """Return the robot of a fake arm, without LeRobot's registry."""
     robot = LeRobotRobot.__new__(LeRobotRobot)
     robot._robot, robot._keys, robot._unit = follower, list(follower.action_features), "deg"
@@ -134,6 +138,105 @@ def test_a_lerobot_arm_that_was_neither_seen_nor_commanded_stays_as_it_is(
     follower.wire.broken = "encoders" in broken
     robot.stop()
     assert set(follower.wire.goals.values()) <= set(POSE.tolist())
+
+
+class FakeTwoArms:
+    """Two arms as LeRobot's `BiSOFollower` has them: each with a bus, the left one first."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.left_arm = FakeFollower(**settings)
+        self.right_arm = FakeFollower(**settings)
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        return self._of_both(FakeFollower.observation_features, FakeFollower.observation_features)
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return self._of_both(FakeFollower.action_features, FakeFollower.action_features)
+
+    def get_observation(self) -> dict[str, Any]:
+        return self._of_both(self.left_arm.get_observation(), self.right_arm.get_observation())
+
+    def send_action(self, action: dict[str, float]) -> None:
+        for prefix, arm in (("left_", self.left_arm), ("right_", self.right_arm)):
+            arm.send_action(
+                {
+                    name.removeprefix(prefix): goal
+                    for name, goal in action.items()
+                    if name.startswith(prefix)
+                }
+            )
+
+    @staticmethod
+    def _of_both(left: dict[str, Any], right: dict[str, Any]) -> dict[str, Any]:
+        return {f"left_{name}": value for name, value in left.items()} | {
+            f"right_{name}": value for name, value in right.items()
+        }
+
+
+FAULTS = ["nothing", "camera", "encoders", "camera and encoders", "all transfers"]
+
+
+def break_down(follower: FakeFollower, fault: str) -> None:
+    follower.camera_broken = "camera" in fault
+    follower.wire.broken = "encoders" in fault
+    if fault == "all transfers":
+        follower.wire.slow = unplugged
+
+
+def unplugged() -> None:
+    raise ConnectionError("the adapter was unplugged")
+
+
+@pytest.mark.parametrize("limit", [None, 5.0])
+@pytest.mark.parametrize("right", FAULTS)
+@pytest.mark.parametrize("left", FAULTS)
+def test_each_of_two_lerobot_arms_is_stopped_whatever_is_broken_in_the_other(
+    left: str, right: str, limit: float | None
+) -> None:
+    follower = FakeTwoArms(max_relative_target=limit)
+    robot = robot_of(follower)
+    robot.observe()
+    robot.apply(np.array([20.0, 5.0, GRASP, 21.0, 6.0, GRASP], np.float32))
+    for arm, fault in ((follower.left_arm, left), (follower.right_arm, right)):
+        break_down(arm, fault)
+    for _ in range(2):
+        if "all transfers" in (left, right):
+            with pytest.raises(ConnectionError, match="unplugged"):
+                robot.stop()
+        else:
+            robot.stop()
+    for arm, fault in ((follower.left_arm, left), (follower.right_arm, right)):
+        if fault != "all transfers":
+            assert arm.wire.goals == {"shoulder": 12.0, "elbow": -3.0, "gripper": GRASP}
+
+
+def test_two_lerobot_arms_stop_where_they_are_and_not_where_they_were_seen() -> None:
+    follower = FakeTwoArms()
+    robot = robot_of(follower)
+    robot.observe()
+    robot.apply(np.array([20.0, 5.0, GRASP, 21.0, 6.0, GRASP], np.float32))
+    follower.right_arm.wire.pose = POSE + 4.0  # the loop hangs, and the arm moves on
+    robot.stop()
+    assert follower.left_arm.wire.goals == {"shoulder": 12.0, "elbow": -3.0, "gripper": GRASP}
+    assert follower.right_arm.wire.goals == {"shoulder": 16.0, "elbow": 1.0, "gripper": GRASP}
+
+
+def test_two_lerobot_arms_have_the_limits_and_the_unit_of_each() -> None:
+    follower = FakeTwoArms()
+    robot = robot_of(follower)
+    unset = SimpleNamespace(joint_limits=None)
+    follower.left_arm.config = unset
+    follower.right_arm.config = SimpleNamespace(joint_limits={"elbow": (-1.0, 2.0)})
+    assert robot.joint_limits[4].tolist() == [-1.0, 2.0]
+    assert np.isinf(np.delete(robot.joint_limits, 4, axis=0)).all()
+
+    follower.left_arm.config = follower.right_arm.config = SimpleNamespace(use_degrees=True)
+    assert robot._configured_unit(SimpleNamespace()) == "deg"
+    follower.left_arm.config = SimpleNamespace(use_degrees=False)
+    with pytest.raises(ConfigError, match="expected the same for all arms, got % and deg"):
+        robot._configured_unit(SimpleNamespace())
 
 
 def test_a_stop_from_another_thread_does_not_share_the_bus_with_the_loop() -> None:

@@ -9,6 +9,7 @@ import logging
 import pkgutil
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,20 @@ class OneAtATime:
         return locked
 
 
+@dataclass(frozen=True, slots=True)
+class _Arm:
+    """A part of a robot with a bus of its own, or the whole robot."""
+
+    robot: Any  # LeRobot's robot of this part
+    motors: list[str]  # the names of its motors, without the prefix that two arms have
+    indices: list[int]  # the indices of these motors in an action
+
+    @property
+    def bus(self) -> Any:
+        """The bus of its motors; None if LeRobot drives them in another way."""
+        return getattr(self.robot, "bus", None)
+
+
 class LeRobotRobot:
     """Any robot that LeRobot drives, by the name that its configuration registers.
 
@@ -61,7 +76,7 @@ class LeRobotRobot:
     Args:
         robot_type: The registered name, such as "so101_follower".
         unit: The unit of the joints; default: "deg" or "%" of the calibrated range, depending on
-            `use_degrees` of the configuration.
+            `use_degrees` of the configuration, or of those of its arms.
         settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and
             `cameras`.
 
@@ -109,6 +124,9 @@ class LeRobotRobot:
                 f"{not_positions}"
             )
 
+        self._keys = list(self._robot.action_features)
+        self._unit = unit or self._configured_unit(config)
+
         self._robot.connect(calibrate=False)
         if not self._robot.is_calibrated:
             self._robot.disconnect()
@@ -117,8 +135,6 @@ class LeRobotRobot:
                 f"--robot.type={robot_type} with its id"
             )
 
-        self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
-        self._keys = list(self._robot.action_features)
         self._lock_buses()
 
     def _lock_buses(self) -> None:
@@ -127,6 +143,42 @@ class LeRobotRobot:
         for arm in (self._robot, *vars(self._robot).values()):
             if hasattr(arm, "bus"):
                 arm.bus = OneAtATime(arm.bus)
+
+    @functools.cached_property
+    def _arms(self) -> list[_Arm]:
+        """The arms that have a bus; the whole robot if not all motors are on their buses.
+
+        LeRobot's robots with two arms have them as `left_arm` and `right_arm`, and the motors'
+        names have the prefixes "left_" and "right_".
+        """
+        whole = [_Arm(self._robot, self.joint_names, list(range(len(self._keys))))]
+        if hasattr(self._robot, "bus"):
+            return whole
+
+        arms = []
+        for attribute, robot in vars(self._robot).items():
+            if not hasattr(robot, "bus"):
+                continue
+            prefix = attribute.removesuffix("arm")
+            indices = [i for i, name in enumerate(self.joint_names) if name.startswith(prefix)]
+            motors = [self.joint_names[i].removeprefix(prefix) for i in indices]
+            arms.append(_Arm(robot, motors, indices))
+        on_buses = sorted(i for arm in arms for i in arm.indices)
+        return arms if on_buses == whole[0].indices else whole
+
+    def _configured_unit(self, config: Any) -> str:
+        """Return the unit of the joints by the configuration of the robot, or of its arms."""
+        units: dict[str, None] = {}
+        for arm in self._arms:
+            of_arm = config if arm.robot is self._robot else arm.robot.config
+            units["deg" if getattr(of_arm, "use_degrees", False) else "%"] = None
+        if len(units) > 1:
+            raise ConfigError(
+                f"use_degrees: expected the same for all arms, got {' and '.join(units)}; set it "
+                "for each arm"
+            )
+        [unit] = units
+        return unit
 
     @property
     def joint_names(self) -> list[str]:
@@ -138,16 +190,19 @@ class LeRobotRobot:
         """The limits of the motors from LeRobot's settings and calibration, (D, 2) in the unit of
         the joints; infinite if they are unknown.
         """
-        return np.array([self._limits_of(name) for name in self.joint_names])
+        limits = np.empty((len(self._keys), 2))
+        for arm in self._arms:
+            limits[arm.indices] = [self._limits_of(arm, name) for name in arm.motors]
+        return limits
 
-    def _limits_of(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest position of a motor."""
-        config = getattr(self._robot, "config", None)
+    def _limits_of(self, arm: _Arm, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest position of a motor of an arm."""
+        config = getattr(arm.robot, "config", None)
         configured = getattr(config, "joint_limits", None) or {}
         if name in configured:
             return configured[name]  # type: ignore[no-any-return]
 
-        bus: Any = getattr(self._robot, "bus", None)
+        bus: Any = arm.bus
         motor: Any = getattr(bus, "motors", {}).get(name)
         calibration: Any = getattr(bus, "calibration", {}).get(name)
         mode = getattr(getattr(motor, "norm_mode", None), "name", "")
@@ -198,14 +253,26 @@ class LeRobotRobot:
         """Make the measured positions the goal; torque stays on, so that the arm does not fall.
 
         No camera is read. If there is no bus or it cannot be read, the goal is the pose of the last
-        observation. The grippers keep their goal.
+        observation. The grippers keep their goal. Each of several arms is stopped, even if another
+        one cannot be.
 
         Raises:
-            Exception: The motors cannot be reached, or the robot was commanded and no pose is
-                known.
+            Exception: The motors of an arm cannot be reached, or the robot was commanded and no
+                pose is known.
         """
+        errors: list[Exception] = []
+        for arm in self._arms:
+            try:
+                self._stop_arm(arm)
+            except Exception as error:  # noqa: BLE001 - raised below, after the other arms
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _stop_arm(self, arm: _Arm) -> None:
+        """Make the measured positions of an arm its goal, except those of its grippers."""
         try:
-            positions = self._present().copy()
+            positions = self._present(arm).copy()
         except Exception as error:
             if self._goal is not None:
                 raise
@@ -217,27 +284,24 @@ class LeRobotRobot:
             return
 
         if self._goal is not None:
-            grippers = ["gripper" in name for name in self.joint_names]
-            positions[grippers] = self._goal[grippers]
+            grippers = ["gripper" in name for name in arm.motors]
+            positions[grippers] = self._goal[arm.indices][grippers]
 
-        goals = dict(zip(self._keys, map(float, positions), strict=True))
+        goals = dict(zip(arm.motors, map(float, positions), strict=True))
         try:
-            self._robot.send_action(goals)
+            arm.robot.send_action({f"{name}.pos": goal for name, goal in goals.items()})
         except Exception:
-            bus = getattr(self._robot, "bus", None)
-            if bus is None:
+            if arm.bus is None:
                 raise
             # With max_relative_target, LeRobot reads the positions before it sends a goal.
-            goals_of_motors = {key.removesuffix(".pos"): goal for key, goal in goals.items()}
-            bus.sync_write("Goal_Position", goals_of_motors)
+            arm.bus.sync_write("Goal_Position", goals)
 
-    def _present(self) -> np.ndarray:
-        """Return the present joints, (D,), if possible without reading a camera."""
-        bus: Any = getattr(self._robot, "bus", None)
-        if hasattr(bus, "sync_read"):
+    def _present(self, arm: _Arm) -> np.ndarray:
+        """Return the present joints of an arm, if possible without reading a camera."""
+        if hasattr(arm.bus, "sync_read"):
             try:
-                positions = bus.sync_read("Present_Position")
-                return np.array([positions[name] for name in self.joint_names], np.float32)
+                positions = arm.bus.sync_read("Present_Position")
+                return np.array([positions[name] for name in arm.motors], np.float32)
             except Exception as error:
                 if self._measured is None:
                     raise
@@ -246,9 +310,10 @@ class LeRobotRobot:
                     error,
                 )
 
-        if self._measured is None:
-            return self.observe().state["joints"]
-        return self._measured
+        joints = self._measured
+        if joints is None:
+            joints = self.observe().state["joints"]
+        return joints[arm.indices]
 
     def close(self) -> None:
         """Disconnect; whether torque is released is a setting of LeRobot's configuration."""

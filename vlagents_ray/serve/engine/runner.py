@@ -524,7 +524,7 @@ class Runner:
             return
         plan.observe(len(act.rows()), pending.arrived, pending.needed)
         if pending.needed and plan.need is not None:
-            replan_s = self._pace.replan_s(plan.need, pending.arrived)
+            replan_s = self._pace.replan_s(plan.need, pending.arrived, pending.needed)
             if replan_s > 0:
                 act.info[REPLAN] = replan_s * 1e3
 

@@ -28,6 +28,9 @@ from vlagents_ray.serve.fleet import (
 from vlagents_ray.slo import Slo
 
 _READ_S = 0.5  # time after which the needs of all sessions are read again
+# The same after the first time; it doubles until it is `_READ_S`. The first curve is of one batch,
+# and the next ones are soon better.
+_FIRST_READ_S = 0.02
 # Share by which the observed rate of a robot must differ from the known one to replace it, so that
 # the needs of equal robots are equal.
 _DIFFERS = 0.1
@@ -134,12 +137,14 @@ class ReplicaPace:
         self._robots = 0
         self._throughput_hz = math.inf  # largest number of answers a second
         self._read = -math.inf  # time at which the needs were read, s
+        self._reread_s = _FIRST_READ_S  # time after which they are read again, s
 
     def load(self) -> ReplicaLoad:
         """Return the load, at most half a second old, of the robots that can be in time."""
         now = self._clock()
-        if now - self._read > _READ_S:
+        if now - self._read > self._reread_s:
             self._read = now
+            self._reread_s = min(_READ_S, 2 * self._reread_s)
             needs = Counter(need for need in self._needs() if need is not None)
             self._robots = needs.total()
             self._load = self._load_of(needs)
@@ -174,22 +179,32 @@ class ReplicaPace:
         needs[newcomer] += 1
         return self._load_of(needs)
 
-    def replan_s(self, need: RobotNeed, arrived: float) -> float:
+    def replan_s(self, need: RobotNeed, arrived: float, needed: float) -> float:
         """Return the time from now until the next request of a robot is useful, s; 0 if it may ask
         at once.
 
         Args:
             need: What the robot needs.
             arrived: The time at which its last request arrived, s.
+            needed: The time at which its plan ended, without the answer to that request, s.
         """
         load = self.load()
         if self._robots < 2:
             return 0.0
+        now = self._clock()
+        longest_s = need.interval_s(load.latency_s)
         # A request that is sent before those that wait are answered would wait, too.
-        backlog_s = self._clock() - arrived + self._depth() / self._throughput_hz
-        interval_s = max(load.replan_s(need), min(backlog_s, need.interval_s(load.latency_s)))
+        waited_s = now - arrived
+        waiting_s = self._depth() / self._throughput_hz
+        # Of robots that asked at once, the first one that is answered asks again first, so that
+        # their next requests do not come at once again.
+        earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
+        interval_s = max(waited_s + waiting_s, load.replan_s(need) - earlier_s)
+        interval_s = min(longest_s, interval_s)
+        # A robot that holds still executes no row of the new plan meanwhile, which ends later.
+        held_s = max(0.0, now - needed)
         # A robot sends its request at the next tick, half a period later on average.
-        return max(0.0, arrived + interval_s - 0.5 / need.hz - self._clock())
+        return max(0.0, arrived + held_s + interval_s - 0.5 / need.hz - now)
 
     def _load_of(self, needs: Mapping[RobotNeed, int]) -> ReplicaLoad:
         curve = self._curve()

@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import ssl
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from certificates import authority
+from deaf_server import deaf_server
 from eval_fakes import wait_for
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
@@ -131,3 +135,29 @@ def test_a_silent_sensor_is_subscribed_to_again(
 
         wait_for(again)
         assert not busy or double.subscriptions.count("/busy") < 3
+
+
+@pytest.mark.parametrize("has_tls", [False, True], ids=["plain", "tls"])
+def test_a_server_that_does_not_read_does_not_block_the_control_loop(
+    has_tls: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = None
+    if has_tls:
+        own = authority(tmp_path, "lab")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(*own.sign("server"))
+        monkeypatch.setenv("SSL_CERT_FILE", str(own.file))
+
+    with deaf_server(context=context) as port:
+        link = Rosbridge(f"{'wss' if has_tls else 'ws'}://127.0.0.1:{port}")
+        link.advertise("/arm", "std_msgs/msg/Float64MultiArray")
+        link.open()
+        longest_s, published = 0.0, True
+        while published:
+            begun = time.monotonic()
+            published = link.publish("/arm", {"data": [0.5] * 100_000})
+            longest_s = max(longest_s, time.monotonic() - begun)
+        begun = time.monotonic()
+        link.close()
+        assert longest_s < 2  # with the limit 0.3 s
+        assert time.monotonic() - begun < 10

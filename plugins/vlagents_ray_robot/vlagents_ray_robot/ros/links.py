@@ -9,17 +9,16 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import struct
 import threading
 import time
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
+from vlagents_ray.client.limited_websocket import LimitedWebSocket
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
@@ -36,9 +35,8 @@ _GET_ROS = (
     "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach "
     "ROS through a rosbridge, `link: ws://arm-pc:9090`"
 )
-# The kernel's time limit for a send, 0.2 s, as websockets has none: a dead link would block the
-# control loop for minutes.
-_SEND_LIMIT = struct.pack("@ll", 0, 200_000)
+_SEND_S = 0.2  # time limit of a message: a dead link would block the control loop for minutes
+_CLOSE_S = 1.0  # maximum time of a closing handshake
 _LARGEST = 64 << 20  # largest frame, bytes; a 4K image in base64 has 34 million
 
 
@@ -179,7 +177,7 @@ class Rosbridge:
         self._heard_at: dict[str, float] = {}
         self._published_types: dict[str, str] = {}  # by topic
 
-        self._socket: ClientConnection | None = None
+        self._socket: LimitedWebSocket | None = None
         self._open = contextlib.ExitStack()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -228,7 +226,7 @@ class Rosbridge:
             return False
         request = {"op": "publish", "topic": topic, "msg": message}
         try:
-            socket.send(json.dumps(request, allow_nan=False))
+            socket.send(json.dumps(request, allow_nan=False), _SEND_S)
         except (WebSocketException, OSError):
             self._lose(socket)
             return False
@@ -240,7 +238,7 @@ class Rosbridge:
         socket, self._socket = self._socket, None
         if socket is not None:
             # The closing handshake lets the last messages arrive.
-            socket.close()
+            socket.close(2 * _CLOSE_S)
         if self._thread is not None:
             self._thread.join()
         self._open.close()
@@ -250,12 +248,17 @@ class Rosbridge:
         self._open.close()  # the previous connection
         try:
             opening = connect(
-                self._url, compression=None, max_size=_LARGEST, open_timeout=5, close_timeout=1
+                self._url,
+                compression=None,
+                max_size=_LARGEST,
+                open_timeout=5,
+                close_timeout=_CLOSE_S,
             )
-            socket = self._open.enter_context(opening)
-            socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
+            socket = LimitedWebSocket(self._open.enter_context(opening))
+            self._open.callback(socket.shut_down)
             for topic, message_type in self._published_types.items():
-                socket.send(json.dumps({"op": "advertise", "topic": topic, "type": message_type}))
+                announcement = {"op": "advertise", "topic": topic, "type": message_type}
+                socket.send(json.dumps(announcement), _SEND_S)
             for topic in self._types:
                 self._send_subscription(topic, socket)
         except (WebSocketException, OSError, TimeoutError) as error:
@@ -276,24 +279,24 @@ class Rosbridge:
 
             try:
                 try:
-                    self._receive(socket.recv(_SILENT_S))
+                    self._receive(socket.connection.recv(_SILENT_S))
                 except TimeoutError:
                     # Without an answer, the server is lost, for instance after a power failure.
-                    if not socket.ping().wait(_SILENT_S):
+                    if not socket.connection.ping().wait(_SILENT_S):
                         self._lose(socket)
                         continue
 
                 for topic, heard_at in self._heard_at.items():
                     if time.monotonic() - heard_at > _SILENT_S:
-                        socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
+                        socket.send(json.dumps({"op": "unsubscribe", "topic": topic}), _SEND_S)
                         self._send_subscription(topic, socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
-    def _send_subscription(self, topic: str, socket: ClientConnection) -> None:
+    def _send_subscription(self, topic: str, socket: LimitedWebSocket) -> None:
         """Subscribe to a topic. On a slow link, the newest message replaces unsent ones."""
         request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "queue_length": 1}
-        socket.send(json.dumps(request))
+        socket.send(json.dumps(request), _SEND_S)
         self._heard_at[topic] = time.monotonic()
 
     def _reconnect(self) -> None:
@@ -311,14 +314,13 @@ class Rosbridge:
             return
         logger.warning("%s: connected again", self._url)
 
-    def _lose(self, socket: ClientConnection) -> None:
+    def _lose(self, socket: LimitedWebSocket) -> None:
         """Drop a connection without the closing handshake, which would wait for a dead peer."""
         if self._socket is socket:
             self._socket = None
             if not self._closing.is_set():
                 logger.warning("%s: the connection is lost", self._url)
-        with contextlib.suppress(OSError):
-            socket.socket.shutdown(SHUT_RDWR)
+        socket.shut_down()
 
     def _receive(self, frame: str | bytes) -> None:
         """Handle a message of the server."""
