@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -120,7 +121,7 @@ class Beside:
     def __init__(self, *loads: ReplicaLoad) -> None:
         self.held, self.asked = list(loads), 0
 
-    async def loads(self) -> list[ReplicaLoad]:
+    async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
         self.asked += 1
         await asyncio.sleep(0.01)
         return [replace(one) for one in self.held]

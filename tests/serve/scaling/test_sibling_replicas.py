@@ -13,7 +13,7 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
-from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
+from vlagents_ray.serve.scaling.rebalancer import ClientLocation, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.sibling_replicas import (
     PEER_METHODS,
@@ -132,6 +132,27 @@ def test_loads_are_those_of_the_replicas_that_answer_and_the_others_are_left_alo
         ("dead", "Rebalancer.load"),
         ("late", "Rebalancer.load"),
     ]
+
+
+def test_of_many_replicas_those_near_a_client_and_some_others_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loads = {
+        f"r{number}": ReplicaLoad(f"r{number}", 3, True, f"node{number % 20}", "boot", ("v", "f"))
+        for number in range(100)
+    }
+    cluster = Cluster(monkeypatch, **loads)
+    others = SiblingReplicas()
+    asyncio.run(others.some_loads())
+    assert len(cluster.asked) == 100, "it does not know yet where they are"
+    drawn = set()
+    for _ in range(30):
+        answers = asyncio.run(others.some_loads([ClientLocation("node7")]))
+        assert {f"r{number}" for number in range(7, 100, 20)} <= {one.replica for one in answers}
+        assert len(answers) == 5 + 32
+        drawn |= {one.replica for one in answers}
+    assert len(drawn) > 90
+    assert len(asyncio.run(others.loads())) == 100
 
 
 def test_a_replica_is_called_once_it_is_initialized(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ import logging
 import random
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Protocol
@@ -128,8 +128,10 @@ class Siblings(Protocol):
     `vlagents_ray.serve.scaling.sibling_replicas.SiblingReplicas`.
     """
 
-    async def loads(self) -> list[ReplicaLoad]:
-        """Return the loads of the replicas that answer quickly."""
+    async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
+        """Return the loads of the replicas near these locations, and of some others, that answer
+        quickly.
+        """
 
     async def announce_client(self, replica: str) -> Any:
         """Announce a client to that replica. Return its answer for the client; None if it does not
@@ -158,6 +160,8 @@ class Rebalancer:
         self._opened = 0
         self._sibling_loads: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time of the last request for the others' loads
+        self._asked_near: set[ClientLocation] = set()  # locations of that request
+        self._wanted_near: set[ClientLocation] = set()  # those of clients that came after it
         self._uneven = False  # whether the last comparison found too many sessions here
         self._placing = asyncio.Lock()  # held while a replica for a client is chosen
 
@@ -196,11 +200,13 @@ class Rebalancer:
             The result of `Siblings.announce_client`; None if the client stays here.
         """
         arrived = time.monotonic()
+        self._wanted_near |= set(locations)
         async with self._placing:
             # Clients that arrived during the requests use those answers.
-            if arrived > self._asked_at:
+            if arrived > self._asked_at or not self._asked_near.issuperset(locations):
+                self._asked_near, self._wanted_near = self._wanted_near, set()
                 try:
-                    self._sibling_loads = await self._siblings.loads()
+                    self._sibling_loads = await self._siblings.some_loads(self._asked_near)
                 except Exception:
                     # Errors of the other replicas must not keep a client from connecting.
                     logger.exception("the loads of the other replicas could not be read")
@@ -240,7 +246,7 @@ class Rebalancer:
         active = sessions.by_connection(MOVABLE, _ACTIVE_S)
         asked = drain_list.asked_within(_SETTLE_S)
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
-            siblings = [load for load in await self._siblings.loads() if load.accepts]
+            siblings = [load for load in await self._siblings.some_loads() if load.accepts]
             if siblings and all(load.version == mine.version for load in siblings):
                 leaving = sum(count for group, count in active.items() if group in asked)
                 too_many = excess_sessions(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import random
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -15,7 +16,7 @@ from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
+from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import (
     HeldSessions,
     Peer,
@@ -33,6 +34,10 @@ _ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not
 _TRANSFER_S = 600.0  # time limit for the answer to a request that contains weights
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time without further requests for a silent replica's load
+# Replicas whose loads are requested at once, besides those near a client. The replicas of a large
+# server would otherwise be busy with one another: each compares its load every few seconds, and for
+# each new client. The least loaded one of so many is rarely far from the least loaded one of all.
+_MOST_ASKED = 32
 
 
 class SiblingApi(Protocol):
@@ -173,17 +178,51 @@ class SiblingReplicas(ReplicasInCluster):
         super().__init__([context.app_name], but=self.own_name)
         # Time until which a silent replica gets no request, by its name.
         self._silent: dict[str, float] = {}
+        self._last_loads: dict[str, ReplicaLoad] = {}  # by name; their replicas stay where they are
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
+        return await self._loads_of(await self._audible())
+
+    async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
+        """Return the loads of the replicas near these locations, and of 32 others, that answer
+        within 0.3 s.
+        """
+        audible = await self._audible()
+        self._last_loads = {
+            replica.name: self._last_loads[replica.name]
+            for replica in audible
+            if replica.name in self._last_loads
+        }
+        if len(audible) <= _MOST_ASKED:
+            return await self._loads_of(audible)
+
+        asked, others = [], []
+        for replica in audible:
+            last = self._last_loads.get(replica.name)
+            # A replica that was never asked may be near.
+            if last is None or any(location.is_near(last) for location in near):
+                asked.append(replica)
+            else:
+                others.append(replica)
+        asked += random.sample(others, min(_MOST_ASKED, len(others)))
+        return await self._loads_of(asked)
+
+    async def _audible(self) -> list[SiblingReplica]:
+        """Return the other replicas without those that did not answer a moment ago."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
-        asked = [replica for replica in await self.others() if replica.name not in self._silent]
+        return [replica for replica in await self.others() if replica.name not in self._silent]
+
+    async def _loads_of(self, asked: Sequence[SiblingReplica]) -> list[ReplicaLoad]:
+        now = time.monotonic()
         answers = await asyncio.gather(
             *(replica.call(Rebalancer.load) for replica in asked), return_exceptions=True
         )
         for replica, answer in zip(asked, answers, strict=True):
-            if not isinstance(answer, ReplicaLoad):
+            if isinstance(answer, ReplicaLoad):
+                self._last_loads[replica.name] = answer
+            else:
                 logger.info("another replica does not answer: %s", answer)
                 self._silent[replica.name] = now + _SILENT_S
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
