@@ -2,17 +2,20 @@
 morning, losses and a rolling update, and which limit is reached first.
 
 `python -m benchmarks.fleet_simulation` prints it; `--json FILE` also writes it. It needs no GPU,
-and takes minutes of one core. The simulation is that of `vlagents-ray plan --check`; each printed
-limit names the measurement or the setting that it was computed from.
+and minutes of one core for each scenario. The simulation is that of `vlagents-ray plan --check`;
+each printed limit names the measurement or the setting that it was computed from.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
+import math
 import random
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -21,19 +24,28 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
-from vlagents_ray_fleet.simulation import Behaviour, Replica, Tally, World
+from vlagents_ray_fleet.simulation import (
+    Behaviour,
+    Replica,
+    Tally,
+    World,
+    starved_streams,
+)
 
 MODEL = "pi0"
 COSTS = CostCurve(0.0293, 0.00806)  # pi0 compiled, on an H200 (docs/measured.md)
 LARGEST_BATCH = 16
 TRANSPORT_S = 0.005
-START_S = 50.0  # of a replica whose compiled programs are kept (docs/measured.md)
+# Of a replica. On an H200 with its compiled programs kept it is 50 s (docs/measured.md), but
+# nothing changes meanwhile.
+START_S = 20.0
 MORNING_S = 60.0  # within which all robots start
+STEADY_S = 15.0  # after which something happens to robots that have started within 5 s
+REPAIR_S = 30.0  # after which lost machines are back
 UPDATED_AT_ONCE = 0.2  # share of the replicas: Ray Serve's rolling_update_percentage
 DRAIN_S = 5.0  # within which the sessions of a leaving replica have moved
 RACKS = 5  # with equal numbers of nodes
 IN_TIME = 0.98
-NODE_LOST_S, RACK_LOST_S, REPAIRED_S, UPDATE_S = 90.0, 120.0, 150.0, 175.0
 
 # Measured inputs of the limits, with their sources.
 SERVER_MS_AN_ACT = 1.226  # WebSocket with JPEG, CPU of the replica (docs/measured.md)
@@ -45,17 +57,29 @@ REPLICA_CORES = {2: 0.0180, 12: 0.0220}
 PROXY_CONNECTIONS = 16_384  # vlagents_ray.serve.launch.haproxy
 CONNECTIONS_OF_AN_ADDRESS = 1_000  # the same
 COMPARE_S = 3.0  # vlagents_ray.serve.scaling.rebalancer.PERIOD_S
+MOST_ASKED = 32  # vlagents_ray.serve.scaling.sibling_replicas
+# By `python -m benchmarks.fleet_costs`.
+DECISION_MS = {400: 7.4}  # one decision of autoscaling, by the number of replicas
+DECISIONS_HZ = 10.0
+OPENING_MS = 0.12  # HAProxy's CPU to open a WebSocket
+CHECKED_REPLICAS = 400
+CHECKING_CORES = 0.076  # HAProxy's CPU for their health checks
 
 
 @dataclass(frozen=True)
-class Event:
-    """What happened, and what the robots got from then until the next event."""
+class Outcome:
+    """What the robots got from the event of a scenario on."""
 
-    name: str
-    begun_s: float
-    share: float  # of ticks in time, until the next event
+    scenario: str
+    share: float  # of ticks in time
     worst_share: float  # of the worst second
-    recovered_s: float  # until at least 98 % of ticks are in time in each later second
+    in_time_s: float  # after the event, until at least 98 % of ticks are in time in each second
+    all_in_time_s: float  # until at least 98 % of the further ticks of each robot are in time
+    late_robots: int  # with less than 98 % of all their ticks in time
+    moves: int  # of sessions
+    most_sessions: int  # of one replica, at the end
+    requests: int
+    cpu_s: float
 
 
 @dataclass(frozen=True)
@@ -64,7 +88,7 @@ class Limit:
 
     part: str
     used: str
-    limit_robots: float
+    limit_robots: float | None  # None: it does not grow with the fleet
     source: str
 
 
@@ -89,40 +113,77 @@ class Shape:
         return -(-self.robots // self.replicas)
 
 
-def run(shape: Shape, seed: int, least_loaded: bool, until_s: float) -> tuple[Tally, World]:
-    """Simulate the fleet through all events before `until_s`."""
+@dataclass(frozen=True)
+class Scenario:
+    """A fleet to which something happens."""
+
+    name: str
+    until_s: float
+    happens: Callable[[World, Shape], None] | None = None
+    begun_s: float = STEADY_S  # time of the event
+    begin_within_s: float = 5.0  # time within which all robots start
+    least_loaded: bool = True  # else sessions are placed by a hash
+    replicas: float = 1.0  # share of the replicas that run at first
+
+
+def run(scenario: Scenario, shape: Shape, seed: int = 0) -> tuple[Tally, World]:
+    """Simulate the fleet through a scenario."""
     draw = random.Random(seed)
-    behaviour = Behaviour()
-    world = World(seed, behaviour, TRANSPORT_S, least_loaded)
-    for index in range(shape.replicas):
+    behaviour = Behaviour(act_cpu_s=SERVER_MS_AN_ACT / 1e3)
+    world = World(seed, behaviour, TRANSPORT_S, scenario.least_loaded)
+    for index in range(round(scenario.replicas * shape.replicas)):
         world.add_replica(MODEL, COSTS, LARGEST_BATCH, node=index % shape.nodes)
     tally = Tally()
     for _ in range(shape.robots):
-        world.add_stream(MODEL, shape.need, TRANSPORT_S, draw.uniform(0, MORNING_S), tally)
+        start_s = draw.uniform(0, scenario.begin_within_s)
+        world.add_stream(MODEL, shape.need, TRANSPORT_S, start_s, tally)
 
     world.at(0.0, world.compare, MODEL, 0)
-    world.at(NODE_LOST_S, partial(_lose, world), range(1), 0)
-    rack = range(1, 1 + shape.nodes // RACKS)
-    world.at(RACK_LOST_S, partial(_lose, world), rack, 0)
-    world.at(REPAIRED_S, partial(_repair, world), range(1 + shape.nodes // RACKS), 0)
-    world.at(UPDATE_S, partial(_update, world, set()), shape, 0)
-    world.run(until_s)
+    if scenario.happens is not None:
+        world.at(scenario.begun_s, partial(scenario.happens, world), shape, 0)
+    # There are no cycles, and a collection takes longer the more robots there are.
+    gc.disable()
+    try:
+        world.run(scenario.until_s)
+    finally:
+        gc.enable()
     world.finish()
     return tally, world
+
+
+def _lose_node(world: World, _: Shape, __: int = 0) -> None:
+    _lose(world, range(1))
+
+
+def _lose_rack(world: World, shape: Shape, _: int = 0) -> None:
+    """Lose the machines of a rack, which are back after 30 s."""
+    rack = range(shape.nodes // RACKS)
+    _lose(world, rack)
+    world.at(world.now + REPAIR_S, partial(_repair, world), rack, 0)
+
+
+def _lose(world: World, nodes: Sequence[int]) -> None:
+    """Lose machines: nothing ends the connections to their replicas."""
+    for replica in world.replicas[MODEL]:
+        if replica.node in nodes and replica.alive:
+            replica.fail(world.behaviour.silent_s)
 
 
 def _repair(world: World, nodes: Sequence[int], _: int) -> None:
     """Start the replicas of machines again."""
     for replica in list(world.replicas[MODEL]):
-        if replica.node in nodes:
+        if replica.node in nodes and not replica.alive:
             world.add_replica(MODEL, COSTS, LARGEST_BATCH, replica.node)
 
 
-def _lose(world: World, nodes: Sequence[int], _: int) -> None:
-    """Lose machines: nothing ends the connections to their replicas."""
-    for replica in world.replicas[MODEL]:
-        if replica.node in nodes and replica.alive:
-            replica.fail(world.behaviour.silent_s)
+def _add_replicas(world: World, shape: Shape, _: int = 0) -> None:
+    """Start the replicas that did not run at first."""
+    for index in range(len(world.replicas[MODEL]), shape.replicas):
+        world.add_replica(MODEL, COSTS, LARGEST_BATCH, index % shape.nodes)
+
+
+def _update_all(world: World, shape: Shape, _: int = 0) -> None:
+    _update(world, set(), shape, 0)
 
 
 def _update(world: World, updated: set[int], shape: Shape, _: int) -> None:
@@ -155,38 +216,54 @@ def _replace(
     world.at(world.now + START_S + 0.001, partial(_update, world, updated), shape, 0)
 
 
-def events(tally: Tally, until_s: float) -> list[Event]:
-    """Return what the robots got through each event."""
+SCENARIOS: Mapping[str, Scenario] = {
+    "morning": Scenario(
+        "all robots start within a minute",
+        MORNING_S + STEADY_S,
+        begun_s=0.0,
+        begin_within_s=MORNING_S,
+    ),
+    "hash": Scenario(
+        "the same, sessions placed by a hash",
+        MORNING_S + STEADY_S,
+        begun_s=0.0,
+        begin_within_s=MORNING_S,
+        least_loaded=False,
+    ),
+    "rush": Scenario("all robots start within 5 s", 45.0, begun_s=0.0),
+    "growth": Scenario(
+        "a quarter more replicas start, and sessions move", 45.0, _add_replicas, replicas=0.8
+    ),
+    "node": Scenario("a node is lost", 45.0, _lose_node),
+    "rack": Scenario("a rack is lost, and is back after 30 s", 75.0, _lose_rack),
+    "update": Scenario(
+        "a rolling update, a fifth of the replicas at once", 130.0 + STEADY_S, _update_all
+    ),
+}
+
+
+def outcome(scenario: Scenario, tally: Tally, world: World, cpu_s: float) -> Outcome:
+    """Return what the robots got from the event on."""
     in_time, starved = tally.by_second()
-    begins = {
-        "all robots start within a minute": 0.0,
-        "all act": MORNING_S,
-        "a node is lost": NODE_LOST_S,
-        "a rack is lost": RACK_LOST_S,
-        "the nodes are back": REPAIRED_S,
-        "a rolling update": UPDATE_S,
-    }
-    ends = [*list(begins.values())[1:], until_s - 1]
-    met = []
-    for (name, begin), next_begin in zip(begins.items(), ends, strict=True):
-        end = min(next_begin, until_s - 1)  # the last second may lack some ticks
-        if end <= begin:
-            continue
-        seconds = slice(int(begin), int(end))
-        ticks = np.maximum(in_time[seconds] + starved[seconds], 1)
-        shares = in_time[seconds] / ticks
-        shares[in_time[seconds] + starved[seconds] == 0] = 1.0
-        late = np.flatnonzero(shares < IN_TIME)
-        met.append(
-            Event(
-                name=name,
-                begun_s=begin,
-                share=float(in_time[seconds].sum() / ticks.sum()),
-                worst_share=float(shares.min()),
-                recovered_s=float(late[-1] + 1) if len(late) else 0.0,
-            )
-        )
-    return met
+    # The last second may lack some ticks.
+    seconds = slice(int(scenario.begun_s), int(scenario.until_s) - 1)
+    ticks = in_time[seconds] + starved[seconds]
+    shares = np.where(ticks > 0, in_time[seconds] / np.maximum(ticks, 1), 1.0)
+    late = np.flatnonzero(shares < IN_TIME)
+    all_in_time_s = max(stream.in_time_from_s(IN_TIME) for stream in world.streams)
+    replicas = world.replicas[MODEL]
+    return Outcome(
+        scenario=scenario.name,
+        share=float(in_time[seconds].sum() / max(1, ticks.sum())),
+        worst_share=float(shares.min()),
+        in_time_s=float(late[-1] + 1) if len(late) else 0.0,
+        all_in_time_s=max(0.0, all_in_time_s - scenario.begun_s),
+        late_robots=len(starved_streams(world.streams, IN_TIME)),
+        moves=world.moves,
+        most_sessions=max(replica.sessions for replica in replicas),
+        requests=sum(replica.requests for replica in replicas),
+        cpu_s=cpu_s,
+    )
 
 
 def limits(shape: Shape, requests_hz: float) -> list[Limit]:
@@ -196,43 +273,40 @@ def limits(shape: Shape, requests_hz: float) -> list[Limit]:
         shape: The fleet.
         requests_hz: Requests a second of one robot.
     """
-    of_node = shape.replicas / shape.nodes
-    comparisons = shape.replicas * (shape.replicas - 1) / COMPARE_S
-    of_sibling = _slope(REPLICA_CORES)
-    cores = of_sibling * (shape.replicas - 1)
-    controller_cores = CONTROLLER_CORES[2] + _slope(CONTROLLER_CORES) * (shape.replicas - 2)
-    controlled = 2 + (1 - CONTROLLER_CORES[2]) / _slope(CONTROLLER_CORES)
     a_core = 1000 / SERVER_MS_AN_ACT
+    mean_robots = shape.robots_of_a_replica
+    # A replica asks others for their numbers of sessions at each comparison, and for each client
+    # that begins there.
+    asked = min(MOST_ASKED, shape.replicas - 1)
+    asks_hz = 1 / COMPARE_S + mean_robots / MORNING_S
+    asking_cores = asks_hz * asked * _slope(REPLICA_CORES) * COMPARE_S
+    controller_cores = _controller_cores(shape.replicas)
+    checks_cores = CHECKING_CORES * shape.replicas / CHECKED_REPLICAS
     reached = [
         Limit(
-            "comparisons of sessions between replicas",
-            f"{comparisons:,.0f} calls a second, {cores:.2f} of a core in each replica",
-            shape.robots_of_a_replica / of_sibling,
-            "each replica asks each other one every 3 s; CPU of an idle replica among 2 and 12",
+            "the thread of one replica, requests at each tick",
+            f"{mean_robots * shape.hz:.0f} requests a second of {a_core:.0f}",
+            shape.robots * a_core / (mean_robots * shape.hz),
+            "CPU of an act by WebSocket with JPEG (docs/measured.md); robots per replica grow",
         ),
         Limit(
-            "thread of one replica, requests at each tick",
-            f"{shape.robots_of_a_replica * shape.hz:.0f} requests a second of {a_core:.0f}",
-            shape.robots * a_core / (shape.robots_of_a_replica * shape.hz),
-            "CPU of an act by WebSocket with JPEG (docs/measured.md)",
-        ),
-        Limit(
-            "thread of one replica, requests as the server states",
-            f"{shape.robots_of_a_replica * requests_hz:.0f} requests a second of {a_core:.0f}",
-            shape.robots * a_core / (shape.robots_of_a_replica * requests_hz),
+            "the thread of one replica, requests as the server states",
+            f"{mean_robots * requests_hz:.0f} requests a second of {a_core:.0f}",
+            shape.robots * a_core / (mean_robots * requests_hz),
             "the same",
         ),
         Limit(
             "connections of one proxy, all robots at one address of the server",
-            f"{shape.robots} of {PROXY_CONNECTIONS}",
+            f"{shape.robots:,} of {PROXY_CONNECTIONS:,}; on a morning "
+            f"{shape.robots / MORNING_S * OPENING_MS / 1e3:.2f} of 2 cores open them",
             PROXY_CONNECTIONS,
             "HAProxy's maxconn, which serve sets; robots at a replica's own port use none",
         ),
         Limit(
-            "connections from one address, such as a site behind NAT",
-            f"{shape.robots} of {CONNECTIONS_OF_AN_ADDRESS}",
+            "connections to a proxy from one address, such as a site behind NAT",
+            f"{shape.robots:,} of {CONNECTIONS_OF_AN_ADDRESS:,}",
             CONNECTIONS_OF_AN_ADDRESS,
-            "the limit by address, which serve sets",
+            "the limit by address, which serve sets; robots at a replica's own port use none",
         ),
         Limit(
             "CPU of one proxy, requests by HTTP at each tick",
@@ -241,19 +315,52 @@ def limits(shape: Shape, requests_hz: float) -> list[Limit]:
             "HAProxy's CPU of an act by HTTP (docs/measured.md), spread over the nodes",
         ),
         Limit(
-            "controller of Ray Serve",
+            "CPU of one proxy, health checks of all replicas",
+            f"{checks_cores:.2f} of 2 cores",
+            shape.robots * 2 / checks_cores,
+            "fleet_costs; each proxy checks each replica twice a second",
+        ),
+        Limit(
+            "Ray Serve's controller, with autoscaling",
             f"{controller_cores:.2f} of a core",
-            controlled * shape.robots_of_a_replica,
-            f"its CPU with 2 and 12 replicas, {of_node:.0f} of which are on a node here",
+            mean_robots * _controlled_replicas(),
+            "its CPU with 2 and 12 idle replicas, and ten decisions of autoscaling a second "
+            "(fleet_costs)",
+        ),
+        Limit(
+            "replicas that ask others for their sessions, on a morning",
+            f"{asked} others, {asks_hz * shape.replicas * asked:,.0f} calls a second, "
+            f"{asking_cores:.2f} of a core in each replica",
+            None,
+            "CPU of an idle replica among 2 and 12, for each replica that it asks",
         ),
     ]
-    return sorted(reached, key=lambda limit: limit.limit_robots)
+    return sorted(reached, key=lambda limit: limit.limit_robots or math.inf)
+
+
+def _controller_cores(replicas: int) -> float:
+    """Return the CPU of Serve's controller, in cores, with autoscaling."""
+    idle = CONTROLLER_CORES[2] + _slope(CONTROLLER_CORES) * (replicas - 2)
+    return idle + DECISIONS_HZ * (DECISION_MS[400] / 400) * replicas / 1e3
+
+
+def _controlled_replicas() -> int:
+    """Return the number of replicas at which Serve's controller uses a core."""
+    replicas = 2
+    while _controller_cores(replicas + 1) < 1:
+        replicas += 1
+    return replicas
 
 
 def _slope(values: dict[int, float]) -> float:
     """Return the growth of a value from the first to the last number of replicas, for each."""
     first, last = min(values), max(values)
     return (values[last] - values[first]) / (last - first)
+
+
+def _write(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -264,73 +371,60 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=Shape.nodes)
     parser.add_argument("--rows", type=int, default=Shape.rows)
     parser.add_argument("--hz", type=float, default=Shape.hz)
-    parser.add_argument("--seconds", type=float, default=450.0, help="of virtual time")
-    parser.add_argument("--hashed", action="store_true", help="place sessions by a hash")
+    parser.add_argument("--scenario", choices=SCENARIOS, action="append", help="default: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     shape = Shape(options.robots, options.replicas, options.nodes, options.hz, options.rows)
 
-    began = time.process_time()
-    tally, world = run(shape, options.seed, not options.hashed, options.seconds)
-    requests = sum(replica.requests for replica in world.replicas[MODEL])
-    busy_s = sum(replica.busy_s for replica in world.replicas[MODEL])
-    requests_hz = requests / shape.robots / options.seconds
     load = replica_load(COSTS, {shape.need: shape.robots_of_a_replica}, LARGEST_BATCH, TRANSPORT_S)
-    document: dict[str, Any] = {
-        "shape": asdict(shape),
-        "placement": "by hash" if options.hashed else "fewest sessions",
-        "seconds": options.seconds,
-        "load": load.load,
-        "share": tally.share,
-        "age_p50_ms": tally.age_s(0.5) * 1e3,
-        "age_p95_ms": tally.age_s(0.95) * 1e3,
-        "requests": requests,
-        "requests_hz": requests_hz,
-        "busy": busy_s / shape.replicas / options.seconds,
-        "moves": world.moves,
-        "cpu_s": time.process_time() - began,
-        "events": [asdict(event) for event in events(tally, options.seconds)],
-        "limits": [asdict(limit) for limit in limits(shape, requests_hz)],
-    }
-    show(document, print)
-    if options.json is not None:
-        options.json.write_text(json.dumps(document, indent=1) + "\n")
-
-
-def show(document: dict[str, Any], write: Callable[[str], None]) -> None:
-    """Write the results as Markdown."""
-    shape = document["shape"]
-    write(
-        f"{shape['robots']:,} robots at {shape['hz']:g} Hz, chunks of {shape['rows']} rows, on "
-        f"{shape['replicas']} replicas and {shape['nodes']} nodes, sessions at the replica "
-        f"{'by hash' if document['placement'] == 'by hash' else 'with the fewest'}; load "
-        f"{document['load']:.2f}. {document['seconds']:g} s, {document['requests']:,} requests, "
-        f"{document['cpu_s']:.0f} s of CPU. Ticks in time {document['share']:.4f}, age p50 "
-        f"{document['age_p50_ms']:.0f} ms, p95 {document['age_p95_ms']:.0f} ms, "
-        f"{document['moves']:,} moves of sessions.\n"
+    _write(
+        f"{shape.robots:,} robots at {shape.hz:g} Hz, chunks of {shape.rows} rows, on "
+        f"{shape.replicas} replicas and {shape.nodes} nodes; load {load.load:.2f}.\n"
     )
-    write("| event | ticks in time | worst second | s until 98 % of all ticks are in time |")
-    write("| --- | --- | --- | --- |")
-    for event in document["events"]:
-        write(
-            f"| {event['name']} | {event['share']:.4f} | {event['worst_share']:.4f} | "
-            f"{event['recovered_s']:.0f} |"
+    _write(
+        "| event | ticks in time | worst second | s until 98 % of all ticks are | s until 98 % of "
+        "each robot's are | robots below 98 % | moves | most sessions | requests | CPU s |"
+    )
+    _write("|" + " --- |" * 10)
+
+    outcomes = []
+    requests_hz = 0.0
+    for name in options.scenario or SCENARIOS:
+        scenario = SCENARIOS[name]
+        began = time.process_time()
+        tally, world = run(scenario, shape, options.seed)
+        result = outcome(scenario, tally, world, time.process_time() - began)
+        outcomes.append(result)
+        requests_hz = max(requests_hz, result.requests / shape.robots / scenario.until_s)
+        _write(
+            f"| {result.scenario} | {result.share:.4f} | {result.worst_share:.4f} | "
+            f"{result.in_time_s:.0f} | {result.all_in_time_s:.1f} | {result.late_robots} | "
+            f"{result.moves:,} | {result.most_sessions} | {result.requests:,} | "
+            f"{result.cpu_s:.0f} |",
         )
-    write("\n| part | use by this fleet | reached at robots | from |")
-    write("| --- | --- | --- | --- |")
-    for limit in document["limits"]:
-        write(
-            f"| {limit['part']} | {limit['used']} | {limit['limit_robots']:,.0f} | "
-            f"{limit['source']} |"
-        )
-    write(
+
+    found = limits(shape, requests_hz)
+    _write("\n| part | use by this fleet | reached at robots | from |")
+    _write("| --- | --- | --- | --- |")
+    for limit in found:
+        reached = "none" if limit.limit_robots is None else f"{limit.limit_robots:,.0f}"
+        _write(f"| {limit.part} | {limit.used} | {reached} | {limit.source} |")
+    _write(
         "\nAssumed: lost replicas are not replaced until their nodes are back; a robot notices a "
         f"lost machine after {Behaviour.silent_s:g} s and an ended connection after "
         f"{Behaviour.broken_s:g} s; a session that moves costs {Behaviour.move_s * 1e3:g} ms; "
         f"Ray Serve replaces {UPDATED_AT_ONCE:.0%} of the replicas at once, which start in "
         f"{START_S:g} s."
     )
+    if options.json is not None:
+        document: dict[str, Any] = {
+            "shape": asdict(shape),
+            "load": load.load,
+            "outcomes": [asdict(result) for result in outcomes],
+            "limits": [asdict(limit) for limit in found],
+        }
+        options.json.write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,15 +13,16 @@ import itertools
 import math
 import random
 import time
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from in_flight import AnySession, message_of_one
 
 from vlagents_ray.protocol.messages import Priority, Request
-from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
+from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
-from vlagents_ray.serve.queue.fair_queue import PATIENCE_S
+from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S
 from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
 from vlagents_ray.serve.requests import Origin, PendingRequest
 
@@ -53,17 +54,17 @@ class Robot:
     lies: bool = False  # whether it says that it is about to run out of rows
     obeys: bool = True  # whether it replans at the pace that it is told
     source: str = ""
-    planned: int = -1  # the last tick that has a row
-    began: float = math.inf  # tick of the first row
+    executed: int = 0  # rows
+    end: int = 0  # rows up to the end of its plan, with those executed
+    begun: bool = False  # whether the first answer is there, which its reset waits for
     captured: float = 0.0  # tick of the observation of its rows, s
     ticks: int = 0
     starved: int = 0
-    held: int = 0  # ticks without a row, at which the plan waits with the robot
-    last_starved: float = 0.0  # time of the last of them, s
     ages: list[float] = field(default_factory=list)
     waiting: PendingRequest | None = None
     waits_until: float = 0.0  # time before which a request is of no use, s
-    round_trip_s: float = 0.0
+    inference_s: float = 0.0  # duration of its last batch
+    late: list[float] = field(default_factory=list)  # times of its starved ticks, s
     plan: RobotPlan = field(default_factory=RobotPlan)
 
     def __post_init__(self) -> None:
@@ -112,10 +113,10 @@ class World:
         self.queue.bind(driven=True)
         self.pace = ReplicaPace(
             self.queue.window.curve,
-            lambda: [robot.plan.need for robot in self.robots],
+            lambda: [robot.plan for robot in self.robots],
             LARGEST,
             lambda: self.now,
-            self.queue.depth,
+            lambda: self.queue.depth_of(Priority.ROBOT),
         )
         self.busy = False
         self.batches: list[int] = []
@@ -141,34 +142,32 @@ class World:
         return self
 
     def _tick(self, robot: Robot, phase: float, tick: int) -> None:
-        period = 1 / robot.hz
-        at = phase + tick * period
-        if tick <= robot.planned:
-            if self.now >= self.measured_from and robot.rows > 1:
-                robot.ages.append(self.now - robot.captured)
-            if self.now >= self.measured_from:
-                robot.ticks += 1
-        elif robot.planned < 0:
-            robot.held += 1
-        else:
-            robot.held += 1
-            robot.last_starved = self.now
-            if self.now >= self.measured_from:
-                robot.ticks += 1
-                robot.starved += 1
-        self.at(at + period, lambda: self._tick(robot, phase, tick + 1))
+        """Send a request if it is due, by the rules of `ChunkPlayer`, and execute a row."""
+        period_s = 1 / robot.hz
+        at = phase + tick * period_s
+        self.at(at + period_s, lambda: self._tick(robot, phase, tick + 1))
 
-        slack_s = max(0.0, phase + (robot.planned + 1) * period - at) if robot.planned >= 0 else 0.0
-        if robot.rows == 1:
-            slack_s = period
-        starves = slack_s < robot.round_trip_s + period
-        if robot.waiting is not None or (self.now < robot.waits_until and not starves):
+        known = robot.end - robot.executed
+        slack_s = max(0.0, known * period_s - 2 * WIRE_S)
+        starves = known <= 1 or slack_s <= robot.inference_s + 2 * period_s
+        if robot.waiting is None and (starves or self.now >= robot.waits_until):
+            self._ask(robot, slack_s, at)
+
+        if not robot.begun:
             return
-        held = robot.held
-        self._ask(robot, slack_s, at, lambda: self._receive(robot, tick - held, at))
+        is_measured = self.now >= self.measured_from
+        robot.ticks += is_measured
+        if known > 0:
+            robot.executed += 1
+            if is_measured:
+                robot.ages.append(self.now - robot.captured)
+        else:
+            robot.starved += is_measured
+            robot.late.append(self.now)
 
-    def _ask(self, robot: Robot, slack_s: float, at: float, done: Callable[[], None]) -> None:
+    def _ask(self, robot: Robot, slack_s: float, at: float) -> None:
         arrived = self.now + WIRE_S
+        row = robot.executed
         pending = PendingRequest(
             robot.name,
             Request("act"),
@@ -178,11 +177,11 @@ class World:
             origin=Origin(connection=robot.source),
         )
         if robot.states_slack and self.slack:
-            slack_s = 0.0 if robot.lies else max(0.0, slack_s - 2 * WIRE_S)
-            pending.needed = arrived + slack_s
+            pending.needed = arrived + (0.0 if robot.lies else slack_s)
+            pending.waits_behind_others = robot.plan.waits_behind_others
         if self.deadlines and self.draw.random() < self.deadlines:
             pending.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])
-        pending.observer_data = {"done": done, "robot": robot}
+        pending.observer_data = {"done": lambda: self._receive(robot, row, at), "robot": robot}
         robot.waiting = pending
         self.sent += 1
         self.at(arrived, lambda: self._put(pending))
@@ -206,11 +205,18 @@ class World:
         pending.observer_data["patient"] = (
             pending.priority is Priority.ROBOT
             and bool(costs_s)
-            and pending.needed > self.now + 2 * costs_s[-1]
+            and self._can_wait(pending, self.now + 2 * costs_s[-1])
         )
         self.queue.put(pending)
         if not self.busy:
             self._turn()
+
+    @staticmethod
+    def _can_wait(pending: PendingRequest, urgent_s: float) -> bool:
+        """Whether a request is not urgent, if those are that are needed until `urgent_s`."""
+        if pending.waits_behind_others:
+            return pending.arrived + BEHIND_OTHERS_S > urgent_s
+        return pending.needed > urgent_s
 
     def _turn(self) -> None:
         taken = self.queue.take()
@@ -243,19 +249,20 @@ class World:
             pending
             for pending in self.queue._waiting.heads()
             if pending.priority is Priority.ROBOT
-            and pending.needed <= urgent_s
+            and not self._can_wait(pending, urgent_s)
             and not pending.over
             and pending.deadline >= self.now
         ]
         patient = [
             pending
             for pending in batch
-            if pending.observer_data["patient"] and pending.needed > urgent_s
+            if pending.observer_data["patient"] and self._can_wait(pending, urgent_s)
         ]
         assert not (left and patient), "an urgent request is behind pending that can wait"
 
     def _finish(self, batch: list[PendingRequest], took: float) -> None:
         self.queue.end()
+        self.queue.most_with_others = self.pace.most_with_others
         self.busy = False
         for pending in batch:
             self.answered += 1
@@ -264,13 +271,10 @@ class World:
             if robot is None:
                 pending.observer_data["done"]()
                 continue
-            robot.plan.observe(robot.rows, pending.arrived, pending.needed)
-            replan_s = 0.0
-            if pending.needed and robot.plan.need is not None:
-                replan_s = self.pace.replan_s(robot.plan.need, pending.arrived, pending.needed)
+            robot.plan.observe(robot.rows, pending.arrived, pending.needed, self.now)
+            replan_s = self.pace.replan_s(robot.plan) if pending.needed else 0.0
             arrives = self.now + WIRE_S
-            # Without the wait in the queue, which is long only for those who have the time.
-            robot.round_trip_s = 2 * WIRE_S + took
+            robot.inference_s = took
             self.at(
                 arrives, lambda pending=pending, replan_s=replan_s: self._answer(pending, replan_s)
             )
@@ -283,17 +287,14 @@ class World:
             robot.waits_until = self.now + replan_s
         pending.observer_data["done"]()
 
-    def _receive(self, robot: Robot, executed: int, at: float) -> None:
-        """The rows of an answer: those of actions that were executed since its observation are
-        skipped.
-        """
-        tick = executed + robot.held
-        if robot.rows == 1:
-            tick += 1
-            robot.ages.append(self.now - at)
-        last = tick + robot.rows - 1
-        if last > robot.planned:
-            robot.planned, robot.captured = last, at
+    def _receive(self, robot: Robot, row: int, captured: float) -> None:
+        """Take the rows of an answer, as `ChunkBuffer.add` does."""
+        robot.begun = True
+        end = row + robot.rows
+        if end == robot.executed == robot.end:
+            end += 1  # the last row may be executed one step late
+        if end > robot.executed and end > robot.end:
+            robot.end, robot.captured = end, captured
 
     def check_all_answered(self) -> None:
         """Nothing is lost, and no simulation waits for ever."""
@@ -307,6 +308,16 @@ class World:
         bound_s = PATIENCE_S + 2 * (len(self.simulations) + 1) * longest_batch_s
         for simulation in self.simulations:
             assert simulation.longest_s <= bound_s, f"{simulation.name} waited for too long"
+
+    def in_time(self) -> int:
+        """The robots of whose ticks at least 98 % had an action."""
+        return sum(
+            robot.ticks > 0 and 1 - robot.starved / robot.ticks >= 0.98 for robot in self.robots
+        )
+
+    def all_in_time_s(self) -> float:
+        """The time after which at least 98 % of each robot's ticks had an action."""
+        return max(_in_time_from_s(robot, self.now) for robot in self.robots)
 
     def share(self) -> float:
         """The lowest share in time of a robot."""
@@ -323,6 +334,14 @@ class World:
         """Of executed actions."""
         ages = sorted(age for robot in self.robots for age in robot.ages)
         return ages[int(0.95 * len(ages))] if ages else math.nan
+
+
+def _in_time_from_s(robot: Robot, until_s: float) -> float:
+    """Return the time from which on at least 98 % of a robot's ticks had an action, s."""
+    for count, late_s in enumerate(reversed(robot.late), start=1):
+        if count > 0.02 * (until_s - late_s) * robot.hz:
+            return late_s
+    return 0.0
 
 
 def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
@@ -374,13 +393,23 @@ def print_starts() -> None:
         for number, slack in itertools.product(numbers, (False, True)):
             robots = start_at_once(PI0, number, slack, *kinds).robots
             starved_s = [robot.starved / robot.hz for robot in robots]
-            last_s = max(robot.last_starved for robot in robots)
+            last_s = max(robot.late[-1] if robot.late else 0.0 for robot in robots)
             in_time = sum(robot.starved <= 0.02 * robot.ticks for robot in robots)
             print(
                 f"{number:6}  {rows:8} {slack!s:6} {sum(starved_s) / number:6.2f} "
                 f"{max(starved_s):6.2f}  {last_s:6.1f}  {in_time} with 98 % of a minute",
                 flush=True,
             )
+
+
+def most_of(costs: CostCurve, needs: Sequence[RobotNeed]) -> int:
+    """Return the largest fleet by arithmetic, of robots with these needs in turns."""
+    number = 0
+    while True:
+        counts = Counter(needs[index % len(needs)] for index in range(number + 1))
+        if not replica_load(costs, counts, LARGEST).in_time:
+            return number
+        number += 1
 
 
 def print_fleets() -> None:
@@ -396,7 +425,7 @@ def print_fleets() -> None:
     for label, costs in (("pi0", PI0), ("graphs", GRAPHS)):
         for name, kinds in fleets.items():
             needs = [RobotNeed(hz, rows) for rows, hz in kinds]
-            bound: float = most_robots(costs, needs[0], LARGEST) if len(needs) == 1 else math.nan
+            bound = most_of(costs, needs)
             before, after = (largest(costs, slack, *kinds) for slack in (False, True))
             ages = [
                 play(costs, max(1, before // 2), slack, *kinds).age_p95_s()
@@ -405,6 +434,45 @@ def print_fleets() -> None:
             print(
                 f"{label:6} {name:18} {bound:10} {before:6} {after:6} {after / max(1, before):6.2f}"
                 f"  {ages[0]:.3f} {ages[1]:.3f} s",
+                flush=True,
+            )
+
+
+def print_overload() -> None:
+    """Print what fleets get that all start at once, and fleets that are too large."""
+    print("all start at once     states an SLO  slack  share  in time  s until all are in time")
+    for robots in (200, 400):
+        for states_slo in (True, False):
+            for slack in (False, True):
+                started = fleet(robots, (50, 10.0))
+                for robot in started:
+                    if not states_slo:
+                        robot.states_slo, robot.plan = False, RobotPlan()
+                world = World(PI0, started, seed=1, slack=slack, begin_s=0.5).run(60.0)
+                print(
+                    f"{robots:4} of 50 rows          {states_slo!s:14} {slack!s:5}  "
+                    f"{world.mean_share():.3f}  {world.in_time():6}  {world.all_in_time_s():.1f}",
+                    flush=True,
+                )
+    print("too many              load  slack  share  in time")
+    too_many: dict[str, tuple[int, list[tuple[int, float]]]] = {
+        "96 of 50 and 8 rows": (96, [(50, 10.0), (8, 10.0)]),
+        "120 of 50 and 8 rows": (120, [(50, 10.0), (8, 10.0)]),
+        "64 of 8 rows": (64, [(8, 10.0)]),
+        "500 of 50 rows": (500, [(50, 10.0)]),
+    }
+    for name, (robots, kinds) in too_many.items():
+        counts = Counter(
+            RobotNeed(hz, rows)
+            for rows, hz in (kinds[index % len(kinds)] for index in range(robots))
+        )
+        load = replica_load(PI0, counts, LARGEST).load
+        for slack in (False, True):
+            world = World(PI0, fleet(robots, *kinds), seed=1, slack=slack)
+            world.measured_from = 20.0
+            world.run(60.0)
+            print(
+                f"{name:21} {load:.2f}  {slack!s:5}  {world.mean_share():.3f}  {world.in_time():6}",
                 flush=True,
             )
 
@@ -455,6 +523,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--fleets", action="store_true", help="print the largest fleets in time")
     parser.add_argument("--starts", action="store_true", help="print starts of all robots at once")
+    parser.add_argument("--overload", action="store_true", help="print starts and overload")
     options = parser.parse_args()
 
     began = time.monotonic()
@@ -468,6 +537,8 @@ def main() -> None:
         print_starts()
     if options.fleets:
         print_fleets()
+    if options.overload:
+        print_overload()
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from tests.simulation.robots import (
     start_at_once,
 )
 from vlagents_ray.serve.fleet import CostCurve
+from vlagents_ray.serve.queue.replica_pace import RobotPlan
 
 
 def test_no_request_is_lost_and_none_overtakes_an_urgent_one() -> None:
@@ -105,3 +106,24 @@ def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
     assert all(need is not None and need.rows == 50 for need in needs)
     assert all(need is not None and abs(need.hz - 10.0) <= 1.0 for need in needs)
     assert world.queue.depth() <= 32, "they wait at home, not in the queue"
+
+
+@pytest.mark.parametrize("states_slo", [True, False])
+def test_robots_that_all_start_at_once_are_soon_in_time(states_slo: bool) -> None:
+    robots = fleet(400, (50, 10.0))
+    for robot in robots:
+        if not states_slo:
+            robot.states_slo, robot.plan = False, RobotPlan()
+    world = World(PI0, robots, seed=1, begin_s=0.5).run(60.0)
+    assert world.all_in_time_s() <= (10.0 if states_slo else 20.0)
+
+
+def test_robots_that_came_first_are_in_time_where_there_are_too_many() -> None:
+    kinds = [(50, 10.0), (8, 10.0)]
+    world = World(PI0, fleet(120, *kinds), seed=1)
+    world.measured_from = 20.0
+    world.run(60.0)
+    admitted = [robot for robot in world.robots if robot.plan.is_admitted]
+    assert 0.7 * 96 <= len(admitted) < 96
+    assert world.in_time() >= 0.9 * len(admitted)
+    assert min(robot.ticks - robot.starved for robot in world.robots) > 0, "none gets nothing"

@@ -497,7 +497,7 @@ class ChunkPlayer(Agent):
             return True
         # It waits no longer than an urgent request can be answered in time. The wait in the queue
         # does not count: otherwise robots would ask the more often the longer the queue is.
-        return self._slack_ms() <= self._inference_ms + self._period_ms()
+        return self._slack_ms() <= self._inference_ms + 2 * self._period_ms()
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
         """Add the answer of the policy to the plan, if there is one; raise an error that another
@@ -533,10 +533,9 @@ class ChunkPlayer(Agent):
 
     def _slack_ms(self) -> float:
         """Return the time, ms, that the server has for the answer to a request of this tick: until
-        the last row that is left, without the time on the way.
+        the tick after the last row that is left, without the time on the way.
         """
-        rows_after_this = max(0, self._plan.known - 1)
-        return max(0.0, rows_after_this * self._period_ms() - self._wire_ms)
+        return max(0.0, self._plan.known * self._period_ms() - self._wire_ms)
 
     def _period_ms(self) -> float:
         """Return the period of the loop, ms, from its last ticks; 0 before the second one."""

@@ -127,6 +127,8 @@ class PendingRequest:
     # Time at which the robot needs the answer, s, of the engine's clock; 0.0 if it states no slack:
     # as soon as possible.
     needed: float = 0.0
+    # Whether the requests of other robots go first, as the replica cannot serve all in time.
+    waits_behind_others: bool = False
     origin: Origin = NOWHERE
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock

@@ -1,10 +1,11 @@
 """A fleet in virtual time: robots that execute chunks, replicas with the batch queue of the server,
 and what happens to them.
 
-The queue is `BatchQueue`, driven by `take`. All else is arithmetic: a batch takes the time of the
-cost curve, a message the time of the transport, and a robot follows the rules of the chunk player
-in mode "async": one request at a time with the newest observation, sent at a tick, no earlier than
-the server allows unless the robot would starve; rows for executed ticks are skipped, and a robot
+The order of the requests, their batches and the pace of the robots are those of the server's own
+code, `FairQueue` and `ReplicaPace`. All else is arithmetic: a batch takes the time of the cost
+curve, a message the time of the transport, and a robot follows the rules of the chunk player in
+mode "async": one request at a time with the newest observation, sent at a tick, no earlier than the
+server allows unless the robot would starve; rows for executed ticks are skipped, and a robot
 without a row holds still, with its plan. Ticks are counted, not simulated: nothing but the rows
 that are left changes between two answers. The same seed gives the same result.
 """
@@ -17,19 +18,19 @@ import random
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from vlagents_ray.protocol.messages import Priority, Request
-from vlagents_ray.serve.fleet import CostCurve, RobotNeed, replica_load
-from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.fleet import CostCurve, RobotNeed
+from vlagents_ray.serve.queue.fair_queue import FairQueue
+from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 _ACT = Request("act")
 _MESSAGE = IncomingMessage("simulation")  # of all requests: nothing is delivered
-# The field of a request with the time at which its answer is needed, for a queue that uses it.
-_NEEDED = "needed"
+_DRAWN = 8192  # random delays, which are drawn once, as each message has one
 _AGE_BIN_S = 0.001
 _AGE_BINS = 120_000
 _FLUSH = 200_000  # runs of ticks that are kept until they are added up
@@ -37,22 +38,8 @@ _FLUSH = 200_000  # runs of ticks that are kept until they are added up
 # excess of sessions over their mean.
 _COMPARE_S = 3.0
 _TOLERATED = 1.25
-
-
-class _EverySession:
-    """The sessions of a replica: all that a request names."""
-
-    def __contains__(self, session_id: object) -> bool:
-        return True
-
-
-class _NoFiles:
-    """In place of the poller: nothing is read from files here."""
-
-    def wake(self) -> None:
-        pass
-
-    hand_to_reader = reclaim = close = wake
+# As in `vlagents_ray.serve.scaling.sibling_replicas`: replicas that one asks for their sessions.
+_MOST_ASKED = 32
 
 
 @dataclass(frozen=True)
@@ -62,7 +49,9 @@ class Behaviour:
     Args:
         jitter: Standard deviation of the duration of a batch, as a share of it.
         transport_jitter_s: Mean of the time by which a message is late, s.
+        slack: Whether robots state their slack, and the queue uses it.
         replan: Whether the server states when the next request of a robot is useful.
+        act_cpu_s: CPU time of a request in the process of a replica, which reads one at a time, s.
         broken_s: Time until a robot whose connection ends has sent its request to another replica.
         silent_s: The same for a replica whose machine is lost, so that nothing ends the connection.
         move_s: Time by which the first request at another replica comes later, as its session
@@ -71,7 +60,9 @@ class Behaviour:
 
     jitter: float = 0.03
     transport_jitter_s: float = 0.001
+    slack: bool = True
     replan: bool = True
+    act_cpu_s: float = 0.0
     broken_s: float = 0.1
     silent_s: float = 3.0
     move_s: float = 0.02
@@ -156,6 +147,14 @@ def _longer(counts: np.ndarray, size: int) -> np.ndarray:
     return np.pad(counts, (0, size - len(counts)))
 
 
+class _StreamRequest(PendingRequest):
+    """The request of a stream: the same object each time, as a stream has one at a time."""
+
+    __slots__ = ("stream",)
+
+    stream: Stream
+
+
 class Stream:
     """The use of one model by one robot: a plan of rows, and at most one request."""
 
@@ -170,12 +169,15 @@ class Stream:
         "_left",
         "_period_s",
         "_phase_s",
-        "_round_trip_s",
         "_tick",
         "asks",
+        "late",
         "need",
+        "plan",
         "replica",
+        "request",
         "session_id",
+        "slack_s",
         "starved",
         "tally",
         "ticks",
@@ -195,12 +197,17 @@ class Stream:
         self.world = world
         self.session_id = session_id
         self.need = need
+        self.plan = RobotPlan(need, is_stated=True)
+        self.request = _StreamRequest(session_id, _ACT, _MESSAGE, Priority.ROBOT, arrived=start_s)
+        self.request.stream = self
         self.transport_s = transport_s
         self.tally = tally
         self.replica: Replica | None = None
         self.ticks = 0
         self.starved = 0
+        self.late: list[tuple[float, int]] = []  # first times, s, and numbers of starved ticks
         self.asks = 0  # numbers its requests, so that an answer to an abandoned one is known
+        self.slack_s = 0.0  # the slack that the last request states
         self._period_s = 1 / need.hz
         self._phase_s = start_s
         self._tick = 0  # the next tick that is not counted yet
@@ -212,24 +219,18 @@ class Stream:
         self._asked_at_s = 0.0
         self._delay_s = 0.0  # by which its next message is late, s
         self._begun = False  # whether the first answer is there
-        self._round_trip_s = transport_s
 
     def begin(self) -> None:
         """Send the first request."""
         self._ask(0)
 
-    def deadline_s(self) -> float:
-        """Return the time at which the plan ends, less the way back, s; now without a plan."""
-        if not self._left:
-            return self.world.now
-        return self._phase_s + (self._tick + self._left) * self._period_s - self.transport_s / 2
-
-    def answered(self, arrives_s: float, replan_s: float) -> None:
+    def answered(self, arrives_s: float, replan_s: float, inference_s: float) -> None:
         """Take the answer to the last request, and plan the next one.
 
         Args:
             arrives_s: The time at which the answer arrives, s.
             replan_s: The time from then on at which the next request is useful, s; 0: at once.
+            inference_s: The duration of its batch, s.
         """
         period_s = self._period_s
         tick = max(math.ceil((arrives_s - self._phase_s) / period_s), self._asked + 1)
@@ -245,14 +246,14 @@ class Stream:
         if rows > 0:
             self._left = rows
             self._captured_s = self._asked_at_s
-        round_trip_s = arrives_s - self._asked_at_s
-        self._round_trip_s += 0.25 * (round_trip_s - self._round_trip_s)
 
         due = tick
         if replan_s > 0:
             allowed = math.ceil((arrives_s + replan_s - self._phase_s) / period_s)
-            urgent = tick + self._left - math.floor(self._round_trip_s / period_s) - 2
-            due = max(tick, min(allowed, urgent))
+            if allowed > tick:
+                # It waits no longer than an urgent request can be answered in time.
+                kept_rows = 2 + (inference_s + self.transport_s) / period_s
+                due = max(tick, min(allowed, tick + math.ceil(self._left - kept_rows)))
         self._ask(due)
 
     def resend(self) -> None:
@@ -270,6 +271,17 @@ class Stream:
             if tick > self._tick:
                 self._count_until(tick)
 
+    def in_time_from_s(self, share: float) -> float:
+        """Return the time from which on at least that share of its ticks were in time, s; 0.0 if
+        that is so from its first tick on.
+        """
+        late = 0
+        for first_s, ticks in reversed(self.late):
+            late += ticks
+            if late > (1 - share) * (self.world.now - first_s) / self._period_s:
+                return first_s + ticks * self._period_s
+        return 0.0
+
     def _ask(self, tick: int) -> None:
         """Send a request with the observation of this tick, before its row is executed."""
         if self._begun and tick > self._tick:
@@ -277,6 +289,7 @@ class Stream:
         self._asked = tick
         self._asked_row = self._executed
         self._asked_at_s = self._phase_s + tick * self._period_s
+        self.slack_s = max(0.0, self._left * self._period_s - self.transport_s)
         self._send(self._asked_at_s)
 
     def _send(self, sent_s: float) -> None:
@@ -291,23 +304,25 @@ class Stream:
         ticks = tick - self._tick
         if ticks <= 0:
             return
-        executed = min(ticks, self._left)
+        left = self._left
+        executed = min(ticks, left)
         first_s = self._phase_s + self._tick * self._period_s
         if executed:
             self.tally.add(first_s, executed, self._period_s, first_s - self._captured_s)
-        starved = ticks - executed
-        if starved:
+            self._executed += executed
+            self._left = left - executed
+        if executed < ticks:
+            starved = ticks - executed
             first_s += executed * self._period_s
             self.tally.add(first_s, starved, self._period_s, -1.0)
-        self._executed += executed
-        self._left -= executed
+            self.late.append((first_s, starved))
+            self.starved += starved
         self._tick = tick
         self.ticks += ticks
-        self.starved += starved
 
 
 class Replica:
-    """A policy with its batch queue."""
+    """A policy with its queue and the pace of its robots."""
 
     def __init__(
         self, world: World, model: str, costs: CostCurve, max_batch_size: int, node: int = 0
@@ -317,54 +332,72 @@ class Replica:
         self.node = node
         self.alive = True
         self.accepts = True  # whether new sessions may begin here
-        self.needs: dict[RobotNeed, int] = {}  # of its sessions
-        self.sessions = 0
+        self.streams: dict[Stream, None] = {}  # its sessions, the oldest first
         self.surplus = 0  # sessions that are asked to reconnect
         self.batches = 0
         self.requests = 0
         self.busy_s = 0.0
+        self.queue = FairQueue()
+        sizes = range(1, max_batch_size + 1)
+        self.queue.costs_s = [0.0, *(costs.cost_s(size) for size in sizes)]
         self._detected_s = 0.0  # once it is lost: time until a robot notices it, s
         self._costs = costs
         self._largest = max_batch_size
-        self._streams: dict[str, tuple[Stream, int]] = {}  # of the waiting requests
         self._busy = False
         self._running: list[PendingRequest] = []
-        self._replan_s: dict[RobotNeed, float] | None = None
-        self.queue = BatchQueue(
-            max_batch_size,
-            sessions=_EverySession(),
-            clock=world.clock,
-            poller=_NoFiles(),  # type: ignore[arg-type]
-        )
-        self.queue.bind(driven=True)
+        self._taken_s = 0.0  # duration of the running batch
+        self._read_s = 0.0  # time at which all requests that have arrived are read
+        self._pace = ReplicaPace(self._curve, self._plans, max_batch_size, world.clock, self._depth)
+
+    @property
+    def sessions(self) -> int:
+        """The number of its sessions."""
+        return len(self.streams)
 
     def join(self, stream: Stream) -> None:
         """Begin a session."""
         stream.replica = self
-        self._change(stream.need, 1)
+        stream.plan.is_admitted = None
+        self.streams[stream] = None
 
     def leave(self, stream: Stream) -> None:
         """End a session."""
         stream.replica = None
-        self._change(stream.need, -1)
+        del self.streams[stream]
 
-    def _change(self, need: RobotNeed, by: int) -> None:
-        self.needs[need] = self.needs.get(need, 0) + by
-        if not self.needs[need]:
-            del self.needs[need]
-        self.sessions += by
-        self._replan_s = None
+    def _curve(self) -> CostCurve:
+        return self._costs
+
+    def _plans(self) -> list[RobotPlan]:
+        return [stream.plan for stream in self.streams]
+
+    def _depth(self) -> int:
+        return self.queue.depth[Priority.ROBOT]
 
     def receive(self, stream: Stream, number: int) -> None:
-        """Queue a request."""
+        """Read a request, after those that have arrived before it."""
         world = self.world
-        request = PendingRequest(
-            stream.session_id, _ACT, _MESSAGE, Priority.ROBOT, arrived=world.now
-        )
-        if world.requests_have_slack:
-            setattr(request, _NEEDED, max(world.now, stream.deadline_s()))
-        self._streams[stream.session_id] = stream, number
-        self.queue.put(request)
+        cpu_s = world.behaviour.act_cpu_s
+        if cpu_s > 0:
+            self._read_s = max(self._read_s, world.now) + cpu_s
+            world.at(self._read_s, self._queue, stream, number)
+        else:
+            self._queue(stream, number)
+
+    def _queue(self, stream: Stream, number: int) -> None:
+        if stream.asks != number:
+            return
+        if not self.alive:
+            self.miss(stream, number)
+            return
+        now = self.world.now
+        request = stream.request
+        request.arrived = now
+        request.begun = False
+        if self.world.behaviour.slack:
+            request.needed = now + stream.slack_s
+            request.waits_behind_others = stream.plan.is_admitted is False
+        self.queue.add(request)
         if not self._busy:
             self._take()
 
@@ -379,63 +412,54 @@ class Replica:
         """
         self.alive = self.accepts = False
         self._detected_s = detected_s
-        waiting = [*self._running, *self.queue.close()]
-        streams = [self._streams[request.session_id] for request in waiting]
-        for stream, number in streams:
-            self.miss(stream, number)
-        self._streams.clear()
-        return [stream for stream, _ in streams]
+        waiting = [_stream_of(request) for request in (*self._running, *self.queue.clear())]
+        for stream in waiting:
+            self.miss(stream, stream.asks)
+        self._running = []
+        return waiting
 
     def miss(self, stream: Stream, number: int) -> None:
         """Leave a request unanswered, which its robot notices after a time."""
         self.world.at(self.world.now + self._detected_s, self.world.resend, stream, number)
 
     def _take(self) -> None:
-        if not self.alive:
-            return
-        taken = self.queue.take()
-        if taken is None or not taken.batch:
-            return
         world = self.world
+        batch, _ = self.queue.take(self._largest, world.now, self._pace.most_with_others)
+        if not batch:
+            return
         self._busy = True
-        self._running = taken.batch
-        duration_s = self._costs.cost_s(len(taken.batch)) * world.factor()
-        self.queue.begin(taken.batch)
+        self._running = batch
+        self._taken_s = self.queue.costs_s[len(batch)] * world.factor()
         self.batches += 1
-        self.requests += len(taken.batch)
-        self.busy_s += duration_s
-        world.at(world.now + duration_s, self._end, None, 0)
+        self.requests += len(batch)
+        self.busy_s += self._taken_s
+        world.at(world.now + self._taken_s, self._end, None, 0)
 
     def _end(self, _: None, __: int) -> None:
         if not self.alive:
             return
         world = self.world
-        self.queue.end()
+        now = world.now
+        is_paced = world.behaviour.replan and world.behaviour.slack
         batch, self._running = self._running, []
-        replan_s = self._replan()
         for request in batch:
-            stream, number = self._streams.pop(request.session_id)
-            if stream.asks != number:
-                continue
-            arrives_s = world.now + stream.transport_s / 2 + world.late_s()
-            left_s = replan_s[stream.need] - (world.now - request.arrived) if replan_s else 0.0
+            stream = _stream_of(request)
+            replan_s = 0.0
+            if is_paced:
+                stream.plan.observe(stream.need.rows, request.arrived, request.needed, now)
+                replan_s = self._pace.replan_s(stream.plan)
             if not self.accepts or self.surplus > 0:
                 self.surplus -= 1
                 world.move(stream)
-            stream.answered(arrives_s, max(0.0, left_s))
+            arrives_s = now + stream.transport_s / 2 + world.late_s()
+            stream.answered(arrives_s, replan_s, self._taken_s)
         self._busy = False
-        self._take()
+        if self.queue.size:
+            self._take()
 
-    def _replan(self) -> dict[RobotNeed, float]:
-        """Return the time between two requests of its robots that the replica states, s."""
-        if self._replan_s is None:
-            self._replan_s = {}
-            if self.world.behaviour.replan:
-                transport_s = self.world.transport_s
-                load = replica_load(self._costs, self.needs, self._largest, transport_s)
-                if math.isfinite(load.load):
-                    self._replan_s = {need: load.replan_s(need) for need in self.needs}
-        return self._replan_s
+
+def _stream_of(request: PendingRequest) -> Stream:
+    return cast(_StreamRequest, request).stream
 
 
 Event = tuple[float, int, Callable[..., None], Any, int]
@@ -458,9 +482,9 @@ class World:
             behaviour: What messages and faults take.
             transport_s: The time of a request and its answer on the way, for the arithmetic of the
                 server.
-            least_loaded: Whether a session begins at the replica with the fewest sessions, as
-                clients of a replica's own port do; else at one by the hash of its id, as behind a
-                proxy.
+            least_loaded: Whether a session begins at the replica with the fewest sessions of those
+                that one replica asks, as clients of a replica's own port do; else at one by the
+                hash of its id, as behind a proxy.
         """
         self.now = 0.0
         self.behaviour = behaviour
@@ -470,8 +494,11 @@ class World:
         self.streams: list[Stream] = []
         self.events = 0
         self.moves = 0
-        self.requests_have_slack = _NEEDED in PendingRequest.__slots__
         self._draw = random.Random(seed)
+        self._delays_s = [
+            self._draw.expovariate(1.0) * behaviour.transport_jitter_s for _ in range(_DRAWN)
+        ]
+        self._messages = 0
         self._due: list[Event] = []
         self._count = 0
 
@@ -480,8 +507,9 @@ class World:
         return self.now
 
     def late_s(self) -> float:
-        """Draw the time by which a message is late, s."""
-        return self._draw.expovariate(1.0) * self.behaviour.transport_jitter_s
+        """Return the time by which the next message is late, s."""
+        self._messages += 1
+        return self._delays_s[self._messages % _DRAWN]
 
     def factor(self) -> float:
         """Draw the duration of a batch, as a multiple of its cost."""
@@ -533,6 +561,8 @@ class World:
         if not accepting:
             return None
         if self.least_loaded:
+            if len(accepting) > _MOST_ASKED + 1:
+                accepting = self._draw.sample(accepting, _MOST_ASKED + 1)
             return min(accepting, key=_sessions_of)
         return self._draw.choice(accepting)
 

@@ -16,6 +16,7 @@ from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import REPLAN, SLACK, SLO
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.fleet import CostCurve
 
 ROWS = 50
 
@@ -135,15 +136,41 @@ def test_robots_of_a_busy_replica_are_told_when_to_replan(engine: Engine) -> Non
 
 
 def test_an_slo_moves_with_its_session(engine: Engine) -> None:
-    reset(engine, "a", slo={"hz": 10, "age_ms": 500})
+    reset(engine, "a", slo={"hz": 10, "age_ms": 500, "rows": 8})
     act(engine, "a", slack_ms=2000.0)
     state = engine.moves.export("a", engine.clock())
     plan = engine.sessions.get("a").plan
-    assert list(state.robot) == [10, ROWS, 0.5, True]
+    assert list(state.robot) == [10, 8, 0.5, True, 0.98, 8]
     engine.sessions.close("a")
     engine.sessions.free("a")
     engine.moves.adopt("a", state)
-    assert engine.sessions.get("a").plan.need == plan.need
+    moved = engine.sessions.get("a").plan
+    assert (moved.need, moved.most_rows) == (plan.need, 8)
+
+
+def test_a_robot_that_executes_a_part_of_each_answer_needs_the_next_one_sooner(
+    engine: Engine,
+) -> None:
+    reset(engine, "a", slo={"hz": 10, "rows": 8})
+    act(engine, "a", slack_ms=500.0)
+    need = engine.sessions.get("a").plan.need
+    assert need is not None
+    assert need.rows == 8, "the answer has 50"
+
+
+def test_requests_of_robots_that_came_too_late_wait_behind_others(engine: Engine) -> None:
+    reset(engine, "first", slo={"hz": 10})
+    act(engine, "first", slack_ms=2000.0)
+    engine.pace._curve = lambda: CostCurve(row_s=0.005)
+    told = [reset(engine, f"robot{number}", slo={"hz": 60})[SLO] for number in range(9)]
+    assert [answer["in_time"] for answer in told] == sorted(
+        (answer["in_time"] for answer in told), reverse=True
+    )
+    assert not told[-1]["in_time"]
+    late = checked(engine, "robot8", Request("act", Obs(info={SLACK: 250})), ignore)
+    first = checked(engine, "first", Request("act", Obs(info={SLACK: 250})), ignore)
+    assert late.waits_behind_others
+    assert not first.waits_behind_others
 
 
 def test_the_costs_of_batches_are_measured(engine: Engine) -> None:

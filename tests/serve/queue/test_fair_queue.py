@@ -19,7 +19,7 @@ from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
-from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
+from vlagents_ray.serve.queue.fair_queue import BEHIND_OTHERS_S, PATIENCE_S, FairQueue
 from vlagents_ray.serve.requests import Origin, PendingRequest
 
 
@@ -232,3 +232,42 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     assert quiet.next() == ([], []), "its thread is told that nothing came for long"
     assert 0.05 <= quiet.load_s()[0] - before_s <= time.perf_counter() - began
     quiet.poller.close()
+
+
+def behind(session: str, *, arrived: float = 0.0) -> PendingRequest:
+    """The request of a robot that is about to run out of rows, but came too late to be admitted."""
+    request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
+    request.needed = arrived
+    request.waits_behind_others = True
+    return request
+
+
+def test_robots_that_are_not_admitted_wait_behind_all_others() -> None:
+    waiting = FairQueue()
+    waiting.costs_s = (0.0, 0.05, 0.06)
+    patient = ticket("patient", priority=Priority.ROBOT)
+    patient.needed = 9.0
+    for request in (
+        behind("late1"),
+        behind("late2"),
+        patient,
+        ticket("urgent", priority=Priority.ROBOT),
+        ticket("env"),
+    ):
+        waiting.add(request)
+    order = [taken(waiting, 1)[0] for _ in range(5)]
+    assert order == ["urgent", "patient", "late1", "late2", "env"]
+
+
+def test_no_robot_waits_behind_others_for_ever() -> None:
+    waiting = FairQueue()
+    waiting.costs_s = (0.0, 0.05)
+    waiting.add(behind("late"))
+    answered = []
+    for second in range(1, 70):
+        waiting.add(ticket(f"urgent{second}", priority=Priority.ROBOT, arrived=float(second)))
+        waiting.add(ticket(f"also{second}", priority=Priority.ROBOT, arrived=float(second)))
+        answered += [(name, second) for name in taken(waiting, 1, now=float(second))]
+        answered += [(name, second) for name in taken(waiting, 1, now=float(second))]
+    [when] = [second for name, second in answered if name == "late"]
+    assert BEHIND_OTHERS_S <= when <= BEHIND_OTHERS_S + 2

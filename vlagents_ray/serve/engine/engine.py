@@ -14,6 +14,7 @@ from contextlib import suppress
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import OutcomeUnknown
 from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.background_calls import BackgroundCalls
 from vlagents_ray.serve.engine.health import Health
@@ -103,10 +104,10 @@ class Engine:
 
         self.pace = ReplicaPace(
             self.queue.window.curve,
-            lambda: [session.plan.need for session in self.sessions.all()],
+            lambda: [session.plan for session in self.sessions.all()],
             settings.max_batch_size,
             clock,
-            self.queue.depth,
+            lambda: self.queue.depth_of(Priority.ROBOT),
         )
 
         parts = EngineParts(

@@ -299,9 +299,10 @@ class Runner:
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
         session.plan = RobotPlan()
         if opening.slo is not None:
-            need = need_of(opening.slo, 1 if model.contract is None else model.contract.chunk or 1)
-            info[SLO] = self._pace.check(need)
-            session.plan = RobotPlan(need, is_stated=True)
+            rows = 1 if model.contract is None else model.contract.chunk or 1
+            info[SLO] = self._pace.check(need_of(opening.slo, rows))
+            session.plan = RobotPlan.from_slo(opening.slo, rows)
+            session.plan.is_admitted = info[SLO]["in_time"]
             session.times = session.times or RobotTimes(pending.priority)
             session.times.target_share = opening.slo.share
         spent = timing(pending, call.began, call.ended)
@@ -522,9 +523,10 @@ class Runner:
         act, plan = reply.act, session.plan
         if act is None:
             return
-        plan.observe(len(act.rows()), pending.arrived, pending.needed)
-        if pending.needed and plan.need is not None:
-            replan_s = self._pace.replan_s(plan.need, pending.arrived, pending.needed)
+        plan.observe(len(act.rows()), pending.arrived, pending.needed, self._clock())
+        if pending.needed:
+            replan_s = self._pace.replan_s(plan)
+            self._queue.most_with_others = self._pace.most_with_others
             if replan_s > 0:
                 act.info[REPLAN] = replan_s * 1e3
 

@@ -14,6 +14,7 @@ how long. `patience=0` disables this.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -72,6 +73,8 @@ class BatchQueue:
     ) -> None:
         self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
+        # The size up to which batches are filled with requests that wait behind others.
+        self.most_with_others: float = math.inf
         self._waiting = FairQueue()
 
         self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
@@ -158,7 +161,7 @@ class BatchQueue:
             self._load_timer.count(self._waiting.size, now)
             if self._closed:
                 return None
-            batch, expired = self._waiting.take(self.largest, now)
+            batch, expired = self._waiting.take(self.largest, now, self.most_with_others)
             if batch:
                 self.window.record_start(batch)
         return Taken(batch, expired)
@@ -211,6 +214,10 @@ class BatchQueue:
     def depth(self) -> int:
         """Return the number of requests that wait for the next batch."""
         return self._waiting.size
+
+    def depth_of(self, priority: Priority) -> int:
+        """Return the number of requests of a priority that wait for the next batch."""
+        return self._waiting.depth[priority]
 
     def depth_by_priority(self) -> dict[Priority, int]:
         """Return the number of requests that wait for the next batch, by priority."""

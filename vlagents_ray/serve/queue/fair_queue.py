@@ -14,6 +14,9 @@ turns, the others follow by the time at which they need their answers, and becom
 comes near. So a client gains nothing by stating less slack than it has. A batch takes no request
 that can wait, and no simulation, if its most urgent answer would be late only because of that row.
 
+If the robots need more than the replica can do, those that it cannot serve in time
+(`PendingRequest.waits_behind_others`) wait behind all other robots, at most `BEHIND_OTHERS_S`.
+
 Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
 of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
 batch.
@@ -32,6 +35,8 @@ from vlagents_ray.serve.requests import PendingRequest
 
 # Time after which a simulation gets a slot although robots' requests keep arriving.
 PATIENCE_S = 1.0
+# Time for which the request of a robot waits behind those of other robots at most, s.
+BEHIND_OTHERS_S = 60.0
 
 # Requests of one session, in order; never empty while the session waits.
 _SessionQueue = deque[PendingRequest]
@@ -93,15 +98,26 @@ class _PatientQueue:
 
     def add(self, queue: _SessionQueue) -> None:
         """Add the queue of a session that did not wait before."""
-        heapq.heappush(self._heap, (queue[0].needed, next(self._numbers), queue))
+        heapq.heappush(self._heap, (_needed(queue[0]), next(self._numbers), queue))
 
     def next(self) -> _SessionQueue:
         """Remove and return the session whose answer is needed first."""
         return heapq.heappop(self._heap)[2]
 
+    def is_behind_others(self) -> bool:
+        """Return whether the next session is one that waits behind others."""
+        return bool(self._heap) and self._heap[0][2][0].waits_behind_others
+
     def first_needed(self) -> float:
         """Return the time at which the first answer is needed, s; `inf` if no session waits."""
         return self._heap[0][0] if self._heap else math.inf
+
+
+def _needed(pending: PendingRequest) -> float:
+    """Return the time before which a robot's request is to be answered, s."""
+    if pending.waits_behind_others:
+        return pending.arrived + BEHIND_OTHERS_S
+    return pending.needed
 
 
 class FairQueue:
@@ -167,7 +183,7 @@ class FairQueue:
         """Add the queue of a session that did not wait before."""
         head = queue[0]
         # A request that states no slack is needed at 0.0.
-        can_wait = head.priority is Priority.ROBOT and head.needed > now + self._urgent_s()
+        can_wait = head.priority is Priority.ROBOT and _needed(head) > now + self._urgent_s()
         if can_wait:
             self._patient.add(queue)
         else:
@@ -179,8 +195,16 @@ class FairQueue:
         """
         return 2 * self.costs_s[-1] if self.costs_s else math.inf
 
-    def take(self, size: int, now: float) -> tuple[list[PendingRequest], list[PendingRequest]]:
+    def take(
+        self, size: int, now: float, most_with_others: float = math.inf
+    ) -> tuple[list[PendingRequest], list[PendingRequest]]:
         """Take the next batch of at most `size` requests.
+
+        Args:
+            size: The largest batch.
+            now: The time, s.
+            most_with_others: The size up to which the batch is filled with requests that wait
+                behind others.
 
         Returns:
             The batch, and the requests whose deadlines have passed or whose connections have ended,
@@ -216,6 +240,8 @@ class FairQueue:
             self._pick(robots.next(), now, batch, expired, still_waiting)
         size = self._size_in_time(batch, size, now)
         while self._patient and len(batch) < size:
+            if len(batch) >= most_with_others and self._patient.is_behind_others():
+                break
             self._pick(self._patient.next(), now, batch, expired, still_waiting)
         while simulations.sources and len(batch) < size:
             self._pick(simulations.next(), now, batch, expired, still_waiting)

@@ -3,6 +3,10 @@
 A robot that asks again as soon as it is answered makes all robots of a busy replica wait in the
 queue, where their observations grow old. So each answer names the time at which the robot's next
 request is useful, and the robot waits at home, with fresher observations.
+
+If the robots need more than the replica can do, those that came first are *admitted* up to the
+largest load at which all of them are in time. The requests of the others wait behind those of the
+admitted ones. If all robots shared what is missing, all of them would be a little late.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ import math
 import reprlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.errors import InvalidInput
@@ -25,7 +29,7 @@ from vlagents_ray.serve.fleet import (
     answer_s,
     replica_load,
 )
-from vlagents_ray.slo import Slo
+from vlagents_ray.slo import SHARE, Slo
 
 _READ_S = 0.5  # time after which the needs of all sessions are read again
 # The same after the first time; it doubles until it is `_READ_S`. The first curve is of one batch,
@@ -34,6 +38,10 @@ _FIRST_READ_S = 0.02
 # Share by which the observed rate of a robot must differ from the known one to replace it, so that
 # the needs of equal robots are equal.
 _DIFFERS = 0.1
+# Load up to which further robots are admitted where there are too many. Those that are admitted
+# stay so up to `USABLE`: measured costs vary, and no robot should come and go.
+_ADMITTED_LOAD = 0.86
+_KINDS = 4  # kinds of robots that are tried for the room that is left, as each costs time
 _MOST_SLACK_MS = 60_000.0  # so that no request waits for longer in a queue that is never empty
 
 
@@ -42,43 +50,66 @@ class RobotPlan:
     """What a session's robot needs, and what its last request showed of its plan."""
 
     need: RobotNeed | None = None  # None until it is known
-    is_stated: bool = False  # whether the robot's own SLO states the rate
+    is_stated: bool = False  # whether an SLO states the rate
+    share: float = SHARE  # least share of its ticks with an action in time
+    most_rows: int | None = None  # rows of an answer that it executes at most; None: all of them
+    # Whether it is among those that the replica can serve in time; None until that is decided.
+    is_admitted: bool | None = None
     asked: float = 0.0  # time at which its last act arrived, s; 0.0 before the first one
+    # Time from which the robot executes the rows of its last answer, if it does not hold, s. The
+    # time in which it held still, as its rows had run out, does not count.
+    begins: float = 0.0
 
     def to_list(self) -> list[Any]:
         """Return the plan for another replica, to which the session moves."""
         need = self.need
         if need is None:
             return []
-        return [need.hz, need.rows, need.age_s, self.is_stated]
+        return [need.hz, need.rows, need.age_s, self.is_stated, self.share, self.most_rows]
 
     @classmethod
     def from_list(cls, values: Sequence[Any]) -> RobotPlan:
         """Return the plan of a session that has moved here, from the result of `to_list`."""
         if not values:
             return cls()
-        hz, rows, age_s, is_stated = values
-        return cls(RobotNeed(hz, rows, age_s), is_stated)
+        hz, rows, age_s, is_stated, share, most_rows = values
+        return cls(RobotNeed(hz, rows, age_s), is_stated, share, most_rows)
 
-    def observe(self, rows: int, arrived: float, needed: float) -> None:
+    @classmethod
+    def from_slo(cls, slo: Slo, rows: int) -> RobotPlan:
+        """Return the plan of a robot with that SLO, if an answer has `rows` rows."""
+        return cls(need_of(slo, rows), is_stated=True, share=slo.share, most_rows=slo.rows)
+
+    @property
+    def waits_behind_others(self) -> bool:
+        """Whether the requests of admitted robots go before those of this one."""
+        return self.is_admitted is False
+
+    def observe(self, rows: int, arrived: float, needed: float, now: float) -> None:
         """Learn from an act what the robot needs.
 
         Args:
             rows: The number of rows of the answer.
             arrived: The time at which the act arrived, s.
             needed: The time at which the robot runs out of rows, s; 0.0 if it did not state it.
+            now: The time at which it is answered, s.
         """
+        if self.most_rows is not None:
+            rows = min(rows, self.most_rows)
         asked, self.asked = self.asked, arrived
+        began = self.begins
+        # Rows are skipped for the actions that the robot executed while it waited.
+        self.begins = now - min(now - arrived, max(0.0, needed - arrived))
         if self.is_stated:
             if self.need is not None and self.need.rows != rows:
-                self.need = replace(self.need, rows=rows)
+                self.need = RobotNeed(self.need.hz, rows, self.need.age_s)
             return
         if not needed or needed <= arrived or not asked:
             return
 
         # The rows that are left are those of the answer to the request before. With one row an
         # answer, there is a request at each tick.
-        plan_s = needed - asked if rows > 1 else arrived - asked
+        plan_s = needed - began if rows > 1 else arrived - asked
         if plan_s <= 0:
             return
         hz = float(f"{rows / plan_s:.2g}")
@@ -116,7 +147,7 @@ class ReplicaPace:
 
     Args:
         curve: Returns the measured durations of batches; None before the first batch.
-        needs: Returns what each robot of the replica needs.
+        plans: Returns the plan of each session, the oldest session first.
         max_batch_size: The largest batch.
         clock: The engine's clock, s.
         depth: Returns the number of requests that wait.
@@ -125,16 +156,21 @@ class ReplicaPace:
     def __init__(
         self,
         curve: Callable[[], CostCurve | None],
-        needs: Callable[[], Iterable[RobotNeed | None]],
+        plans: Callable[[], Iterable[RobotPlan]],
         max_batch_size: int,
         clock: Callable[[], float],
         depth: Callable[[], int],
     ) -> None:
-        self._curve, self._needs = curve, needs
+        self._curve, self._plans = curve, plans
         self._max_batch_size, self._clock = max_batch_size, clock
         self._depth = depth
-        self._load = IDLE
+        self._load = IDLE  # of all robots that can be in time
+        self._admitted_load = IDLE
+        # The size up to which batches are filled with requests of robots that are not admitted:
+        # with larger ones, the admitted robots would wait for longer than they can.
+        self.most_with_others: float = math.inf
         self._robots = 0
+        self._others = 0  # robots that are not admitted
         self._throughput_hz = math.inf  # largest number of answers a second
         self._read = -math.inf  # time at which the needs were read, s
         self._reread_s = _FIRST_READ_S  # time after which they are read again, s
@@ -145,74 +181,155 @@ class ReplicaPace:
         if now - self._read > self._reread_s:
             self._read = now
             self._reread_s = min(_READ_S, 2 * self._reread_s)
-            needs = Counter(need for need in self._needs() if need is not None)
-            self._robots = needs.total()
-            self._load = self._load_of(needs)
+            self._read_plans()
         return self._load
 
     def check(self, newcomer: RobotNeed) -> dict[str, Any]:
         """Return whether one more robot can be in time here, as the info of its reset."""
+        self.load()
         load = self._load_with(newcomer)
-        if load.in_time:
+        # Robots that wait to be admitted come before it.
+        most = _ADMITTED_LOAD if self._others else USABLE
+        if load.load <= most:
             return {"load": load.load, "in_time": True}
         if load.load == math.inf:
             reason = (
-                f"expected actions at {newcomer.hz:g} Hz, but the policy takes "
-                f"{load.latency_s * 1e3:.0f} ms for a request alone; lower the rate, or use longer "
-                "chunks"
+                f"expected actions at {newcomer.hz:g} Hz, but an answer takes up to "
+                f"{load.latency_s * 1e3:.0f} ms here; lower the rate, or use longer chunks"
             )
             return {"load": None, "in_time": False, "reason": reason}
         reason = (
-            f"expected a load of at most {USABLE:g} with this robot, got {load.load:.2f}; add a "
+            f"expected a load of at most {most:g} with this robot, got {load.load:.2f}; add a "
             "replica, or lower the robots' rates"
         )
         return {"load": load.load, "in_time": False, "reason": reason}
 
     def _load_with(self, newcomer: RobotNeed) -> ReplicaLoad:
-        """Return the load with one more robot; it is `inf` if that cannot be in time even alone."""
+        """Return the load of the admitted robots with one more; it is `inf` if that cannot be in
+        time here.
+        """
         curve = self._curve()
         if curve is None:
             return IDLE
-        if newcomer.interval_s(curve.cost_s(1)) <= 0:
-            return ReplicaLoad(math.inf, 1, curve.cost_s(1))
-        needs = Counter(need for need in self._needs() if need is not None)
+        needs = _needs_of(plan for plan in self._plans() if not plan.waits_behind_others)
         needs[newcomer] += 1
-        return self._load_of(needs)
+        soonest_s = answer_s(curve, 1, needs.total())
+        if newcomer.interval_s(soonest_s) <= 0:
+            return ReplicaLoad(math.inf, 1, soonest_s)
+        return self._load_of(needs, curve)
 
-    def replan_s(self, need: RobotNeed, arrived: float, needed: float) -> float:
+    def replan_s(self, plan: RobotPlan) -> float:
         """Return the time from now until the next request of a robot is useful, s; 0 if it may ask
         at once.
 
         Args:
-            need: What the robot needs.
-            arrived: The time at which its last request arrived, s.
-            needed: The time at which its plan ended, without the answer to that request, s.
+            plan: The plan of the robot, which has observed the act that is answered now.
         """
-        load = self.load()
+        self.load()
+        need, now = plan.need, self._clock()
+        # The requests of robots that are not admitted wait behind its own.
+        waiting = self._depth() if plan.waits_behind_others else self._depth() - self._others
+        # A request that is sent before those that wait are answered would wait, too.
+        waiting_s = max(0, waiting) / self._throughput_hz
+        if need is None:
+            return waiting_s
         if self._robots < 2:
             return 0.0
-        now = self._clock()
-        longest_s = need.interval_s(load.latency_s)
-        # A request that is sent before those that wait are answered would wait, too.
-        waited_s = now - arrived
-        waiting_s = self._depth() / self._throughput_hz
-        # Of robots that asked at once, the first one that is answered asks again first, so that
-        # their next requests do not come at once again.
-        earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
-        interval_s = max(waited_s + waiting_s, load.replan_s(need) - earlier_s)
-        interval_s = min(longest_s, interval_s)
-        # A robot that holds still executes no row of the new plan meanwhile, which ends later.
-        held_s = max(0.0, now - needed)
-        # A robot sends its request at the next tick, half a period later on average.
-        return max(0.0, arrived + held_s + interval_s - 0.5 / need.hz - now)
 
-    def _load_of(self, needs: Mapping[RobotNeed, int]) -> ReplicaLoad:
+        load = self._admitted_load
+        longest_s = need.interval_s(load.latency_s)
+        if plan.waits_behind_others:
+            # Each answer is worth most if all rows before it were executed.
+            interval_s = max(longest_s, need.rows / need.hz)
+        else:
+            # Of robots that asked at once, the first one that is answered asks again first, so that
+            # their next requests do not come at once again.
+            waited_s = now - plan.asked
+            earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
+            backlog_s = now - plan.begins + waiting_s
+            interval_s = min(longest_s, max(backlog_s, load.replan_s(need) - earlier_s))
+        # A robot sends its request at the next tick, half a period later on average.
+        return max(0.0, plan.begins + interval_s - 0.5 / need.hz - now)
+
+    def _read_plans(self) -> None:
+        """Compute the loads, and decide which robots are admitted."""
+        plans = [plan for plan in self._plans() if plan.need is not None]
         curve = self._curve()
+        self._robots, self._others = len(plans), 0
+        self.most_with_others = math.inf
+        if curve is None:
+            self._load = self._admitted_load = IDLE
+            return
+        self._throughput_hz = self._max_batch_size / curve.cost_s(self._max_batch_size)
+        self._load = self._admitted_load = self._load_of(_needs_of(plans), curve)
+        if self._load.in_time:
+            for plan in plans:
+                plan.is_admitted = True
+            return
+
+        admitted = self._choose_admitted(plans, curve)
+        self._admitted_load = self._load_of(_needs_of(admitted), curve)
+        self.most_with_others = self._admitted_load.batch_size
+        self._others = len(plans) - len(admitted)
+        for plan in plans:
+            plan.is_admitted = False
+        for plan in admitted:
+            plan.is_admitted = True
+
+    def _choose_admitted(self, plans: Sequence[RobotPlan], curve: CostCurve) -> list[RobotPlan]:
+        """Return the robots that can be in time together: those that are admitted already, then the
+        oldest ones.
+        """
+        soonest_s = answer_s(curve, 1, len(plans))
+        kept = [plan for plan in plans if plan.is_admitted]
+        others = [plan for plan in plans if not plan.is_admitted]
+        admitted: list[RobotPlan] = []
+        for candidates, most in ((kept, USABLE), (others, _ADMITTED_LOAD)):
+            # A robot that cannot be in time at all is admitted nowhere.
+            left = [
+                plan
+                for plan in candidates
+                if plan.need is not None and plan.need.interval_s(soonest_s) > 0
+            ]
+            for _ in range(_KINDS):
+                count = self._fitting(admitted, left, most, curve)
+                admitted += left[:count]
+                if count == len(left):
+                    break
+                # There is no room for another robot of this kind.
+                full = left[count].need
+                left = [plan for plan in left[count:] if plan.need != full]
+        return admitted
+
+    def _fitting(
+        self,
+        admitted: Sequence[RobotPlan],
+        candidates: Sequence[RobotPlan],
+        most: float,
+        curve: CostCurve,
+    ) -> int:
+        """Return how many of the candidates, the first ones, fit beside the admitted robots with a
+        load of at most `most`.
+        """
+        fits, too_many = 0, len(candidates) + 1
+        while too_many - fits > 1:
+            count = (fits + too_many) // 2
+            needs = _needs_of([*admitted, *candidates[:count]])
+            if self._load_of(needs, curve).load <= most:
+                fits = count
+            else:
+                too_many = count
+        return fits
+
+    def _load_of(self, needs: Mapping[RobotNeed, int], curve: CostCurve) -> ReplicaLoad:
         robots = sum(needs.values())
-        if curve is None or not robots:
+        if not robots:
             return IDLE
         # A robot that cannot be in time at all says nothing about the others.
         soonest_s = answer_s(curve, 1, robots)
         servable = {need: count for need, count in needs.items() if need.interval_s(soonest_s) > 0}
-        self._throughput_hz = self._max_batch_size / curve.cost_s(self._max_batch_size)
         return replica_load(curve, servable, self._max_batch_size)
+
+
+def _needs_of(plans: Iterable[RobotPlan]) -> Counter[RobotNeed]:
+    return Counter(plan.need for plan in plans if plan.need is not None)
