@@ -13,7 +13,7 @@ import asyncio
 import pickle
 import sys
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -291,6 +291,18 @@ def long_polls(client: Any) -> Iterator[Any]:
                 client._controller, router._event_loop
             )
             yield shared.long_poll_client
+
+
+def begin_to_end(client: Any, names: Sequence[str]) -> None:
+    """Begin to end applications; `serve.delete` waits for each of them, for at most a minute."""
+    client._controller.delete_apps.remote(list(names))
+
+
+def list_applications(client: Any) -> Any:
+    """Return the ref of the list of all applications, which `serve.status` would wait for without
+    a time limit.
+    """
+    return client._controller.list_serve_statuses.remote()
 
 
 def end_controller(client: Any) -> Any:

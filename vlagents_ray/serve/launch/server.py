@@ -14,7 +14,7 @@ import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ log = logging.getLogger(__name__)
 _SHUTDOWN_S = 30.0
 # Time for Serve's proxies to listen; on a busy node, several are replaced before one does.
 _PROXIES_S = 180.0
+_HAPROXY_S = 0.5  # time in which HAProxy is updated after the end of an application, s
 _LOOK_S = 0.2  # interval of the checks of Serve's proxies and of its end, s
 _START_S = 600.0  # time for a policy to become ready on this machine
 _GROW_S = 3600.0  # time for a policy to become ready on a cluster that may add a machine first
@@ -73,6 +74,30 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
             proxies = look_again()
         else:
             return
+
+
+def end_applications(client: Any, names: Sequence[str]) -> None:
+    """End these applications, and wait until their replicas have ended.
+
+    When Serve shuts down, it stops HAProxy at once, and with it the connections of the clients,
+    before the replicas have answered them and closed their WebSockets. Without its applications,
+    HAProxy keeps these connections.
+    """
+    private.begin_to_end(client, names)
+    deadline = time.monotonic() + _SHUTDOWN_S
+    while time.monotonic() < deadline and not head_monitor.head_is_gone():
+        listing = private.list_applications(client)
+        if not ray.wait([listing], timeout=_LOOK_S)[0]:
+            continue
+        try:
+            left = ray.get(listing)
+        except ray.exceptions.RayError:  # the controller has ended
+            return
+        if not left:
+            # Serve's log would report an error if HAProxy ended during its last update.
+            time.sleep(_HAPROXY_S)
+            return
+        time.sleep(_LOOK_S)
 
 
 def shut_down(client: Any) -> None:
@@ -197,6 +222,9 @@ def running_server(
         if ingress and address is None and stats_port:
             haproxy.wait_for_haproxy(serve, paths, int(stats_port), deadline)
 
+        if ingress:
+            names = [app.name for app in config.applications]
+            stack.push(session.unless_lost(lambda: end_applications(client, names)))
         url = _url("http" if tls is None else "https", host, public_port)
         if is_own_ray and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
