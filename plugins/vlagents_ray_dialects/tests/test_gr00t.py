@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gr00t_client
@@ -599,3 +600,52 @@ def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
         assert sorted(answers) == ["late", "waiting"], "a client waits for ever"
         assert all("stopping" in text for text in answers.values()), answers
     replicas.frozen.clear()
+
+
+PAUSES_S = (0.0, 0.001, 0.002, 0.01, 0.03, 0.1)  # of clients, between an answer and a request
+RESTARTS = 3
+
+
+def test_no_client_waits_for_ever_when_the_gateway_restarts_however_often_it_asks(
+    replicas: Replicas,
+) -> None:
+    """ZeroMQ sends a request once, so one that an ended gateway never reads has no answer."""
+    port = free_port()
+
+    def begin() -> GR00TDialect:
+        context = GatewayContext(
+            "noop", lambda *_: replicas.agent(), MessageLimits(), 8, 30.0, None, NoKey.OPEN
+        )
+        dialect = GR00TDialect("gr00t", GR00TDialect.Config(port=port), context)
+        dialect.serve(reserve("gr00t", "127.0.0.1", port))
+        return dialect
+
+    answered = [0] * len(PAUSES_S)
+    over = threading.Event()
+
+    def ask(index: int, pause_s: float) -> None:
+        with contextlib.closing(zmq.Context.instance().socket(zmq.REQ)) as client:
+            client.setsockopt(zmq.LINGER, 0)
+            client.connect(f"tcp://127.0.0.1:{port}")
+            while not over.is_set():
+                client.send(said("ping"))
+                while not client.poll(50):
+                    if over.is_set():
+                        return
+                answer = msgpack.unpackb(client.recv())
+                answered[index] += "error" not in answer
+                assert "stopping" in answer.get("error", "stopping")
+                time.sleep(pause_s)
+
+    with ThreadPoolExecutor(len(PAUSES_S)) as clients:
+        asking = [clients.submit(ask, *each) for each in enumerate(PAUSES_S)]
+        try:
+            for _ in range(RESTARTS):
+                dialect = begin()
+                before = list(answered)
+                wait_for(lambda before=before: all(np.greater(answered, before)), 20)
+                dialect.close()
+        finally:
+            over.set()
+    for one in asking:
+        one.result()

@@ -88,6 +88,7 @@ class GR00TConnection(GatewayClient):
 
         self._sending = threading.Lock()  # guards sending, and the next field
         self._waiting: Envelope | None = None  # the envelope of the request without an answer
+        self._is_last_answer_sent = False  # whether the connection ends with the last answer
         self._answered = threading.Condition()
         self.is_client = False  # whether it is one of the dialect's clients
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
@@ -133,7 +134,7 @@ class GR00TConnection(GatewayClient):
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             set_keep_alive(self._connection)
             self._greet()
-            while True:
+            while not self._is_last_answer_sent:
                 head = self._receive_head()
                 if head is None:
                     break
@@ -284,7 +285,16 @@ class GR00TConnection(GatewayClient):
             if envelope is None:
                 return False
             self._connection.settimeout(_SEND_S)
-            self._connection.sendall(zmtp.write_message([*envelope, answer]))
+            data = zmtp.write_message([*envelope, answer])
+            if not self._dialect.is_stopping:
+                self._connection.sendall(data)
+                return True
+            # The end of the connection arrives with the answer, so that ZeroMQ keeps the client's
+            # next request for the server's successor; a request that is sent before it arrives
+            # would be lost, and its client would wait forever.
+            self._is_last_answer_sent = True
+            self._connection.sendall(data, socket.MSG_MORE)
+            self._connection.shutdown(socket.SHUT_WR)
             return True
 
     # The messages.
@@ -510,9 +520,13 @@ class GR00TDialect(PortDialect):
     def close(self) -> None:
         """Answer the requests that have arrived, reject later ones, and end all connections.
 
-        Each request needs an answer, as a client of this protocol has no timeout.
+        Each request needs an answer, as a client of this protocol has no timeout. So a connection
+        ends with the answer to its next request; those of clients that send none for a second end
+        then.
         """
         self._stopping.set()
+        if self._acceptor is not None:
+            self._acceptor.close()
 
         until = time.monotonic() + _END_S
         with self._lock:
@@ -523,10 +537,9 @@ class GR00TDialect(PortDialect):
             with contextlib.suppress(OSError):  # the client has disconnected
                 connection.refuse_waiting(_stopping())
 
-        if self._acceptor is not None:
-            self._acceptor.close()
-        with self._lock:
-            connections = list(self._connections)
+        until = time.monotonic() + _LINGER_S
+        for connection in connections:
+            connection.thread.join(max(0.0, until - time.monotonic()))
         for connection in connections:
             connection.stop_reading()
 
