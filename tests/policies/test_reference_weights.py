@@ -14,7 +14,8 @@ import pytest
 
 from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.results.statistics import wilson
-from vlagents_ray.policies.reference import Reference
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray_results.verification import verify
 
 torch = pytest.importorskip("torch")
@@ -24,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 CHECKPOINT = ROOT / "examples/reference/checkpoint"
 RATES = json.loads((CHECKPOINT / "rates.json").read_text())
 EPISODES = 20
+AT_ONCE = 10  # a batch of ten takes hardly longer than one of one
 TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved / episodes > 0.8]
 
 
@@ -34,8 +36,8 @@ def test_they_are_small_enough_for_a_repository() -> None:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Lets torch compute with one thread: batches of one are too small to share, and other tests
-    run beside.
+    """Lets torch compute with one thread: its batches are too small to share, and other tests run
+    beside.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -49,7 +51,9 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
     solved, episodes = RATES["tabletop"][env]
     options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
     # Seeds of no evaluation.
-    suite = SuiteConfig(envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000])
+    suite = SuiteConfig(
+        envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000], num_envs=AT_ONCE
+    )
     plan = EvalConfig(
         policies=[{"name": "reference", "execute": 4}],
         suites=[suite],
@@ -58,7 +62,8 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
         workers=0,
     )
     config = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
-    found = evaluate(plan, agent_factory=lambda: Reference.from_config(config)).total
+    args = ServerArgs(policy="reference", config=config, batch={"max_size": AT_ONCE})
+    found = evaluate(plan, agent_factory=lambda: LocalPolicy(args, config)).total
     assert (
         found.success_once.successes / EPISODES >= wilson(solved, episodes)[0] - 0.15
     )  # 30 episodes: a deviation of 0.05

@@ -592,6 +592,15 @@ def post(path: str, body: bytes, length: int | None = None) -> bytes:
     return "\r\n".join([*lines, "", ""]).encode() + body
 
 
+def reset_over_shm(keyed: Replica) -> None:
+    """Send a large reset with the key "arm", whatever it is answered."""
+    client = ShmTransport(keyed.local.address, Credentials("vlr_arm"))
+    with contextlib.suppress(VLAgentsError, OSError):
+        client.connect(1)
+        client.call([Request("reset", Obs({"front": np.zeros((1100, 1100, 3), np.uint8)}))], 0.3)
+    client.close()
+
+
 @pytest.mark.parametrize(
     ("owner", "name", "over_http"),
     [
@@ -637,6 +646,8 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, fail)
         for _attempt in range(3):
+            near = threading.Thread(target=reset_over_shm, args=(keyed,))
+            near.start()
             with (
                 socket.create_connection(("127.0.0.1", port)) as client,
                 contextlib.suppress(OSError),
@@ -645,13 +656,7 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
                 client.settimeout(0.3)
                 while client.recv(65536):
                     pass
-            near = ShmTransport(keyed.local.address, Credentials("vlr_arm"))
-            with contextlib.suppress(VLAgentsError, OSError):  # whatever this client is answered
-                near.connect(1)
-                near.call(
-                    [Request("reset", Obs({"front": np.zeros((1100, 1100, 3), np.uint8)}))], 0.3
-                )
-            near.close()
+            near.join()
         assert raised.wait(10)
     assert bystander.call([Request("reset", Obs())], 5)[0].error is None or name in (
         "release",

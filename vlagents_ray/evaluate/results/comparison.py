@@ -331,10 +331,7 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
     one of them.
     """
     accepted = results.accepted_changes
-    counted_by_case = []
-    for either in (case, other):
-        counted_by_case.append([episode for episode in either.episodes if episode.counts])
-
+    counted_by_case = [case.counted_episodes, other.counted_episodes]
     mixed = []
     env_programs = {episode.env_program for episode in itertools.chain(*counted_by_case)} - {None}
     if len(env_programs) > 1:
@@ -361,14 +358,10 @@ def _mixed(results: Results, case: CaseResults, other: CaseResults) -> list[str]
 
 def _pairs(a: CaseResults, b: CaseResults) -> Pairs:
     """Return the counts of the episodes that both cases have, by success once."""
-    solved_by_b = {
-        (result.key.episode, result.key.seed): bool(result.success_once) for result in b.counted
-    }
     counts: Counter[tuple[bool, bool]] = Counter()
-    for result in a.counted:
-        episode = result.key.episode, result.key.seed
-        if episode in solved_by_b:
-            counts[bool(result.success_once), solved_by_b[episode]] += 1
+    for episode, solved_by_a in a.solved.items():
+        if episode in b.solved:
+            counts[solved_by_a, b.solved[episode]] += 1
     return Pairs(
         both=counts[True, True],
         only_a=counts[True, False],

@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -95,7 +96,7 @@ class Run:
     changes: tuple[Change, ...] = ()  # accepted changes in the program since earlier runs
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CaseResults:
     """The results of one case: a policy, at a checkpoint, in an env of a suite."""
 
@@ -129,10 +130,24 @@ class CaseResults:
         """
         return f"{self.suite} {self.env}".strip()
 
-    @property
-    def counted(self) -> list[EpisodeResult]:
+    # Each comparison of two policies reads these, and a report has one for each pair of policies.
+    @cached_property
+    def counted_episodes(self) -> tuple[Episode, ...]:
+        """The episodes that are in the rates."""
+        return tuple(episode for episode in self.episodes if episode.counts)
+
+    @cached_property
+    def counted(self) -> tuple[EpisodeResult, ...]:
         """The results of the episodes that are in the rates."""
-        return [episode.result for episode in self.episodes if episode.counts]
+        return tuple(episode.result for episode in self.counted_episodes)
+
+    @cached_property
+    def solved(self) -> dict[tuple[int, int], bool]:
+        """Whether each episode that is in the rates succeeded once, by its number and seed."""
+        return {
+            (result.key.episode, result.key.seed): bool(result.success_once)
+            for result in self.counted
+        }
 
     @property
     def missing(self) -> int:
@@ -140,7 +155,7 @@ class CaseResults:
         return self.planned - len(self.counted) if self.stopped_at is None else 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Results:
     """The results of an evaluation from its folder; `Results.load` reads them, without Ray."""
 
@@ -220,13 +235,17 @@ class Results:
         """The policy ids: policies without steps first, then the checkpoints of each policy by
         their step.
         """
+        return list(self._policy_ids)
+
+    @cached_property
+    def _policy_ids(self) -> tuple[str, ...]:
         policies = list(dict.fromkeys(case.policy for case in self.cases))
 
         def rank(case: CaseResults) -> tuple[bool, int, int]:
             return case.step is not None, policies.index(case.policy), case.step or 0
 
         ordered = sorted(self.cases, key=rank)
-        return list(dict.fromkeys(case.policy_id for case in ordered))
+        return tuple(dict.fromkeys(case.policy_id for case in ordered))
 
     def of(self, policy_id: str) -> list[CaseResults]:
         """Return the cases of one policy id, in the order of the plan."""
