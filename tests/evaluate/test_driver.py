@@ -67,12 +67,36 @@ def test_a_failed_attempt_is_repeated_until_its_episode_is_lost(config: Config) 
     driver, [job, *_] = driver_of(config(retries=1), consumer)
     driver.take(job, Report(failure=BROKEN))
     again = next_job(driver, job)
-    assert (again.key, again.attempt, again.alone) == (job.key, 2, False)
+    assert (again.key, again.attempt, again.alone) == (job.key, 2, True)
     driver.take(again, Report(failure=BROKEN))
     assert consumer.repeated == [True, False]
     assert consumer.statuses == ["infra_failed"]
     assert consumer.results[0].error == "env_failed: the simulator exploded"
     assert not len(driver.queue)
+
+
+@pytest.mark.parametrize(
+    ("retries", "alone"), [(1, [True]), (2, [False, True]), (3, [False, True, True])]
+)
+def test_an_episode_whose_simulator_breaks_again_is_played_alone(
+    config: Config, retries: int, alone: list[bool]
+) -> None:
+    """Another episode in the same simulator may be the cause."""
+    driver, [job, *_] = driver_of(config(retries=retries), Collected())
+    attempts = []
+    for _ in range(retries):
+        driver.take(job, Report(failure=BROKEN))
+        job = next_job(driver, job)
+        attempts.append(job.alone)
+    assert attempts == alone
+
+
+def test_an_episode_is_repeated_beside_others_if_the_policy_was_lost(config: Config) -> None:
+    driver, [job, *_] = driver_of(config(retries=3), Collected())
+    for _ in range(3):
+        driver.take(job, Report(failure=replace(BROKEN, cause="policy")))
+        job = next_job(driver, job)
+        assert not job.alone
 
 
 def test_an_episode_that_may_have_broken_others_is_played_alone(config: Config) -> None:

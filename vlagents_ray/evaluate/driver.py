@@ -113,12 +113,23 @@ class Driver:
         if failure.cause == "user":
             raise from_code(failure.code, failure.message)
         if repeated:
-            self.queue.put_back(job.again(alone=failure.names_no_episode))
+            self.queue.put_back(job.again(alone=self._must_be_alone(job, failure)))
         elif is_needed:
             error = f"{failure.code}: {failure.message}"
             lost = EpisodeResult(job.key, "infra_failed", error=error)
             self._consumer.finished(job, lost, Artifacts())
             self._count_loss(failure)
+
+    def _must_be_alone(self, job: Job, failure: Failure) -> bool:
+        """Return whether the next attempt is played without other episodes in its simulator, as
+        one of them may be the cause of the failure.
+
+        After a simulator broke, all its episodes are first repeated together, since most simulators
+        do not break again. The last attempt is always alone, so that an episode which breaks its
+        simulator does not lose others.
+        """
+        broke_again = failure.cause == "worker" and job.attempt >= min(2, self._retries)
+        return failure.names_no_episode or broke_again
 
     def _diverged_before(self, job: Job, result: EpisodeResult) -> bool:
         """Return whether the simulation of an episode has diverged before under the same

@@ -38,7 +38,17 @@ EXPLOSIONS: dict[str, Exception] = {  # by which simulators tell that they diver
     "SciPy": ValueError("array must not contain infs or NaNs"),
     "environment's own check": EnvFailed("env step: the state of 'arm' is not finite"),
 }
-TROUBLES = ["refuses", "diverges", "reward", "raises", "answers badly", "wrong state", *EXPLOSIONS]
+AT_RESET = ["reset raises", "reset refuses", "reset sees nothing"]
+TROUBLES = [
+    *AT_RESET,
+    "refuses",
+    "diverges",
+    "reward",
+    "raises",
+    "answers badly",
+    "wrong state",
+    *EXPLOSIONS,
+]
 _OTHERS = itertools.count(10)
 _LIMIT = 1.0  # of an action; beyond it, the environment has its trouble
 
@@ -55,6 +65,12 @@ class Fragile(EvalEnv):
 
     def reset(self, *, seed: int, options: object = None) -> tuple[Obs, dict[str, Any]]:
         self._seed, self._steps = seed, 0
+        if seed % 3 == 1 and self._trouble == "reset raises":
+            raise RuntimeError("the assets of this scene are missing")
+        if seed % 3 == 1 and self._trouble == "reset refuses":
+            raise InvalidAction("action: got one that settles nothing")
+        if seed % 3 == 1 and self._trouble == "reset sees nothing":
+            return self._look(np.nan), {}
         return self._look(), {}
 
     def step(self, act: Act) -> Any:
@@ -186,6 +202,17 @@ def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=2)
     assert outcomes(together) == alone
     assert together.cases[0].infra_failures == 0
+
+
+@pytest.mark.parametrize("retries", [1, 2, 3])
+@pytest.mark.parametrize("trouble", ["raises", *AT_RESET])
+def test_an_episode_that_breaks_the_simulator_of_several_loses_no_other_one(
+    run: Callable[..., Summary], trouble: str, retries: int
+) -> None:
+    alone = outcomes(run(trouble))
+    together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=retries)
+    assert outcomes(together) == alone
+    assert together.cases[0].infra_failures == 3
 
 
 @pytest.mark.parametrize("trouble", ["diverges", "reward", *EXPLOSIONS])

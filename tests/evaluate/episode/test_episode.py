@@ -359,6 +359,17 @@ def test_what_a_step_returns_is_never_guessed(answer: Any, said: str) -> None:
             run_episode(Stated(words=words), Chunks(ROW), KEY)
 
 
+def test_an_action_that_an_environment_refuses_at_its_reset_is_its_own_error() -> None:
+    """No policy has acted yet, so that the episode is repeated, and no other one ends."""
+
+    class RefusesItsOwn(Stated):
+        def reset(self, **options: Any) -> Any:
+            raise InvalidAction("action: expected numbers in [-1, 1], got 2")
+
+    with pytest.raises(EnvFailed, match="env reset: InvalidAction: action: expected numbers"):
+        run_episode(RefusesItsOwn(), Chunks(ROW), KEY)
+
+
 @pytest.mark.parametrize("success", [np.True_, 1, 1.0, np.float32(1)])
 def test_a_number_that_is_a_bool_is_one(success: Any) -> None:
     after = (GOOD, np.float32(0.5), np.False_, 0, {"success": success})

@@ -134,8 +134,11 @@ class env_side(_Side):  # noqa: N801 - a context manager
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
+        # At a reset, only the environment itself can have chosen an action that it refuses.
+        refuses_own = self._phase == "reset" and isinstance(error, errors.InvalidAction)
+        passes = isinstance(error, _FROM_ENV) and not refuses_own
         # ManiSkill raises SystemExit when an asset is missing.
-        if isinstance(error, Exception | SystemExit) and not isinstance(error, _FROM_ENV):
+        if isinstance(error, Exception | SystemExit) and not passes:
             raise errors.EnvFailed(f"env {self._phase}: {type(error).__name__}: {error}") from error
 
 
