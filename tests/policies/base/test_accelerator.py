@@ -254,6 +254,22 @@ CONVOLUTION = (
             False,
         ),
         (
+            (
+                f"6 : RUNTIME_EXCEPTION : {CONVOLUTION}/core/framework/bfc_arena.cc:376 Available "
+                "memory of 0 is smaller than requested bytes of 2147483648"
+            ),
+            True,
+            False,
+        ),
+        (
+            (
+                "1 : FAIL : CUDNN failure 4002: "
+                "CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED ; GPU=0"
+            ),
+            True,
+            False,
+        ),
+        (
             "1 : FAIL : CUDA failure 2: out of memory ; GPU=0 ; expr=cudaMalloc((void**)&p, size);",
             True,
             False,

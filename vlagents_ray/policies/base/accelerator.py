@@ -35,7 +35,9 @@ _DRIVER = Path("/proc/driver/nvidia/version")
 # Messages of errors of torch, JAX and ONNX Runtime. The classes of these errors differ between
 # versions.
 _EXHAUSTED = re.compile(
-    r"out of memory|ALLOC_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED|Failed to allocate memory",
+    r"out of memory|ALLOC_FAILED|ALLOCATION_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED"
+    # ONNX Runtime, without and with a limit of its memory
+    r"|Failed to allocate memory|Available memory of \d+ is smaller than requested",
     re.IGNORECASE,
 )
 _GPU_ERROR = re.compile(
