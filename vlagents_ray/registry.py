@@ -17,6 +17,7 @@ import importlib
 import json
 import logging
 import sys
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -522,6 +523,12 @@ def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any
     return cls
 
 
+def _place_of(error: Exception) -> str:
+    """Return the line that raised an error, " (my_policy.py:12)"."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f" ({Path(frame.filename).name}:{frame.lineno})"
+
+
 def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
     """Return the object given as "module:NAME"; raises `unknown` if there is none."""
     module, colon, attribute = name.partition(":")
@@ -530,6 +537,10 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
     if module.endswith(".py"):
         raise unknown(
             f"expected an importable module, as in 'my_policies:{attribute}', got the file {name!r}"
+        )
+    if attribute.isdigit():
+        raise unknown(
+            f"expected 'module:Class', got {name!r}; the URL of a server begins with http://"
         )
     try:
         loaded = importlib.import_module(module)
@@ -541,12 +552,20 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
                 f"it{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
+    except VLAgentsError:
+        raise
+    except Exception as error:  # whatever the module raises, a syntax error among them
+        place = "" if isinstance(error, SyntaxError) else _place_of(error)
+        raise unknown(
+            f"{name!r}: the import of module {module!r} raised {type(error).__name__}: "
+            f"{error}{place}; correct the module"
+        ) from error
 
     target = getattr(loaded, attribute, None)
     if target is None:
         classes = [other for other, value in vars(loaded).items() if isinstance(value, type)]
         raise unknown(
-            f"{name!r}: module {module!r} has no class "
-            f"{attribute!r}{did_you_mean(attribute, classes)}"
+            f"{name!r}: module {module!r} has no class {attribute!r}"
+            + (did_you_mean(attribute, classes) or "; write the name of a class that it has")
         )
     return target

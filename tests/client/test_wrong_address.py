@@ -65,6 +65,27 @@ def test_a_wrong_address_is_named_within_the_time_of_a_call(
 
 
 @pytest.mark.parametrize("host", ["127.0.0.2", "localhost"])
+@pytest.mark.parametrize("transport", ["auto", "shm", "http", "websocket"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://localhost:80x",
+        "http://localhost:99999",
+        "ws://localhost:-1",
+        "http://localhost:0",
+        "http://[::1",
+        "http://",
+        "localhost:8000",
+        "ftp://localhost:1",
+        "",
+    ],
+)
+def test_what_is_no_address_is_refused_before_anything_is_tried(url: str, transport: str) -> None:
+    with pytest.raises(ConfigError, match=r"url: expected http\(s\)://HOST:PORT") as caught:
+        RemoteAgent(url, transport=transport).initialize()  # type: ignore[arg-type]
+    assert repr(url) in str(caught.value)
+
+
 def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(
     tmp_path: Path, host: str
 ) -> None:

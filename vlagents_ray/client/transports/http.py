@@ -390,9 +390,16 @@ def http_url(url: str) -> SplitResult:
     Raises:
         ConfigError: It is not the URL of a server.
     """
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+        is_port = parts.port != 0
+    except ValueError as error:  # of its port, or of an IPv6 address
+        raise ConfigError(
+            f"url: expected http(s)://HOST:PORT, with a port from 1 to 65535, got {url!r} ({error})"
+        ) from error
+
     scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
-    if scheme is None or not parts.hostname:
+    if scheme is None or not parts.hostname or not is_port:
         raise ConfigError(
             f"url: expected http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP, got {url!r}"
         )

@@ -158,7 +158,7 @@ def select_transport(
     Raises:
         ConfigError: The URL does not support the transport.
     """
-    is_in_cluster = urlsplit(url).scheme == "serve"
+    is_in_cluster = url.startswith("serve://")
     if transport not in get_args(TransportName):
         raise ConfigError(
             f"transport: expected one of {list(get_args(TransportName))}, got {transport!r}"
@@ -170,6 +170,8 @@ def select_transport(
             "with serve://APP"
         )
 
+    if not is_in_cluster:
+        http_url(url)  # raises for an invalid URL before anything is tried
     credentials.use_at(url)
     if transport in ("handle", "plasma"):
         app = urlsplit(url).netloc
@@ -178,6 +180,4 @@ def select_transport(
         if transport == "http":
             return HttpTransport(url, codec, credentials, watch=watch)
         return WebSocketTransport(url, codec, credentials, watch)
-    if not is_in_cluster:
-        http_url(url)  # raises for an invalid URL before anything is tried
     return AutoTransport(url, codec, credentials, watch, only_shm=transport == "shm")
