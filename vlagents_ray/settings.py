@@ -65,7 +65,7 @@ def require_arguments(
             if name not in accepted and not suggestion:
                 suggestion = did_you_mean(name, accepted)
         raise ConfigError(
-            f"{subject}: {error}; it accepts {sorted(accepted)}{suggestion}"
+            f"{subject}: {error}; it accepts {sorted(accepted) or 'none'}{suggestion}"
         ) from error
 
     annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
@@ -123,26 +123,12 @@ def wrong_settings(error: ValueError, model: type | None = None, option: str | N
 
 def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -> str:
     """Return the message for an item of pydantic's list of errors."""
-    kind, value = item["type"], item["input"]
+    kind = item["type"]
     where = ".".join(map(str, item["loc"]))
-    message = str(item["msg"]).removeprefix("Value error, ")
     name = str(item["loc"][-1]) if item["loc"] else ""
     siblings = _fields(model, item["loc"][:-1])
 
-    # Other values are named by their type alone, as they may be secrets.
-    value_text = value if isinstance(value, (bool, int, float)) else type(value).__name__
-    # A word in place of a number or a list is no secret.
-    if kind in _WORD_ERRORS and isinstance(value, str):
-        value_text = shown(value)
-        message = message.partition(", unable to")[0]
-        if kind in ("list_type", "sequence_str"):
-            message += f", such as [{value[:40]}]"
-    hint = _SPELLINGS.get((kind, type(value)), "")
-    # A word in place of one of a list is no secret, either.
-    if kind == "literal_error" and isinstance(value, str):
-        value_text = shown(value)
-        hint = did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
-
+    message, value_text, hint = _reworded(item)
     if message.startswith(_EXPECTED):
         message = f"expected {message.removeprefix(_EXPECTED)}, got {value_text}{hint}"
     if kind == "path_type":
@@ -167,6 +153,41 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
         if accepted:
             message += f"; expected one of {accepted}{did_you_mean(name, accepted)}"
     return f"{where}: {message}" if where else message
+
+
+def _reworded(item: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return pydantic's message in clearer words, the text of the value, and a hint."""
+    kind, value = item["type"], item["input"]
+    message = str(item["msg"]).removeprefix("Value error, ")
+    # Other values are named by their type alone, as they may be secrets.
+    value_text = str(value) if isinstance(value, (bool, int, float)) else type(value).__name__
+    if value is None:
+        value_text = "nothing"
+    # A word in place of a number or a list is no secret.
+    if kind in _WORD_ERRORS and isinstance(value, str):
+        value_text = shown(value)
+        message = message.partition(", unable to")[0]
+        if kind in ("list_type", "sequence_str"):
+            message += f", such as [{value[:40]}]"
+
+    hint = _SPELLINGS.get((kind, type(value)), "")
+    if kind == "literal_error" and isinstance(value, str):
+        # A word in place of one of a list is no secret, either.
+        value_text = shown(value)
+        hint = did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
+    elif kind == "bool_parsing":
+        hint = "; write true or false"
+    elif kind == "int_from_float":
+        message = message.partition(", got a number")[0]
+    elif kind == "too_short" and not value:
+        number = item["ctx"]["min_length"]
+        message = f"{_EXPECTED}at least {number} {'entry' if number == 1 else 'entries'}"
+        value_text = "none"
+    elif kind == "invalid_key":
+        message = f"{_EXPECTED}a name as a key"
+        value_text = str(item["loc"][-1])
+        hint = "; correct it, or put it in quotation marks"
+    return message, value_text, hint
 
 
 def _fields(model: type | None, path: Iterable[Any]) -> Mapping[str, Any]:

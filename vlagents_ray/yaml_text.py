@@ -31,7 +31,10 @@ def load_yaml(text: str, *, extra: str = "serve", distribution: str = CORE) -> A
     try:
         return yaml.load(text, Loader=_loader(yaml))
     except yaml.YAMLError as error:
-        raise ValueError(str(error)) from error
+        reason = str(error).replace('in "<unicode string>", ', "in ")
+        if "character '\\t'" in reason:
+            reason += "; write spaces, as YAML allows no tab there"
+        raise ValueError(reason) from error
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
 

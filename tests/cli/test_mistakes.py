@@ -130,12 +130,34 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "policy misspelt": ([*EVAL, "noope"], ["noope", "noop"]),
     "policy file absent": ([*EVAL, "nope.yaml"], ["nope.yaml", "does not exist"]),
     "module absent": ([*EVAL, "absent:Policy"], ["absent"]),
-    "class absent": ([*EVAL, "own:Nope"], ["Nope"]),
+    "class absent": ([*EVAL, "own:Nope"], ["Nope", "write the name of a class"]),
+    "module with a syntax error": (
+        [*EVAL, "syntax:Policy"],
+        ["'syntax' raised SyntaxError", "syntax.py, line 1", "correct the module"],
+    ),
+    "module that raises": (
+        [*EVAL, "raising:Policy"],
+        ["'raising' raised ZeroDivisionError", "(raising.py:2)", "correct the module"],
+    ),
+    "module that needs another name": (
+        [*EVAL, "importing:Policy"],
+        ["'importing' raised ImportError", "absent_name", "(importing.py:1)"],
+    ),
+    "env in a module with a syntax error": (
+        [*EVAL, "noop", "syntax:Env"],
+        ["'syntax' raised SyntaxError", "correct the module"],
+    ),
+    "serve: module with a syntax error": (
+        ["serve", "--set", "gain=1", "syntax:Policy"],
+        ["'syntax' raised SyntaxError", "correct the module"],
+    ),
+    "an address without http": ([*EVAL, "localhost:8000"], ["'localhost:8000'", "http://"]),
+    "a port beyond the last": ([*EVAL, "http://localhost:99999"], ["99999", "1 to 65535"]),
     "no agent": ([*EVAL, "own:NoAgent"], ["Agent"]),
     "setting misspelt": ([*EVAL, "noop", "--set", "chunks=2"], ["chunks", "chunk"]),
     "setting of another type": (
         [*EVAL, "noop", "--set", "delta=maybe"],
-        ["delta", "'maybe'", "boolean"],
+        ["delta", "'maybe'", "boolean", "true or false"],
     ),
     "setting without a value": ([*EVAL, "noop", "--set", "delta"], ["delta", "KEY=VALUE"]),
     "env setting misspelt": ([*EVAL, "noop", "--env-set", "maxsteps=3"], ["maxsteps", "max_steps"]),
@@ -154,21 +176,24 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["eval", run(policies=[POLICY | {"transport": "grpc"}])],
         ["'grpc'", "'auto'"],
     ),
-    "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist"]),
+    "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist; "]),
     "file with options of suites": (
         ["eval", run(), "--episodes", "3"],
         ["episodes", "write them in the file"],
     ),
-    "file empty": (["eval", " "], ["a mapping with", "policies"]),
+    "file empty": (["eval", " "], ["a mapping with", "policies", "got an empty file"]),
     "file a list": (["eval", "- 1"], ["list", "a mapping with"]),
-    "file with a tab": (["eval", "policies:\n\t- x"], ["not YAML", "line 2"]),
+    "file with a tab": (["eval", "policies:\n\t- x"], ["not YAML", "line 2", "spaces"]),
     "key twice": (["eval", run(workers=0) + "workers: 3\n"], ["'workers'", "twice", "keep one"]),
     "key misspelt": (["eval", run(suites=[SUITE | {"episods": 3}])], ["episods", "episodes"]),
     "text for a number": (
         ["eval", run(suites=[SUITE | {"episodes": "two"}])],
         ["'two'", "integer"],
     ),
-    "half an episode": (["eval", run(suites=[SUITE | {"episodes": 2.5}])], ["2.5", "integer"]),
+    "half an episode": (
+        ["eval", run(suites=[SUITE | {"episodes": 2.5}])],
+        ["expected a valid integer, got 2.5"],
+    ),
     "negative": (["eval", run(suites=[SUITE | {"episodes": -2}])], ["-2", "1"]),
     "exponent": (["eval", run().replace("envs:", "episodes: 1e12\n  envs:")], ["1000000"]),
     "text for a list": (["eval", run(suites=[{"envs": "tabletop"}])], ["'tabletop'", "[tabletop]"]),
@@ -205,9 +230,12 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["not YAML", "line 1"],
     ),
     "nested too deeply": (["eval", "policies: " + "[" * 3000], ["not YAML", "nested too deeply"]),
-    "no entries": (["eval", run(policies=[])], ["policies", "at least 1"]),
-    "an empty key": (["eval", run(suites=None)], ["suites: expected a valid list, got NoneType"]),
-    "a number as a key": (["eval", "1: 2\n" + run()], ["1: ", "string"]),
+    "no entries": (["eval", run(policies=[])], ["policies: expected at least 1 entry, got none"]),
+    "an empty key": (["eval", run(suites=None)], ["suites: expected a valid list, got nothing"]),
+    "a number as a key": (
+        ["eval", "1: 2\n" + run()],
+        ["1: expected a name as a key", "quotation marks"],
+    ),
     "a folder as a file": (["eval", "folder.yaml"], ["expected a file, got a folder"]),
     "slurm: setup absent": (
         ["slurm", "serve", "noop", "--dry-run", "--setup", "no.sh"],
@@ -392,6 +420,9 @@ def folder(tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     # Python writes it beside own.py, which is no result.
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (tmp_path / "own.py").write_text(POLICIES)
+    (tmp_path / "syntax.py").write_text("class Policy(:\n")
+    (tmp_path / "raising.py").write_text("a = 0\nb = 1 / a\n")
+    (tmp_path / "importing.py").write_text("from json import absent_name\n")
     (tmp_path / "folder.yaml").mkdir()
     for name, text in (("emptied", ""), ("texted", "no database")):
         (tmp_path / name).mkdir()

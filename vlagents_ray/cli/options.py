@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from typer.core import TyperGroup
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.settings import wrong_settings
 from vlagents_ray.yaml_text import load_yaml, read_yaml
 
@@ -246,8 +247,11 @@ def read_run_file(file: Path, noun: str, keys: str) -> dict[str, Any]:
             f"{noun} {str(file)!r}: expected a file, got a folder; name a .yaml file in it"
         )
     if not file.is_file():
-        raise ConfigError(f"{noun} {str(file)!r} does not exist")
+        neighbours = [str(other) for other in file.parent.glob("*.y*ml")]
+        hint = did_you_mean(str(file), neighbours) or "; check the path"
+        raise ConfigError(f"{noun} {str(file)!r} does not exist{hint}")
     document = read_yaml(file)
     if not isinstance(document, dict):
-        raise ConfigError(f"{file}: expected a mapping with {keys}, got {type(document).__name__}")
+        found = "an empty file" if document is None else type(document).__name__
+        raise ConfigError(f"{file}: expected a mapping with {keys}, got {found}")
     return {"out": Path("runs") / file.stem} | document
