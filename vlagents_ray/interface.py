@@ -58,6 +58,12 @@ LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this ob
 # int: the expected number of ticks until the answer arrives, at most the rows of LEFTOVER. It is 0
 # if the number is unknown.
 DELAY = "delay_ticks"
+# The next three are in the observations of a robot with a planner (`vlagents_ray.robot.planner`).
+GOAL = "goal"  # (D,) float32: the action of the planner's newest answer, such as a pose to reach
+# str: what the robot is to do until the planner's next answer; in the Act of a planner as well.
+SUBTASK = "subtask"
+# float: the time since the observation from which the planner computed its newest answer, ms.
+SUBTASK_AGE = "subtask_age_ms"
 # In an observation, float: the time from the request's arrival for which the server may take to
 # send its answer, ms. A robot that has no rows left states 0.
 SLACK = "slack_ms"

@@ -119,6 +119,7 @@ ENVS: dict[str, RegistryEntry] = {
 
 WRAPPERS: dict[str, RegistryEntry] = {
     "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
+    "subtasks": RegistryEntry("vlagents_ray.policies.subtasks:Subtasks"),
 }
 
 # Formats of `vlagents-ray export`. A function (results, path, **settings) writes the episodes and

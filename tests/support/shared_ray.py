@@ -25,8 +25,9 @@ FIXTURE = "shared_ray"
 _CPUS = 4  # only an account: replicas, and workers of evaluations
 # For a policy to be ready, with packages that Ray installs; CI may have a fraction of two cores.
 _READY_S = 400.0
-# Policies that tests serve: their own, and those of an example with several files.
-_POLICIES = (Path(__file__).parent, Path(__file__).parents[2] / "examples" / "raptor")
+_EXAMPLES = Path(__file__).parents[2] / "examples"
+# Policies that tests serve: their own, and those of examples with several files.
+_POLICIES = (Path(__file__).parent, _EXAMPLES / "raptor", _EXAMPLES / "two_models")
 
 _running: contextlib.ExitStack | None = None
 _port = 0  # of Serve's HTTP

@@ -49,6 +49,7 @@ from vlagents_ray.robot.loop import (
     robot_watchdog,
     run_loop,
 )
+from vlagents_ray.robot.planner import RobotWithPlanner
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
@@ -62,6 +63,7 @@ MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0
 _HZ = 50.0  # the control rate of a robot, unless --hz sets it
 _MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
+_PLANNER_HZ, _PLANNER_MAX_AGE_S = 1.0, 5.0
 _LABELS = {"y": "success", "n": "failure"}
 KEYS = (
     "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and "
@@ -143,6 +145,12 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             "NAME:ARGUMENT or MODULE:CLASS"
         )
 
+    if options.planner is None and (options.planner_hz or options.planner_max_age_s):
+        parser.error(
+            "--planner-hz and --planner-max-age-s: expected --planner with them, got none; give "
+            "the URL of the planner"
+        )
+
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
@@ -213,8 +221,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player.initialize()  # rejects unfit settings before anything is timed or moves
 
         make_robot = make_robot or partial(SimulatedRobot, contract)
-        robot = stack.enter_context(opened(make_robot))
-        _require_part(options.measure, robot)
+        robot = stack.enter_context(_opened_robot(options, make_robot))
         fit = _require_fit(options, agent, robot, guard.limits, say)
 
         recorder = None
@@ -254,7 +261,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 player,
                 hz=hz,
                 seconds=options.seconds,
-                until=lambda: keys.over,
+                until=lambda: keys.over or _is_task_done(robot),
                 instruction=options.instruction,
                 watchdog=watchdog,
                 recorder=recorder,
@@ -264,6 +271,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
             failure = error
 
         _say_report(report, f"{options.mode}, {agent.transport}", say, led=leader is not None)
+        if report.jitter:
+            _say_planner(robot, say)
 
     if recorder is not None:  # it is closed, so that everything is written
         say(
@@ -291,6 +300,40 @@ def _opened_leader(
         if help_text:
             say(help_text)
         yield leader
+
+
+@contextlib.contextmanager
+def _opened_robot(options: argparse.Namespace, make_robot: Callable[[], Robot]) -> Iterator[Robot]:
+    """Open the robot within the context, with the planner of the options, if there is one."""
+    with opened(make_robot) as robot:
+        _require_part(options.measure, robot)
+        if options.planner is None:
+            yield robot
+            return
+
+        planner = RemoteAgent(
+            options.planner, transport=options.transport, timeout_s=options.timeout_s
+        )
+        with RobotWithPlanner(
+            robot,
+            planner,
+            instruction=options.instruction,
+            hz=options.planner_hz or _PLANNER_HZ,
+            max_age_s=options.planner_max_age_s or _PLANNER_MAX_AGE_S,
+        ) as planned_robot:
+            yield planned_robot
+
+
+def _is_task_done(robot: Robot) -> bool:
+    """Return whether the planner of a robot, if it has one, considers the task finished."""
+    return isinstance(robot, RobotWithPlanner) and robot.task_done
+
+
+def _say_planner(robot: Robot, say: Callable[[str], None]) -> None:
+    """Print how punctual the planner of a robot was, if it has one."""
+    if isinstance(robot, RobotWithPlanner):
+        figures = robot.planner_timeliness
+        say(f"planner: {figures.share:.2%} of {figures.ticks} answers in time")
 
 
 def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) -> Guard:
@@ -740,6 +783,24 @@ def command_parser() -> tuple[
         default=SHARE,
         metavar="SHARE",
         help="share of the ticks that need an action in time (default: %(default)s)",
+    )
+    real(
+        "--planner",
+        metavar="URL",
+        help="URL of a planner, a second and slower model: its newest subtask is in each "
+        "observation of the policy, and the robot holds while that is too old",
+    )
+    real(
+        "--planner-hz",
+        type=number(above=True, maximum=_MOST_HZ),
+        metavar="HZ",
+        help=f"rate at which the planner is asked (default: {_PLANNER_HZ:g})",
+    )
+    real(
+        "--planner-max-age-s",
+        type=seconds,
+        metavar="S",
+        help=f"age in seconds above which a subtask is too old (default: {_PLANNER_MAX_AGE_S:g})",
     )
     real(
         "--silent-s",
