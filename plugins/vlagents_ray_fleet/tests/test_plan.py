@@ -11,7 +11,7 @@ import pytest
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.fleet import USABLE, RobotNeed, most_robots
 from vlagents_ray_fleet.check import check
-from vlagents_ray_fleet.fleet_file import FleetFile, read_fleet
+from vlagents_ray_fleet.fleet_file import MOST_LOAD, FleetFile, read_fleet
 from vlagents_ray_fleet.plan import FleetPlan, plan
 
 ROOT = Path(__file__).parents[3]
@@ -91,14 +91,14 @@ def test_no_gpu_holds_more_than_it_has_and_each_replica_has_a_place(name: str) -
             memory_gb += replicas * values["models"][piece.model]["memory_gb"]
         assert memory_gb <= GPUS["memory_gb"]
     assert placed == {model.model: model.replicas for model in solved.models}
-    assert all(model.load <= 0.75 for model in solved.models)
+    assert all(model.load <= MOST_LOAD for model in solved.models)
 
 
 def test_the_fewest_gpus_are_those_of_the_arithmetic() -> None:
     values = {"robots": {"arms": robots(1000, 10, 50)}, "models": {"pi0": PI0}}
     solved = plan(fleet(gpus=100, **values))
     model = fleet(**values).models["pi0"]
-    of_one = most_robots(model.costs.curve(), RobotNeed(10.0, 50), 16, 0.005) * 0.75 / USABLE
+    of_one = most_robots(model.costs.curve(), RobotNeed(10.0, 50), 16, 0.005) * MOST_LOAD / USABLE
     assert solved.gpus_used == math.ceil(1000 / math.floor(of_one))
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import http.server
 import json
 import shutil
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import our_apps, policy_application, read_deployment
 from vlagents_ray_fleet.command import plan_command
-from vlagents_ray_fleet.fleet_file import Costs, read_fleet
+from vlagents_ray_fleet.fleet_file import read_fleet
 from vlagents_ray_fleet.registry import PLAN
 
 ROOT = Path(__file__).parents[3]
@@ -105,7 +102,7 @@ def test_too_few_gpus_are_an_exit_status_and_a_sentence_with_the_missing_ones(fi
         ("fixed_ms: 29.3, ", "", "expected fixed_ms with row_ms, got"),
         ("row_ms: 8.06", "row_ms: 8.06, table: {1: 3}", "expected one of .* keep one"),
         ("fixed_ms: 29.3, row_ms: 8.06", "fixed_ms: 0, row_ms: 0", "expected a duration"),
-        ("fixed_ms: 29.3, row_ms: 8.06", "url: file:///etc/x", "expected http://"),
+        ("fixed_ms: 29.3, row_ms: 8.06", "url: file:///etc/x", "costs.url: expected the metadata"),
         ("      planner: {hz: 1, age_ms: 3000}", "     ", "got the unused"),
         ("policy: noop  #", "policy: noop\n    deployment: x.yaml  #", "got both; keep one"),
     ],
@@ -156,38 +153,3 @@ def test_a_model_without_a_policy_has_no_deployment_file(file: Path, tmp_path: P
     done = CliRunner().invoke(app, ["plan", str(file), "--out", str(tmp_path / "served.yaml")])
     assert done.exit_code == 2
     assert "models.planner: expected `deployment` or `policy`" in done.stderr
-
-
-@pytest.fixture
-def measured() -> Iterator[str]:
-    """The address of a server that answers with its costs, and below /empty without any."""
-
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            document = {} if self.path == "/empty" else {"costs": {"table": {"1": 40, "4": 70}}}
-            body = json.dumps(document).encode()
-            self.send_response(200)
-            self.send_header("content-length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-def test_costs_are_read_from_a_running_server(measured: str) -> None:
-    curve = Costs(url=measured).curve()
-    assert [curve.cost_s(rows) for rows in (1, 2, 4)] == pytest.approx([0.04, 0.05, 0.07])
-    with pytest.raises(ConfigError, match=r"costs\.url: expected .* none until batches have run"):
-        Costs(url=f"{measured}/empty").curve()
-    with pytest.raises(ConfigError, match=r"costs\.url: expected the costs as JSON .* running\?"):
-        Costs(url="http://127.0.0.1:1/").curve()

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from vlagents_ray import RemoteAgent
 from vlagents_ray.bounds import MOST_ROWS, MOST_WORKERS
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.serve.fleet import USABLE, CostCurve
 from vlagents_ray.settings import wrong_settings
@@ -23,7 +21,7 @@ time keep a queue that does not shrink: an answer that comes after the last row 
 each robot that starves asks twice. In the simulation, fleets at a load of 0.8 starved for minutes.
 """
 
-_HTTP_S = 10.0  # longest wait for the costs that a running replica has measured
+_SERVER_S = 10.0  # longest wait for the costs that a running replica has measured
 _MOST_MS = 1e9
 _MOST_HZ = 1e4
 _MOST_GB = 1e6
@@ -87,8 +85,8 @@ class Costs(_FleetModel):
     )
     url: str | None = Field(
         default=None,
-        description="address whose JSON has `fixed_ms` and `row_ms`, or `table`, as a server "
-        "measures them",
+        description="address of a server of the model, which measures its batches as it runs",
+        examples=["http://gpu-box:8000/pi0"],
     )
 
     @model_validator(mode="after")
@@ -113,7 +111,7 @@ class Costs(_FleetModel):
         """Return the curve; with `url`, as its server answers.
 
         Raises:
-            ConfigError: The costs are not above 0, or the server does not answer with costs.
+            ConfigError: The costs are not above 0, or the server has measured too few batches.
         """
         if self.url is not None:
             return _curve_at(self.url)
@@ -236,28 +234,29 @@ def read_fleet(file: Path | str) -> FleetFile:
 
 
 def _curve_at(url: str) -> CostCurve:
-    """Return the costs that a server has measured."""
-    if not url.startswith(("http://", "https://")):
-        raise ConfigError(f"costs.url: expected http://… or https://…, got {url!r}")
+    """Return the durations of batches that a server has measured as it ran."""
     try:
-        with urllib.request.urlopen(url, timeout=_HTTP_S) as answer:  # noqa: S310
-            document = json.load(answer)
-    except (urllib.error.URLError, TimeoutError, ValueError) as error:
+        with RemoteAgent(url, timeout_s=_SERVER_S) as server:
+            measured = server.metadata.get("batch_costs")
+    except VLAgentsError as error:
         raise ConfigError(
-            f"costs.url: expected the costs as JSON from {url}, got {error}; is the server "
+            f"costs.url: expected the metadata of the server at {url}, got {error}; is the server "
             "running? Or write its costs into the file"
         ) from error
 
-    known = Costs.model_fields.keys() - {"url"}
-    values = {}
-    if isinstance(document, dict):
-        measured = document.get("costs", document)
-        if isinstance(measured, dict):
-            values = {name: value for name, value in measured.items() if name in known}
+    sizes: dict[str, Any] = {}
+    if isinstance(measured, dict) and isinstance(measured.get("ms_by_size"), dict):
+        sizes = measured["ms_by_size"]
+    if len(sizes) < 2:
+        raise ConfigError(
+            f"costs.url: expected batches of at least two sizes at {url}, got those of "
+            f"{sorted(sizes) or 'none'}; let robots run first, or write the costs that "
+            "`vlagents-ray tune` prints into the file"
+        )
     try:
-        return Costs(**values).curve()
+        return Costs.model_validate({"table": sizes}).curve()
     except ValidationError as error:
         raise ConfigError(
-            f"costs.url: expected {sorted(known)} from {url}: {wrong_settings(error, Costs)}; it "
-            "has none until batches have run"
+            f"costs.url: expected milliseconds by batch size from {url}: "
+            f"{wrong_settings(error, Costs)}; is it a server of this project?"
         ) from error
