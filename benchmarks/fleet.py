@@ -210,9 +210,46 @@ def _point(plan: FleetPlan, system: str, robots: int, urls: Sequence[str]) -> di
         )
         for url, kind in zip(urls, plan.fleet(robots), strict=True)
     ]
+    run = run_robots(fleet, plan.warm, plan.seconds)
+    figures = run.figures
+    robot_hours = robots * plan.seconds / 3600
+    point = {
+        "system": system,
+        "robots": robots,
+        **summary(figures),
+        "client_cpu_s": run.client_cpu_s / robot_hours,
+        "server_cpu_s": run.server_cpu_s / robot_hours,
+        "failed": sorted({robot["failed"] for robot in figures if robot["failed"]}),
+        "kinds": [],
+    }
+    kinds = plan.fleet(robots)
+    for kind in plan.kinds:
+        of_kind = [robot for robot, its in zip(figures, kinds, strict=True) if its == kind]
+        if of_kind:
+            point["kinds"].append({"hz": kind.hz, "rows": kind.rows, **summary(of_kind)})
+    return point
+
+
+@dataclass(frozen=True, slots=True)
+class RobotsRun:
+    """What robots got, and the CPU time that they and their servers took, s."""
+
+    figures: Sequence[Mapping[str, Any]]  # of each robot
+    client_cpu_s: float
+    server_cpu_s: float
+
+
+def run_robots(fleet: Sequence[Robot], warm: float, seconds: float) -> RobotsRun:
+    """Run robots in processes of their own, all of which begin at once.
+
+    Args:
+        fleet: The robots.
+        warm: The time before the measurement, s.
+        seconds: The length of the measurement, s.
+    """
     with contextlib.ExitStack() as stack:
         processes = []
-        for first in range(0, robots, _ROBOTS_A_PROCESS):
+        for first in range(0, len(fleet), _ROBOTS_A_PROCESS):
             robots_of_process = fleet[first : first + _ROBOTS_A_PROCESS]
             arguments = json.dumps([asdict(robot) for robot in robots_of_process])
             command = [sys.executable, "-m", "benchmarks.fleet_robots", arguments]
@@ -223,34 +260,18 @@ def _point(plan: FleetPlan, system: str, robots: int, urls: Sequence[str]) -> di
         client_pids = [process.pid for process in processes]
         server_pids = server_processes(os.getpid(), client_pids)
         begin = time.monotonic() + _AHEAD_S
-        counted = begin + plan.warm
-        times = {"begin": begin, "counted": counted, "end": counted + plan.seconds}
+        counted = begin + warm
+        times = {"begin": begin, "counted": counted, "end": counted + seconds}
         for process in processes:
             process.send(json.dumps(times))
         time.sleep(max(0.0, counted - time.monotonic()))
         clients_before, server_before = _cpu_s(client_pids), _cpu_s(server_pids)
         figures: list[dict[str, Any]] = []
         for process in processes:
-            figures += process.read(plan.seconds + _LATE_S)
-        clients_s = _cpu_s(client_pids) - clients_before
-        server_s = _cpu_s(server_pids) - server_before
-
-    robot_hours = robots * plan.seconds / 3600
-    point = {
-        "system": system,
-        "robots": robots,
-        **_summary(figures),
-        "client_cpu_s": clients_s / robot_hours,
-        "server_cpu_s": server_s / robot_hours,
-        "failed": sorted({robot["failed"] for robot in figures if robot["failed"]}),
-        "kinds": [],
-    }
-    kinds = plan.fleet(robots)
-    for kind in plan.kinds:
-        of_kind = [robot for robot, its in zip(figures, kinds, strict=True) if its == kind]
-        if of_kind:
-            point["kinds"].append({"hz": kind.hz, "rows": kind.rows, **_summary(of_kind)})
-    return point
+            figures += process.read(seconds + _LATE_S)
+        return RobotsRun(
+            figures, _cpu_s(client_pids) - clients_before, _cpu_s(server_pids) - server_before
+        )
 
 
 def _cpu_s(pids: Sequence[int]) -> float:
@@ -261,7 +282,7 @@ def _cpu_s(pids: Sequence[int]) -> float:
     return seconds
 
 
-def _summary(robots: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summary(robots: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the figures of some robots: the share of their ticks, and the ages of actions, ms."""
     shares = [1 - robot["starved"] / max(1, robot["ticks"]) for robot in robots]
     ticks = sum(robot["ticks"] for robot in robots)
