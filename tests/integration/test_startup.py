@@ -332,6 +332,8 @@ def test_a_server_that_stops_closes_the_websockets_behind_its_proxy_with_a_reaso
     """Serve ends HAProxy, and with it all connections, before the replicas if both end at once."""
     with contextlib.ExitStack() as stack:
         with serving("noop", tmp_path / "log") as address:
+            # Before, a WebSocket may go through Serve's own proxy.
+            wait_for(lambda: "Ctrl-C stops" in (tmp_path / "log").read_text(), 60)
             websocket = stack.enter_context(connect(f"ws://{address}/v1/stream"))
         with pytest.raises(ConnectionClosed) as closed:
             websocket.recv(timeout=10)

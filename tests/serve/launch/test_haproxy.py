@@ -28,12 +28,14 @@ from ray.serve._private.constants import (
 from vlagents_ray.client.connection import FROZEN_S
 from vlagents_ray.client.transports.http import refusal
 from vlagents_ray.errors import NoReplica, PolicyUnavailable
+from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.launch.haproxy import (
     _CHECK_FAILURES,
     _CHECK_INTERVAL,
     _CONNECTIONS_PER_ADDRESS,
     ROBOTS,
     _write_launcher,
+    close_port,
     haproxy_binary,
     open_port,
     wait_for_haproxy,
@@ -164,12 +166,13 @@ def binds(launcher: Path, config: Path, server: str) -> list[str]:
 
 
 @pytest.mark.parametrize("begins_empty", [False, True])
-def test_clients_are_refused_until_the_first_replica_runs(
-    begins_empty: bool, tmp_path: Path
+def test_clients_are_refused_until_the_first_replica_runs_and_when_the_server_stops(
+    begins_empty: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """openpi's client waits for a server whose port is closed, and ends at a handshake that is
     refused or hangs.
     """
+    monkeypatch.setenv(MARK, str(tmp_path))
     launcher, config = _write_launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"
     own, public = ["127.0.0.1:9000", "127.0.0.1:9001"], ["127.0.0.1:8000", "192.0.2.7:8443"]
     if begins_empty:
@@ -178,6 +181,9 @@ def test_clients_are_refused_until_the_first_replica_runs(
     assert set(binds(launcher, config, REPLICA)) == {*own, *public}
     # When the last replica has ended, clients get an answer that says so.
     assert set(binds(launcher, config, FALLBACK)) == {*own, *public}
+    close_port()  # the server stops
+    assert set(binds(launcher, config, REPLICA)) == set(own)
+    assert set(binds(launcher, config, FALLBACK)) == set(own)
 
 
 def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ _CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
 _WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
 _RETRY_AFTER_S = 1
 _OPEN = "open"  # file name, in the same folder: the port has been open, and stays open
+_CLOSED = "closed"  # the same: the server stops, and its port is closed to new connections
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
@@ -292,13 +293,15 @@ def _write_launcher(
         rf"s/^backend .*$/&\n{stick_table}\n    stick on hdr(x-session-id)/",
     )
 
-    # Lines of the script that close the port until the first replica runs.
-    is_open = shlex.quote(str(folder / _OPEN))
-    close_port = r"/^(frontend http_frontend|listen outside)$/,/^ *bind /s/^ *bind /    # &/"
+    # Lines of the script that close the port until the first replica runs, and when the server
+    # stops.
+    is_open, is_closed = (shlex.quote(str(folder / name)) for name in (_OPEN, _CLOSED))
+    closing = r"/^(frontend http_frontend|listen outside)$/,/^ *bind /s/^ *bind /    # &/"
     opening = (
-        f"        if [ ! -e {is_open} ]; then\n"
+        f"""        if [ -e {is_closed} ]; then sed -i -E -e '{closing}' "$word"\n"""
+        f"        elif [ ! -e {is_open} ]; then\n"
         f"""            if grep -q '^    server SERVE_REPLICA' "$word"; then : >{is_open}\n"""
-        f"""            else sed -i -E -e '{close_port}' "$word"; fi\n"""
+        f"""            else sed -i -E -e '{closing}' "$word"; fi\n"""
         "        fi\n"
     )
 
@@ -337,6 +340,15 @@ def _write_refusal(folder: Path) -> Path:
 def open_port(folder: Path) -> None:
     """Open the port of a server before it has replicas, for applications that begin with none."""
     (folder / _OPEN).touch()
+
+
+def close_port() -> None:
+    """Close the port of this process's server to new connections, at HAProxy's next update. Clients
+    of other systems retry a refused connection, but give up after a rejected handshake.
+    """
+    folder = os.environ.get(MARK)
+    if folder:
+        (Path(folder) / _CLOSED).touch()
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:

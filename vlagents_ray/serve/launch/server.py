@@ -81,7 +81,7 @@ def end_applications(client: Any, names: Sequence[str]) -> None:
 
     When Serve shuts down, it stops HAProxy at once, and with it the connections of the clients,
     before the replicas have answered them and closed their WebSockets. Without its applications,
-    HAProxy keeps these connections.
+    HAProxy keeps these connections; see also `haproxy.close_port`.
     """
     private.begin_to_end(client, names)
     deadline = time.monotonic() + _SHUTDOWN_S
@@ -225,6 +225,8 @@ def running_server(
         if ingress:
             names = [app.name for app in config.applications]
             stack.push(session.unless_lost(lambda: end_applications(client, names)))
+        if is_own_ray:
+            stack.callback(haproxy.close_port)
         url = _url("http" if tls is None else "https", host, public_port)
         if is_own_ray and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
