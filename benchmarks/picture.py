@@ -1,10 +1,10 @@
-"""The picture of the league: round trips of all systems, and actions a second by number of
-clients.
+"""The pictures of the measurements: the league's round trips of all systems and actions a second by
+number of clients, and the robots that each system serves in time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,3 +99,54 @@ def _plot_throughput(axes: Any, part: Mapping[str, Any]) -> None:
     axes.set_title(f"{part['policy']}{settings}, batches of {part['batch']} at most", fontsize=8)
     axes.set_xlabel("clients")
     axes.set_ylabel("actions/s")
+
+
+def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
+    """Draw the share of the ticks in time by number of robots, a panel for each fleet.
+
+    Args:
+        fleets: For each its "title", the "points" of `benchmarks.fleet.measure_fleet`, and "most",
+            the largest number of robots by arithmetic, or None.
+        file: The picture.
+    """
+    matplotlib = require("matplotlib")
+    with matplotlib.rc_context({**_SETTINGS, "svg.hashsalt": "fleets"}):
+        figure = require("matplotlib.figure").Figure(
+            figsize=(3.6 * len(fleets) + 1.6, 3.2), layout="constrained"
+        )
+        panels = figure.subplots(1, len(fleets), sharey=True, squeeze=False)[0]
+        systems = list(dict.fromkeys(one["system"] for each in fleets for one in each["points"]))
+        for axes, fleet in zip(panels, fleets, strict=True):
+            _plot_shares(axes, fleet, systems)
+        panels[0].set_ylabel("ticks in time, %")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(
+            handles,
+            labels,
+            loc="outside right center",
+            fontsize=8,
+            frameon=False,
+            labelcolor=_TEXT,
+        )
+        figure.savefig(file, transparent=True, metadata={"Date": None})
+
+
+def _plot_shares(axes: Any, fleet: Mapping[str, Any], systems: Sequence[str]) -> None:
+    for number, system in enumerate(systems):
+        points = [point for point in fleet["points"] if point["system"] == system]
+        ours = number == 0
+        axes.plot(
+            [point["robots"] for point in points],
+            [100 * point["share"] for point in points],
+            label=system,
+            marker="o",
+            ms=4 if ours else 3,
+            lw=2 if ours else 1,
+            ls=_DASHES[number % len(_DASHES)],
+            color=_OURS if ours else f"C{number % 10}",
+        )
+    if fleet["most"] is not None:
+        axes.axvline(fleet["most"], color=_TEXT, lw=0.8, ls=":")
+    axes.set_title(fleet["title"], fontsize=8)
+    axes.set_xlabel("robots on one accelerator")
+    axes.set_ylim(0, 105)

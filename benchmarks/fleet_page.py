@@ -1,0 +1,92 @@
+"""The picture and the table of several measurements of `benchmarks.fleet`.
+
+`python -m benchmarks.fleet_page FILE... --picture docs/pictures/fleet.svg` prints the table as
+Markdown. Files that measured the same robots, such as other systems, share a panel.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from benchmarks.fleet import most_served
+from benchmarks.picture import plot_fleets
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
+
+_SAME = ("kinds", "chunk", "base_ms", "row_ms", "batch", "transport", "real_time_chunking")
+
+
+def merge_fleets(files: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a fleet for each sort of robots, with the points of all files that measured it."""
+    fleets: dict[str, dict[str, Any]] = {}
+    for measured in files:
+        plan = measured["plan"]
+        key = json.dumps({name: plan[name] for name in _SAME}, sort_keys=True)
+        fleet = fleets.setdefault(key, {"title": title(plan), "most": most(plan), "points": []})
+        fleet["points"] += measured["points"]
+    return list(fleets.values())
+
+
+def title(plan: Mapping[str, Any]) -> str:
+    """Return the heading of a panel."""
+    robots = " and ".join(f"{kind['rows']} rows at {kind['hz']:g} Hz" for kind in plan["kinds"])
+    continued = ", RTC" if plan["real_time_chunking"] else ""
+    curve = f"{plan['base_ms']:g} + {plan['row_ms']:g} ms a row"
+    return f"{robots}{continued}, {plan['transport']}, {curve}"
+
+
+def most(plan: Mapping[str, Any]) -> int | None:
+    """Return the largest number of robots by arithmetic; None for robots of several kinds."""
+    if len(plan["kinds"]) > 1:
+        return None
+    kind = plan["kinds"][0]
+    costs = CostCurve(plan["base_ms"] / 1e3, plan["row_ms"] / 1e3)
+    return most_robots(costs, RobotNeed(kind["hz"], kind["rows"]), plan["batch"])
+
+
+def markdown(fleets: Sequence[Mapping[str, Any]]) -> str:
+    """Return a row for each fleet and system."""
+    columns = (
+        "robots",
+        "system",
+        "most in time",
+        "at N robots: in time, served, age p95 s",
+        "CPU s a robot-hour: server, client",
+    )
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for fleet in fleets:
+        systems = dict.fromkeys(point["system"] for point in fleet["points"])
+        for system in systems:
+            points = [point for point in fleet["points"] if point["system"] == system]
+            figures = "; ".join(
+                f"{point['robots']}: {point['share']:.1%}, {point['served']}, "
+                f"{point['age_p95_ms'] / 1e3:.2f}"
+                for point in points
+            )
+            last = points[-1]
+            lines.append(
+                f"| {fleet['title']} | {system} | {most_served(points, system)} | {figures} | "
+                f"{last['server_cpu_s']:.0f}, {last['client_cpu_s']:.0f} |"
+            )
+    return "\n".join(lines)
+
+
+def main(
+    files: Annotated[list[Path], typer.Argument(help="Files of `benchmarks.fleet --out`.")],
+    picture: Annotated[Path | None, typer.Option(help="File of the picture.")] = None,
+) -> None:
+    """Print the table of several measurements, and draw them."""
+    with errors():
+        fleets = merge_fleets([json.loads(file.read_text()) for file in files])
+        out.print(markdown(fleets), soft_wrap=True, markup=False)
+        if picture is not None:
+            plot_fleets(fleets, picture)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,58 @@
+"""The table and the picture of several measurements of fleets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from benchmarks.fleet_page import markdown, merge_fleets, most
+from benchmarks.picture import plot_fleets
+
+PLAN: dict[str, Any] = {
+    "kinds": [{"hz": 10.0, "rows": 50, "weight": 1}],
+    "chunk": 50,
+    "base_ms": 29.3,
+    "row_ms": 8.06,
+    "batch": 16,
+    "transport": "websocket",
+    "real_time_chunking": False,
+}
+
+
+def point(system: str, robots: int, served: int) -> dict[str, Any]:
+    return {
+        "system": system,
+        "robots": robots,
+        "served": served,
+        "share": served / robots,
+        "age_p95_ms": 1200.0,
+        "server_cpu_s": 5.0,
+        "client_cpu_s": 13.0,
+    }
+
+
+def test_files_of_the_same_robots_share_a_panel(tmp_path: Path) -> None:
+    mixed = {**PLAN, "kinds": [*PLAN["kinds"], {"hz": 10.0, "rows": 8, "weight": 1}]}
+    files: list[dict[str, Any]] = [
+        {"plan": PLAN, "points": [point("vlagents_ray", 64, 64), point("vlagents_ray", 256, 192)]},
+        {"plan": PLAN, "points": [point("openpi", 64, 32)]},
+        {"plan": mixed, "points": [point("vlagents_ray", 32, 32)]},
+    ]
+    fleets = merge_fleets(files)
+    assert [len(fleet["points"]) for fleet in fleets] == [3, 1]
+    assert [fleet["most"] for fleet in fleets] == [426, None]
+
+    ours, openpi, _ = markdown(fleets).splitlines()[2:]
+    assert "| vlagents_ray | 64 | 64: 100.0%, 64, 1.20; 256: 75.0%, 192, 1.20 | 5, 13 |" in ours
+    assert "| openpi | 0 |" in openpi
+
+    picture = tmp_path / "fleet.svg"
+    plot_fleets(fleets, picture)
+    assert "openpi" in picture.read_text()
+
+
+def test_another_rate_is_another_fleet() -> None:
+    slower = {**PLAN, "kinds": [{"hz": 5.0, "rows": 50, "weight": 1}]}
+    fleets = merge_fleets([{"plan": PLAN, "points": []}, {"plan": slower, "points": []}])
+    assert len(fleets) == 2
+    assert most(slower) > most(PLAN)  # type: ignore[operator]
