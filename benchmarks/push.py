@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import ray
@@ -39,7 +39,7 @@ class TrainedConfig(BaseModel, extra="forbid"):
 class Trained(TrainableAgent):
     """Returns zeros after `base_ms` a batch, and has parameters that a learner may replace."""
 
-    Config = TrainedConfig
+    Config: ClassVar[type[TrainedConfig]] = TrainedConfig
     trainable = "layers"
     shared = ("config", "layers")
 

@@ -178,6 +178,7 @@ class World:
         )
         if robot.states_slack and self.slack:
             pending.needed = arrived + (0.0 if robot.lies else slack_s)
+            robot.plan.heard = arrived
             pending.waits_behind_others = robot.plan.waits_behind_others
         if self.deadlines and self.draw.random() < self.deadlines:
             pending.deadline = arrived + self.draw.choice([0.05, 0.3, 2.0])

@@ -396,6 +396,7 @@ class Replica:
         request.begun = False
         if self.world.behaviour.slack:
             request.needed = now + stream.slack_s
+            stream.plan.heard = now
             request.waits_behind_others = stream.plan.is_admitted is False
         self.queue.add(request)
         if not self._busy:

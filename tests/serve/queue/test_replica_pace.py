@@ -31,8 +31,8 @@ class Robots:
         return [plan.is_admitted for plan in self.plans]
 
 
-def stated(need: RobotNeed, number: int = 1) -> list[RobotPlan]:
-    return [RobotPlan(need, is_stated=True) for _ in range(number)]
+def stated(need: RobotNeed, number: int = 1, key: str = "") -> list[RobotPlan]:
+    return [RobotPlan(need, is_stated=True, key=key) for _ in range(number)]
 
 
 def test_all_robots_are_admitted_where_there_is_room() -> None:
@@ -130,3 +130,49 @@ def test_a_robot_that_is_not_admitted_asks_when_its_rows_have_run_out() -> None:
     last = robots.plans[-1]
     last.observe(50, arrived=robots.now - 3.0, needed=robots.now - 3.0, now=robots.now)
     assert robots.pace.replan_s(last) == pytest.approx(5.0 - 0.05)
+
+
+@pytest.mark.parametrize("hog", [OF_50, OF_8, RobotNeed(10.0, 1), RobotNeed(1.0, 1)])
+@pytest.mark.parametrize("first", [True, False])
+def test_the_robots_of_one_key_do_not_make_those_of_another_wait(
+    hog: RobotNeed, first: bool
+) -> None:
+    """However many they are, whatever they say that they need, and whenever they came."""
+    theirs, ours = stated(hog, 2000, "hog/"), stated(OF_8, 8, "lab/")
+    robots = Robots(*theirs)
+    robots.read()
+    assert robots.pace.check(OF_8, "lab/")["in_time"] is True
+    assert robots.pace.check(hog, "hog/")["in_time"] is False
+
+    robots.plans = [*ours, *theirs] if first else [*theirs, *ours]
+    for _ in range(3):
+        robots.read()
+        assert all(plan.is_admitted for plan in ours)
+    admitted = sum(plan.is_admitted is True for plan in theirs)
+    servable = hog.interval_s(2 * PI0.cost_s(1)) > 0
+    assert (0 < admitted < 2000) if servable else admitted == 0, "what is left is theirs"
+
+
+def test_what_one_key_does_not_need_is_for_the_others() -> None:
+    alone = Robots(*stated(OF_50, 600, "hog/"))
+    number = alone.read().count(True)
+    beside = Robots(*stated(OF_50, 600, "hog/"), *stated(OF_50, 10, "lab/"))
+    assert abs(beside.read().count(True) - number) <= 1
+
+
+def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> None:
+    gone, here = stated(OF_50, 600), stated(OF_50, 300)
+    robots = Robots(*gone, *here)
+    for plan in gone:
+        plan.heard = robots.now
+    assert False in robots.read()
+
+    robots.now += 20.0
+    robots.read()
+    assert all(plan.is_admitted for plan in here)
+    assert robots.pace.load().in_time
+
+    gone[0].heard = robots.now  # it goes on
+    robots.read()
+    assert gone[0].is_admitted
+    assert {plan.is_admitted for plan in gone[1:]} == {None}

@@ -115,6 +115,7 @@ class Intake:
                 model.check(request)
             if request.obs is not None and request.obs.info:
                 self._record_report(session, pending, request.obs.info)
+            session.plan.heard = pending.arrived
             pending.waits_behind_others = session.plan.is_admitted is False
             preparation = None
             if self._preparations is not None and self._queue.window.overlaps:

@@ -94,7 +94,7 @@ class SessionMoves:
             moves=moves,
             announced=True,
             origin=origin,
-            plan=RobotPlan.from_list(state.robot),
+            plan=RobotPlan.from_list(state.robot, origin.prefix, began + state.age_s),
         )
         self._sessions.expect(arriving)
         try:

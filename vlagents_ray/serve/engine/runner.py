@@ -297,14 +297,17 @@ class Runner:
                     observes.observe(obs)
 
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
-        session.plan = RobotPlan()
+        key = pending.origin.prefix
+        plan = RobotPlan()
         if opening.slo is not None:
             rows = 1 if model.contract is None else model.contract.chunk or 1
-            info[SLO] = self._pace.check(need_of(opening.slo, rows))
-            session.plan = RobotPlan.from_slo(opening.slo, rows)
-            session.plan.is_admitted = info[SLO]["in_time"]
+            info[SLO] = self._pace.check(need_of(opening.slo, rows), key)
+            plan = RobotPlan.from_slo(opening.slo, rows)
+            plan.is_admitted = info[SLO]["in_time"]
             session.times = session.times or RobotTimes(pending.priority)
             session.times.target_share = opening.slo.share
+        plan.key, plan.heard = key, pending.arrived
+        session.plan = plan
         spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.set_agent(agent)

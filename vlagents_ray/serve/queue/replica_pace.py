@@ -41,6 +41,9 @@ _DIFFERS = 0.1
 # Load up to which further robots are admitted where there are too many. Those that are admitted
 # stay so up to `USABLE`: measured costs vary, and no robot should come and go.
 _ADMITTED_LOAD = 0.86
+# Time without a request, beyond that of its rows, after which a robot does not count: it is paused,
+# or its client has gone without a word.
+_PRESENT_S = 10.0
 _KINDS = 4  # kinds of robots that are tried for the room that is left, as each costs time
 _MOST_SLACK_MS = 60_000.0  # so that no request waits for longer in a queue that is never empty
 
@@ -55,6 +58,8 @@ class RobotPlan:
     most_rows: int | None = None  # rows of an answer that it executes at most; None: all of them
     # Whether it is among those that the replica can serve in time; None until that is decided.
     is_admitted: bool | None = None
+    key: str = ""  # prefix of the sessions of its key; empty if there is none
+    heard: float = math.inf  # time at which its last reset or act arrived, s; inf: just now
     asked: float = 0.0  # time at which its last act arrived, s; 0.0 before the first one
     # Time from which the robot executes the rows of its last answer, if it does not hold, s. The
     # time in which it held still, as its rows had run out, does not count.
@@ -68,17 +73,25 @@ class RobotPlan:
         return [need.hz, need.rows, need.age_s, self.is_stated, self.share, self.most_rows]
 
     @classmethod
-    def from_list(cls, values: Sequence[Any]) -> RobotPlan:
-        """Return the plan of a session that has moved here, from the result of `to_list`."""
-        if not values:
-            return cls()
-        hz, rows, age_s, is_stated, share, most_rows = values
-        return cls(RobotNeed(hz, rows, age_s), is_stated, share, most_rows)
+    def from_list(cls, values: Sequence[Any], key: str, now: float) -> RobotPlan:
+        """Return the plan of a session of a key that moves here `now`, s, from the result of
+        `to_list`.
+        """
+        plan = cls(key=key, heard=now)
+        if values:
+            hz, rows, age_s, plan.is_stated, plan.share, plan.most_rows = values
+            plan.need = RobotNeed(hz, rows, age_s)
+        return plan
 
     @classmethod
     def from_slo(cls, slo: Slo, rows: int) -> RobotPlan:
         """Return the plan of a robot with that SLO, if an answer has `rows` rows."""
         return cls(need_of(slo, rows), is_stated=True, share=slo.share, most_rows=slo.rows)
+
+    def is_present(self, now: float) -> bool:
+        """Return whether the robot sends requests, at the time `now`, s."""
+        rows_s = 0.0 if self.need is None else self.need.rows / self.need.hz
+        return now - self.heard <= _PRESENT_S + rows_s
 
     @property
     def waits_behind_others(self) -> bool:
@@ -184,13 +197,18 @@ class ReplicaPace:
             self._read_plans()
         return self._load
 
-    def check(self, newcomer: RobotNeed) -> dict[str, Any]:
-        """Return whether one more robot can be in time here, as the info of its reset."""
+    def check(self, newcomer: RobotNeed, key: str = "") -> dict[str, Any]:
+        """Return whether one more robot can be in time here, as the info of its reset.
+
+        Args:
+            newcomer: What it needs.
+            key: The prefix of the sessions of its key.
+        """
         self.load()
         load = self._load_with(newcomer)
         # Robots that wait to be admitted come before it.
         most = _ADMITTED_LOAD if self._others else USABLE
-        if load.load <= most:
+        if load.load <= most or self._fits_share(newcomer, key):
             return {"load": load.load, "in_time": True}
         if load.load == math.inf:
             reason = (
@@ -204,6 +222,21 @@ class ReplicaPace:
         )
         return {"load": load.load, "in_time": False, "reason": reason}
 
+    def _fits_share(self, newcomer: RobotNeed, key: str) -> bool:
+        """Return whether one more robot of a key fits into the part of the load that is kept for
+        that key, whatever the robots of the other keys need.
+        """
+        curve = self._curve()
+        if curve is None:
+            return True
+        plans = self._present()
+        keys = {key, *(plan.key for plan in plans)}
+        needs = _needs_of(plan for plan in plans if plan.key == key)
+        needs[newcomer] += 1
+        if newcomer.interval_s(answer_s(curve, 1, len(plans) + 1)) <= 0:
+            return False
+        return self._load_of(needs, curve).load <= _ADMITTED_LOAD / len(keys)
+
     def _load_with(self, newcomer: RobotNeed) -> ReplicaLoad:
         """Return the load of the admitted robots with one more; it is `inf` if that cannot be in
         time here.
@@ -211,7 +244,7 @@ class ReplicaPace:
         curve = self._curve()
         if curve is None:
             return IDLE
-        needs = _needs_of(plan for plan in self._plans() if not plan.waits_behind_others)
+        needs = _needs_of(plan for plan in self._present() if not plan.waits_behind_others)
         needs[newcomer] += 1
         soonest_s = answer_s(curve, 1, needs.total())
         if newcomer.interval_s(soonest_s) <= 0:
@@ -251,9 +284,20 @@ class ReplicaPace:
         # A robot sends its request at the next tick, half a period later on average.
         return max(0.0, plan.begins + interval_s - 0.5 / need.hz - now)
 
+    def _present(self) -> list[RobotPlan]:
+        """Return the plans of the robots whose needs are known and that send requests."""
+        now = self._clock()
+        present: list[RobotPlan] = []
+        for plan in self._plans():
+            if plan.is_present(now):
+                present.append(plan)
+            else:
+                plan.is_admitted = None  # it is no longer, or not yet, one of those in time
+        return [plan for plan in present if plan.need is not None]
+
     def _read_plans(self) -> None:
         """Compute the loads, and decide which robots are admitted."""
-        plans = [plan for plan in self._plans() if plan.need is not None]
+        plans = self._present()
         curve = self._curve()
         self._robots, self._others = len(plans), 0
         self.most_with_others = math.inf
@@ -278,19 +322,28 @@ class ReplicaPace:
 
     def _choose_admitted(self, plans: Sequence[RobotPlan], curve: CostCurve) -> list[RobotPlan]:
         """Return the robots that can be in time together: those that are admitted already, then the
-        oldest ones.
+        oldest ones. A part of the load is kept for each key, so that the robots of one key do not
+        make those of another wait, however many they are and whenever they came.
         """
+        # A robot that cannot be in time at all is admitted nowhere.
         soonest_s = answer_s(curve, 1, len(plans))
-        kept = [plan for plan in plans if plan.is_admitted]
-        others = [plan for plan in plans if not plan.is_admitted]
+        servable = [
+            plan for plan in plans if plan.need is not None and plan.need.interval_s(soonest_s) > 0
+        ]
+        kept = [plan for plan in servable if plan.is_admitted]
+        others = [plan for plan in servable if not plan.is_admitted]
+
         admitted: list[RobotPlan] = []
+        keys = sorted({plan.key for plan in servable})
+        if len(keys) > 1:
+            for key in keys:
+                of_key = [plan for plan in (*kept, *others) if plan.key == key]
+                count = self._fitting([], of_key, _ADMITTED_LOAD / len(keys), curve)
+                admitted += of_key[:count]
+
         for candidates, most in ((kept, USABLE), (others, _ADMITTED_LOAD)):
-            # A robot that cannot be in time at all is admitted nowhere.
-            left = [
-                plan
-                for plan in candidates
-                if plan.need is not None and plan.need.interval_s(soonest_s) > 0
-            ]
+            known = {id(plan) for plan in admitted}
+            left = [plan for plan in candidates if id(plan) not in known]
             for _ in range(_KINDS):
                 count = self._fitting(admitted, left, most, curve)
                 admitted += left[:count]
