@@ -159,6 +159,20 @@ def test_only_the_page_itself_is_read_without_a_key(
     assert (answer.status_code, reached) == ((200, [path]) if is_served else (401, []))
 
 
+def test_who_asks_often_without_a_key_is_answered_as_late_as_with_a_wrong_one(
+    endpoint: Endpoint,
+) -> None:
+    """Each answer takes the event loop and Python's lock, for which robots wait."""
+    guard = AccessMiddleware(
+        PlainTextResponse("a page without data"), Keys.from_file(endpoint.file), "noop"
+    )
+    client = TestClient(guard)
+    begun = time.monotonic()
+    for _ in range(81):
+        assert client.get("/healthz").status_code == 200
+    assert time.monotonic() - begun > 1.0  # 20 at once, then at most 40 a second
+
+
 def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> None:
     """A browser on the robot's machine says whose page asks, and reaches loopback."""
     unkeyed = AccessMiddleware(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 import uuid
 from collections.abc import Collection, Mapping
 
@@ -50,11 +51,15 @@ from vlagents_ray.serve.endpoints.http_messages import (
 from vlagents_ray.serve.endpoints.shutdown import STOPPING, Shutdown
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.pauses import note_connection
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
 _HEALTH = "/healthz"
 
+# Requests a second to the paths without a key: above it, each is answered as late as a refusal, as
+# it costs as much.
+_OPEN_PER_S = 20.0
 _TICK_S = 0.5  # period at which the time limit of an upload is checked
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _TIMEOUT = 408
@@ -102,6 +107,7 @@ class AccessMiddleware:
         self._shutdown = shutdown or Shutdown()
         self.websockets = AsgiWebSockets(admission, slow_s, idle_s, self._shutdown)
         self._public = frozenset({_HEALTH, *public})
+        self._open_requests = TokenBucket(_OPEN_PER_S, time.monotonic())
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection as specified by ASGI."""
@@ -150,6 +156,8 @@ class AccessMiddleware:
             TooManyRequests: The key is over its rate, or has too many connections.
         """
         if _is_page(scope, self._public):
+            if self._keys is not None and self._open_requests.take(time.monotonic()) > 0:
+                await asyncio.sleep(REFUSAL_S)
             return NoKey.OPEN
         if self._keys is None:
             # A page that the robot's user opens can reach loopback.
