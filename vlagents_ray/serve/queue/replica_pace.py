@@ -315,10 +315,10 @@ class ReplicaPace:
         self._admitted_load = self._load_of(_needs_of(admitted), curve)
         self.most_with_others = self._admitted_load.batch_size
         self._others = len(plans) - len(admitted)
+        # Each value is set once: the threads that admit requests read it.
+        admitted_ids = {id(plan) for plan in admitted}
         for plan in plans:
-            plan.is_admitted = False
-        for plan in admitted:
-            plan.is_admitted = True
+            plan.is_admitted = id(plan) in admitted_ids
 
     def _choose_admitted(self, plans: Sequence[RobotPlan], curve: CostCurve) -> list[RobotPlan]:
         """Return the robots that can be in time together: those that are admitted already, then the
