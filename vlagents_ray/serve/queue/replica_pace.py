@@ -44,6 +44,8 @@ _ADMITTED_LOAD = 0.86
 # Time without a request, beyond that of its rows, after which a robot does not count: it is paused,
 # or its client has gone without a word.
 _PRESENT_S = 10.0
+# Load and interval up to which robots may ask a little more often than they are paced.
+_IDLE_LOAD, _FEW_TICKS = 0.5, 4
 _KINDS = 4  # kinds of robots that are tried for the room that is left, as each costs time
 _MOST_SLACK_MS = 60_000.0  # so that no request waits for longer in a queue that is never empty
 
@@ -281,8 +283,11 @@ class ReplicaPace:
             earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
             backlog_s = now - plan.begins + waiting_s
             interval_s = min(longest_s, max(backlog_s, load.replan_s(need) - earlier_s))
-        # A robot sends its request at the next tick, half a period later on average.
-        return max(0.0, plan.begins + interval_s - 0.5 / need.hz - now)
+        # A robot sends its request at the next tick, half a period later on average. Where there is
+        # time, and a tick is a large part of the interval, it rather sends it earlier than later.
+        is_early = load.load <= _IDLE_LOAD and interval_s <= _FEW_TICKS / need.hz
+        early_s = (1.0 if is_early else 0.5) / need.hz
+        return max(0.0, plan.begins + interval_s - early_s - now)
 
     def _present(self) -> list[RobotPlan]:
         """Return the plans of the robots whose needs are known and that send requests."""
