@@ -30,7 +30,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.interface import AGE_MS, CAUSE, REPLAN, SAFE, SLACK, Act, Agent, Obs
+from vlagents_ray.interface import AGE_MS, CAUSE, CHUNK, REPLAN, SAFE, SLACK, Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.robot.pacing import Pacer
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
@@ -171,11 +171,20 @@ class RunningRobot:
         time.sleep(max(0.0, begin + random.uniform(0, 1 / robot.hz) - time.monotonic()))
         ticks, starved, failed = 0, 0, ""
         ages: list[float] = []
+        resumed: set[int] = set()  # chunks before which the session had to begin again
         late: list[tuple[float, int]] = []  # moments of starved ticks, s after `begin`
         try:
             reset = self._player.reset(replace(self._obs, info={}), "measure", **options)
         except VLAgentsError as error:
-            return {"ticks": 1, "starved": 1, "ages": [], "late": [], "failed": str(error)}
+            return {
+                "ticks": 1,
+                "starved": 1,
+                "missed": 0,
+                "ages": [],
+                "late": [],
+                "resumed": 0,
+                "failed": str(error),
+            }
 
         pacer = Pacer(robot.hz)
         missed_before = 0
@@ -187,6 +196,8 @@ class RunningRobot:
                 continue
 
             ticks += 1
+            if act.info.get("resumed"):
+                resumed.add(act.info[CHUNK])
             if SAFE not in act.info:
                 ages.append(act.info[AGE_MS])
                 continue
@@ -202,6 +213,7 @@ class RunningRobot:
             "missed": missed,
             "ages": ages if len(ages) <= _AGES else random.sample(ages, _AGES),
             "late": late,
+            "resumed": len(resumed),
             "failed": failed,
             "slo": reset.get("slo"),
         }

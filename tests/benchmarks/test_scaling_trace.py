@@ -1,0 +1,37 @@
+"""The figures of a trace of autoscaling; tests/integration/test_load.py runs one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.autoscaling import ScaleSample
+from benchmarks.scaling_trace import TracePlan, report
+
+
+def figures(late: list[float], missed: int = 0, resumed: int = 0) -> dict[str, Any]:
+    return {
+        "ticks": 100,
+        "starved": len(late) + missed,
+        "missed": missed,
+        "late": late,
+        "resumed": resumed,
+        "failed": "",
+    }
+
+
+def test_a_trace_has_the_time_of_the_replicas_and_that_of_the_last_late_tick() -> None:
+    samples = [
+        ScaleSample(-5.0, 1, 1, 1),
+        ScaleSample(1.0, 1, 1, 3),
+        ScaleSample(4.0, 2, 1, 3),
+        ScaleSample(8.0, 2, 2, 3),
+        ScaleSample(35.0, 1, 1, 1),
+    ]
+    plan = TracePlan(robots=3, burst_s=30.0)
+    # A second without the robot's own process is not the server's, nor is a tick of long after.
+    burst = [figures([0.5, 3.0, 7.5, 25.0], missed=10), figures([1.0], resumed=1)]
+    found = report(plan, samples, [figures([-4.0])], burst)
+    assert (found["requested_s"], found["running_s"], found["in_time_s"]) == (4.0, 8.0, 7.5)
+    assert found["replicas"] == [[-5.0, 1, 1], [4.0, 2, 1], [8.0, 2, 2], [35.0, 1, 1]]
+    assert (found["ticks"], found["starved"], found["missed"]) == (300, 6, 10)
+    assert (found["starved_by_first"], found["resumed"], found["failed"]) == (1, 1, [])
