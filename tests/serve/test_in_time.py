@@ -14,7 +14,7 @@ from vlagents_ray.interface import EXECUTED_AGE, TICKS, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Priority, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.in_time import Goodput, RobotReport, RobotTimes, goodput
+from vlagents_ray.serve.in_time import Goodput, RobotReport, RobotTimes, describe, goodput
 
 
 def test_a_report_is_optional_and_checked() -> None:
@@ -81,6 +81,19 @@ def test_goodput_counts_robots_that_reach_their_own_target() -> None:
     assert goodput([*robots, silent], 2.0) == {
         Priority.ROBOT: Goodput(3, 2),
         Priority.SIMULATION: Goodput(1, 0),
+    }
+
+
+def test_the_metadata_describe_the_robots_of_the_last_ten_seconds() -> None:
+    assert describe([], 0.0) == {"robots": 0, "in_time": 0, "share": None, "age_p95_ms": None}
+    robots = [RobotTimes(), RobotTimes(), RobotTimes(Priority.SIMULATION)]
+    for robot, starved in zip(robots, (0, 10, 100), strict=True):
+        robot.add(RobotReport(100, starved, 80.0 + starved), 1.0)
+    assert describe(robots, 2.0) == {
+        "robots": 2,
+        "in_time": 1,
+        "share": 0.95,
+        "age_p95_ms": 90.0,
     }
 
 

@@ -155,6 +155,29 @@ def goodput(times: Iterable[RobotTimes], now: float) -> dict[Priority, Goodput]:
     return {priority: Goodput(robots[priority], in_time[priority]) for priority in Priority}
 
 
+def describe(times: Iterable[RobotTimes], now: float) -> dict[str, Any]:
+    """Return how the robots of a replica were served in the last `WINDOW_S` seconds before `now`,
+    s, for its metadata.
+
+    Returns:
+        `robots`, the number of those that report their ticks; `in_time`, the number of those whose
+        share was at least their target; `share`, that of the ticks of all of them, None without
+        ticks; and `age_p95_ms`, the largest 95th percentile of the ages of one robot's actions.
+    """
+    robots = [robot for robot in times if robot.priority is Priority.ROBOT]
+    lately = [robot.lately(now) for robot in robots]
+    ticks = sum(robot.ticks for robot in lately)
+    starved = sum(robot.starved for robot in lately)
+    ages_ms = [robot.age_p95_ms for robot in lately if robot.age_p95_ms is not None]
+    served = goodput(robots, now)[Priority.ROBOT]
+    return {
+        "robots": served.robots,
+        "in_time": served.in_time,
+        "share": None if ticks == 0 else 1 - starved / ticks,
+        "age_p95_ms": max(ages_ms, default=None),
+    }
+
+
 def _quantile(ordered: list[float], share: float) -> float | None:
     """Return the nearest-rank quantile of sorted values; None without values."""
     if not ordered:

@@ -17,6 +17,7 @@ from vlagents_ray.ray_tools.git_state import GitState
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
+from vlagents_ray.serve.in_time import describe
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import AwaitedReplies, IncomingMessage, PendingRequest
@@ -46,6 +47,7 @@ def build_engine(
         batch_sizes=args.batch.sizes or (),
         session_limit=args.sessions.limit,
         session_idle_s=args.sessions.idle_s,
+        slo=None if args.slo is None else args.slo.objective(),
         version=version_of(args),
         check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
@@ -81,11 +83,13 @@ def policy_metadata(
         "contract": None if contract is None else contract.to_json(),
         "continues_plans": models.continues_plans,
         "reads_slo": True,  # at a reset
+        "slo": None if args.slo is None else args.slo.objective().to_json(),
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
         "program": program | models.files,
         "batch_costs": engine.queue.window.describe_costs(),
         "load": engine.pace.load().load,
+        "robots": describe(engine.sessions.times(), engine.clock()),
     }
 
 

@@ -99,7 +99,7 @@ class Opening:
     # First step of the connection's previous episode, which continues if the reset is undone; None
     # if there is none.
     previous: int | None
-    slo: Slo | None = None  # what the robot needs, if it states that
+    slo: Slo | None = None  # what the robot needs, if its reset or the deployment states it
 
 
 @dataclass(slots=True, eq=False)

@@ -13,6 +13,7 @@ from live_server import METADATA
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.in_time import RobotReport, RobotTimes
 from vlagents_ray_live import live_view
 from vlagents_ray_live.live_view import (
     PICTURES,
@@ -185,3 +186,20 @@ def test_a_slow_viewer_misses_the_oldest(
     assert names == [str(sent - len(names) + i) for i in range(len(names))]
     assert files[-1][0] == sent - 1
     assert sum(map(len, files)) <= 2**26 if behind is None else len(names) == behind
+
+
+def test_a_snapshot_has_the_robots_in_time(own: ReplicaView) -> None:
+    engine = own._engine
+    for name, starved in (("good", 1), ("late", 10)):
+        session = engine.sessions.open(name)
+        session.times = RobotTimes()
+        session.times.add(RobotReport(100, starved, 80.0), engine.clock())
+    engine.sessions.open("silent")
+
+    document = own.read(0, ()).document
+    assert document["robots"] == {"robots": 2, "in_time": 1}
+    assert {one["id"]: one["in_time"] for one in document["sessions"]} == {
+        "good": {"share": 0.99, "age_p95_ms": 80.0},
+        "late": {"share": 0.9, "age_p95_ms": 80.0},
+        "silent": None,
+    }

@@ -21,8 +21,10 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, UnknownSession
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
+from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -148,7 +150,7 @@ class ReplicaView:
         ordered_sessions = sorted(engine.sessions.all(), key=lambda session: session.id)
         sessions = {}
         for session in ordered_sessions[:_SESSIONS]:
-            sessions[session.id] = _session(session, last_answers.get(session.id))
+            sessions[session.id] = _session(session, last_answers.get(session.id), engine.clock())
 
         # The session whose pictures are the oldest comes first.
         begun = time.thread_time()
@@ -174,8 +176,10 @@ class ReplicaView:
         waiting = {}
         for priority, depth in engine.queue.depth_by_priority().items():
             waiting[priority.name.lower()] = depth
+        robots = goodput(engine.sessions.times(), engine.clock())[Priority.ROBOT]
         snapshot.document = {
             **self._about,
+            "robots": {"robots": robots.robots, "in_time": robots.in_time},
             **self._state(),
             **_counts(answers),
             "waiting": waiting,
@@ -222,8 +226,10 @@ class ReplicaView:
         return self._slow_data
 
 
-def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[str, Any]:
-    """Describe a session for viewers, with its last answer if that is new."""
+def _session(session: Session[LoadedModel], last: live.Answer | None, now: float) -> dict[str, Any]:
+    """Describe a session for viewers at `now`, s, of the engine's clock, with its last answer if
+    that is new.
+    """
     weights = session.weights
     described = {
         "id": session.id,
@@ -232,11 +238,24 @@ def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[st
         "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
+        "in_time": _in_time(session, now),
         "pictures": {},
     }
     if last is None:
         return described
     return described | {"priority": last.priority, "last": _act(last)}
+
+
+def _in_time(session: Session[LoadedModel], now: float) -> dict[str, Any] | None:
+    """Describe how well a session's robot was served lately; None if it does not report that."""
+    lately = None if session.times is None else session.times.lately(now)
+    if lately is None or lately.share is None:
+        return None
+    age_ms = lately.age_p95_ms
+    return {
+        "share": round(lately.share, 4),
+        "age_p95_ms": None if age_ms is None else round(age_ms, 1),
+    }
 
 
 def _pictures(observation: live.KeptObservation, files: list[bytes]) -> dict[str, int]:

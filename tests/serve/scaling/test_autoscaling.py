@@ -15,6 +15,8 @@ from ray.serve.config import AutoscalingConfig, AutoscalingContext
 from vlagents_ray.serve.config.deployment import AutoscalingArgs, ServerArgs
 from vlagents_ray.serve.scaling.autoscaling import (
     SESSIONS,
+    SLO_LOAD,
+    SLO_ROBOTS,
     UTILISATION,
     WAITING,
     MeasuredLoad,
@@ -23,8 +25,7 @@ from vlagents_ray.serve.scaling.autoscaling import (
 POLICY = DeploymentID("Policy", "app")
 
 
-def wanted(
-    policy: MeasuredLoad,
+def context_of(
     utilisation: list[float],
     *,
     waiting: float = 0.0,
@@ -32,12 +33,16 @@ def wanted(
     target: int | None = None,
     running: int | None = None,
     requests: float = 0.0,
-) -> int:
-    """The decision where each replica of those that report has this utilisation, queue and
-    number of sessions.
+    slo_load: float = 0.0,
+    slo_robots: float = 0.0,
+    now: float = 0.0,
+    state: dict[str, Any] | None = None,
+) -> AutoscalingContext:
+    """What Serve passes to the policy where each replica of those that report has this
+    utilisation, queue and number of sessions.
     """
     replicas = [ReplicaID(str(i), POLICY) for i in range(len(utilisation))]
-    context = AutoscalingContext(
+    return AutoscalingContext(
         deployment_id=POLICY,
         deployment_name="Policy",
         app_name="app",
@@ -50,20 +55,25 @@ def wanted(
             UTILISATION: dict(zip(replicas, utilisation, strict=True)),
             WAITING: dict.fromkeys(replicas, waiting),
             SESSIONS: dict.fromkeys(replicas, sessions),
+            SLO_LOAD: dict.fromkeys(replicas, slo_load),
+            SLO_ROBOTS: dict.fromkeys(replicas, slo_robots),
         }
         if replicas
         else {},
         raw_metrics={},
         capacity_adjusted_min_replicas=0,
         capacity_adjusted_max_replicas=100,
-        policy_state={},
+        policy_state=state or {},
         last_scale_up_time=None,
         last_scale_down_time=None,
-        current_time=0.0,
+        current_time=now,
         config=None,
     )
-    number, state = policy(context)
-    assert state == {}
+
+
+def wanted(policy: MeasuredLoad, utilisation: list[float], **load: Any) -> int:
+    """The decision of the first call."""
+    number, _ = policy(context_of(utilisation, **load))
     return number
 
 
@@ -83,6 +93,40 @@ def test_a_long_queue_counts_where_the_policy_is_busy_anyway() -> None:
 def test_sessions_count_only_if_a_target_is_set() -> None:
     assert wanted(MeasuredLoad(), [0.1], sessions=100, target=1) == 1
     assert wanted(MeasuredLoad(target_sessions=32), [0.1], sessions=100) == 4
+
+
+def test_robots_that_state_their_needs_get_the_replicas_for_them() -> None:
+    """They keep replicas busy however few they are, so that utilisation says nothing of them."""
+    policy = MeasuredLoad()
+    assert wanted(policy, [1.0], sessions=4, slo_robots=4, slo_load=0.6) == 1
+    assert wanted(policy, [1.0], sessions=16, slo_robots=16, slo_load=2.1) == 3
+    assert wanted(policy, [1.0], sessions=2, slo_robots=2, slo_load=9.0) == 2
+    assert (
+        wanted(MeasuredLoad(target_slo_load=0.5), [1.0], sessions=4, slo_robots=4, slo_load=0.6)
+        == 2
+    )
+
+
+def test_sessions_that_state_no_needs_count_by_utilisation_as_well() -> None:
+    assert wanted(MeasuredLoad(), [1.0], sessions=5, slo_robots=4, slo_load=0.6) == 2
+
+
+def test_measured_load_waits_for_its_delay_and_robots_with_slos_do_not() -> None:
+    policy, state = MeasuredLoad(busy_s=7.0), {}
+    busy: dict[str, Any] = {"utilisation": [1.0], "sessions": 5.0}
+
+    def at(now: float, **load: Any) -> int:
+        nonlocal state
+        number, state = policy(context_of(now=now, state=state, **load))
+        return number
+
+    assert at(100.0, **busy) == 1
+    assert at(106.9, **busy) == 1
+    assert at(107.0, **busy) == 2
+    assert at(108.0, utilisation=[0.1], sessions=5.0) == 1, "a break"
+    assert at(109.0, **busy) == 1
+    assert at(110.0, **busy, slo_robots=4, slo_load=2.1) == 3, "one states nothing"
+    assert at(116.0, **busy) == 2
 
 
 def test_around_a_target_the_number_stays() -> None:
@@ -125,7 +169,8 @@ def test_settings_reach_serve() -> None:
         max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4
     )
     config = AutoscalingConfig(**args.options())
-    assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 2, 4)
+    assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 1.5, 4)
+    assert config.policy.policy_kwargs["busy_s"] == 0.5
     assert (config.look_back_period_s, config.metrics_interval_s) == (5, 1)
     policy: Any = config.policy.get_policy()(**config.policy.policy_kwargs)
     assert wanted(policy, [0.1], sessions=16) == 2

@@ -21,6 +21,7 @@ from vlagents_ray.serve.scaling.rebalancer import (
     ReplicaLoad,
     choose_connections,
     choose_replica,
+    excess_load,
     excess_sessions,
 )
 from vlagents_ray.serve.sessions import DrainList
@@ -85,6 +86,35 @@ def test_moving_the_surplus_never_makes_another_one() -> None:
             moved = excess_sessions(mine, [other])
             assert excess_sessions(mine - moved, [other + moved]) == 0
             assert excess_sessions(other + moved, [mine - moved]) == 0
+
+
+def test_robots_that_need_much_move_although_the_numbers_are_equal() -> None:
+    fast = replace(load("a", 4), robots=4, load=1.2)
+    slow = replace(load("b", 4), robots=4, load=0.2)
+    assert fast.needs_are_known
+    assert excess_load(fast, [slow]) == pytest.approx(0.5)
+    assert excess_load(fast, [slow], leaving=0.3) == 0.0  # one is on its way
+    assert excess_load(slow, [fast]) == 0.0
+    alone = replace(load("a", 1), robots=1, load=0.9)
+    assert excess_load(alone, [replace(load("b", 0))]) == 0.0, "a robot is not divided"
+
+
+def test_needs_are_known_only_if_those_of_all_sessions_are() -> None:
+    assert load("a", 0).needs_are_known
+    assert not replace(load("a", 4), robots=3, load=0.5).needs_are_known
+    assert not replace(load("a", 4), robots=4, load=0.0).needs_are_known, "its costs are unknown"
+
+
+def test_moving_load_never_makes_another_surplus() -> None:
+    """Equal robots are spread as equal sessions are."""
+    for mine in range(2, 40):
+        for other in range(mine + 1):
+            pair = [
+                replace(load(name, robots), robots=robots, load=0.1 * robots)
+                for name, robots in (("a", mine), ("b", other))
+            ]
+            moved = int(excess_load(pair[0], pair[1:]) / 0.1 + 1e-6)
+            assert moved == excess_sessions(mine, [other])
 
 
 def test_connections_move_whole() -> None:
@@ -201,6 +231,26 @@ def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
         for agent in agents_of_one:
             agent.close()
     assert (len(first.sessions), len(second.sessions)) == (0, 0)
+    served.close()
+
+
+def test_a_replica_that_joins_gets_its_share_after_one_comparison() -> None:
+    served = Replicas([Counting()])
+    [engine] = served.engines
+    agents = [served.agent() for _ in range(4)]
+    for agent in agents:
+        agent.reset(Obs())
+    for session in engine.sessions.all():
+        session.origin = replace(session.origin, transport="shm")
+
+    mine, neighbours = balance(engine, load("b", 4))
+    asyncio.run(mine.compare())
+    neighbours.held.append(load("c", 0))
+    asyncio.run(mine.compare())
+    assert len(engine.drain_list._marked) == 1
+
+    for agent in agents:
+        agent.close()
     served.close()
 
 

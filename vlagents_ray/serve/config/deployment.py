@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.program import Program, loaded_code
@@ -22,6 +23,7 @@ from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
+from vlagents_ray.slo import SHARE, Slo
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
@@ -186,6 +188,36 @@ class SessionArgs(_DeploymentModel):
         le=MOST_S,
         description="a session that sends nothing for so long is forgotten",
     )
+
+
+class SloArgs(_DeploymentModel):
+    """What a robot needs whose reset states no SLO, see `vlagents_ray.slo.Slo`."""
+
+    hz: float = Field(description="ticks of its control loop a second")
+    age_ms: float | None = Field(
+        default=None, description="largest age of an executed action; unset: any"
+    )
+    share: float = Field(
+        default=SHARE, description="least share of its ticks with an action in time"
+    )
+    rows: int | None = Field(
+        default=None, description="rows of a chunk that it executes at most; unset: all of them"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_at_a_reset(cls, value: object) -> object:
+        if not isinstance(value, cls):
+            try:
+                Slo.from_json(value)
+            except ConfigError as error:
+                # The path of the setting, which comes first in the message, ends with `slo`.
+                raise ValueError(str(error).removeprefix("slo.").removeprefix("slo: ")) from None
+        return value
+
+    def objective(self) -> Slo:
+        """Return the SLO."""
+        return Slo(**self.model_dump())
 
 
 class StreamArgs(_DeploymentModel):
@@ -362,11 +394,20 @@ class AutoscalingArgs(_DeploymentModel):
     target_sessions: float | None = Field(
         default=None, gt=0, le=1_000_000, description="sessions of a replica; unset: any number"
     )
+    target_slo_load: float = Field(
+        default=0.8,
+        gt=0,
+        le=1,
+        description="share of a replica that its robots need to be in time, by their SLOs",
+    )
     look_back_s: float = Field(
         default=15.0, gt=0, le=MOST_S, description="load is averaged over this time"
     )
     upscale_delay_s: float = Field(
-        default=10.0, ge=0, le=MOST_S, description="more must be wanted for this long"
+        default=10.0,
+        ge=0,
+        le=MOST_S,
+        description="more must be needed for this long, or 3 s by sessions and their SLOs",
     )
     downscale_delay_s: float = Field(
         default=300.0, ge=0, le=MOST_S, description="less must be wanted for this long"
@@ -382,15 +423,26 @@ class AutoscalingArgs(_DeploymentModel):
 
     def options(self) -> dict[str, Any]:
         """Return Serve's `autoscaling_config`."""
-        targets = {"target_utilisation", "target_waiting", "target_sessions"}
+        targets = {
+            "target_utilisation",
+            "target_waiting",
+            "target_sessions",
+            "target_slo_load",
+        }
+        # A replica reports at each measurement; Serve's own default is every 10 s.
+        report_s = min(2.0, self.look_back_s / 5)
+        # What sessions need is known. But while one moves, two replicas may count it, until both
+        # have reported again.
+        all_reported_s = min(self.upscale_delay_s, 1.5 * report_s)
+        kwargs = self.model_dump(include=targets)
         return {
             **self.model_dump(exclude_none=True, exclude=targets | {"look_back_s"}),
+            "upscale_delay_s": all_reported_s,
             "look_back_period_s": self.look_back_s,
-            # A replica reports at each measurement; Serve's own default is every 10 s.
-            "metrics_interval_s": min(2.0, self.look_back_s / 5),
+            "metrics_interval_s": report_s,
             "policy": {
                 "policy_function": "vlagents_ray.serve.scaling.autoscaling:MeasuredLoad",
-                "policy_kwargs": self.model_dump(include=targets),
+                "policy_kwargs": {**kwargs, "busy_s": self.upscale_delay_s - all_reported_s},
             },
         }
 
@@ -425,6 +477,9 @@ class ServerArgs(_DeploymentModel):
     autoscaling: AutoscalingArgs | None = None
     batch: BatchArgs = BatchArgs()
     sessions: SessionArgs = SessionArgs()
+    slo: SloArgs | None = Field(
+        default=None, description="what each robot needs whose reset states no SLO"
+    )
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()

@@ -50,6 +50,7 @@ class Intake:
         self._drain_list = parts.drain_list
         self._stats = parts.stats
         self._clock = parts.clock
+        self._default_slo = parts.settings.slo
         # None if the engine has no threads.
         self._preparations = Preparations() if parts.settings.threaded else None
 
@@ -146,6 +147,7 @@ class Intake:
         if times is None:
             times = session.times = RobotTimes()
         times.priority = pending.priority
+        times.target_share = session.plan.share
         times.add(report, self._clock())
         self._stats.report(pending.priority.name.lower(), report)
 
@@ -154,6 +156,8 @@ class Intake:
         request, origin, session_id = pending.request, pending.origin, pending.session_id
         choice, kwargs = self._source.split_options(request.kwargs)
         slo = _stated_slo(kwargs.pop(SLO, None))
+        if slo is None and pending.priority is Priority.ROBOT:
+            slo = self._default_slo
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
         # If the checkpoint is not loaded, the request is checked after loading.
         model = self._models.loaded(choice)

@@ -35,7 +35,6 @@ from vlagents_ray.serve.engine.responses import (
     require_serializable,
     timing,
 )
-from vlagents_ray.serve.in_time import RobotTimes
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import too_late
 from vlagents_ray.serve.queue.batch_queue import Taken
@@ -304,8 +303,6 @@ class Runner:
             info[SLO] = self._pace.check(need_of(opening.slo, rows), key)
             plan = RobotPlan.from_slo(opening.slo, rows)
             plan.is_admitted = info[SLO]["in_time"]
-            session.times = session.times or RobotTimes(pending.priority)
-            session.times.target_share = opening.slo.share
         plan.key, plan.heard = key, pending.arrived
         session.plan = plan
         spent = timing(pending, call.began, call.ended)

@@ -26,6 +26,7 @@ from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
 from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
+from vlagents_ray.serve.scaling.slo_load import robots_load
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +135,11 @@ class Exporter:
         self._goodput = make(
             Gauge, "goodput", "Robots whose share of ticks in time reached its target.", "priority"
         )
+        self._slo_load = make(
+            Gauge,
+            "slo_load",
+            "Share of a replica that its robots need to be in time, by their SLOs.",
+        )
         self._unreadable = make(
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."
         )
@@ -169,6 +175,7 @@ class Exporter:
             self._robots.set(count.robots, tags)
             self._goodput.set(count.in_time, tags)
         self._utilisation.set(self._meter.read().utilisation)
+        self._slo_load.set(robots_load(self._engine).load)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
         for kind, size in self._engine.models.gpu_memory().items():

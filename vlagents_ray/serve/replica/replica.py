@@ -25,6 +25,7 @@ from vlagents_ray.protocol.messages import (
     PROTOCOL_VERSION,
     SERVERS_MACHINE,
     MessageLimits,
+    Priority,
     StreamAddress,
     boot_id,
 )
@@ -46,15 +47,24 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.shutdown import Shutdown
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender, message_admission
+from vlagents_ray.serve.in_time import goodput
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.replica.part import PartContext, open_parts
-from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
+from vlagents_ray.serve.scaling.autoscaling import (
+    LATE_ROBOTS,
+    SESSIONS,
+    SLO_LOAD,
+    SLO_ROBOTS,
+    UTILISATION,
+    WAITING,
+)
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.slo_load import robots_load
 
 logger = logging.getLogger(__name__)
 
@@ -233,10 +243,15 @@ class PolicyReplica(ClientApi, SiblingApi):
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Return the load since the last call, for `MeasuredLoad`; called periodically by Serve."""
         load = self._meter.read()
+        reported = goodput(self._engine.sessions.times(), self._engine.clock())
+        needed = robots_load(self._engine)
         return {
             UTILISATION: load.utilisation,
             WAITING: load.waiting / self._args.batch.max_size,
             SESSIONS: float(len(self._engine.sessions)),
+            SLO_LOAD: needed.load,
+            SLO_ROBOTS: float(needed.robots),
+            LATE_ROBOTS: float(reported[Priority.ROBOT].late),
         }
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
@@ -350,8 +365,16 @@ class PolicyReplica(ClientApi, SiblingApi):
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.health.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
+        needed = robots_load(self._engine)
         return ReplicaLoad(
-            self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version
+            self._peers.own_name,
+            sessions,
+            accepts,
+            node,
+            boot_id(),
+            self._engine.models.version,
+            needed.robots,
+            needed.load,
         )
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:

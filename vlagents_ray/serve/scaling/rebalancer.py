@@ -3,16 +3,17 @@ sessions are moved.
 
 A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica until it
 ends, so a new replica would not relieve the others. Therefore each replica compares its number of
-sessions with the others' every few seconds. If it has clearly more than its share, it asks some
-clients to reconnect. Their sessions then move in the same way as when a replica stops
-(`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash selects the replica of
-HTTP sessions.
+sessions with the others' every few seconds, or what its robots need, if that is known of all. If it
+has clearly more than its share, it asks some clients to reconnect. Their sessions then move in the
+same way as when a replica stops (`vlagents_ray.serve.scaling.session_migration`). The load
+balancer's hash selects the replica of HTTP sessions.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import random
 import time
 from collections import Counter, deque
@@ -22,6 +23,7 @@ from operator import attrgetter
 from typing import Any, Protocol
 
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.slo_load import PARTS, loads_by_connection
 
 # Tolerated excess over the mean, as a share of the mean; at least one session is tolerated.
 _SLACK = 0.25
@@ -49,6 +51,14 @@ class ReplicaLoad:
     boot_id: str  # boot id of its machine
     # Version of the policy and its shared objects; sessions only move between equal ones.
     version: tuple[str, str]
+    robots: int = 0  # those of its sessions whose needs are known
+    load: float = 0.0  # what these robots need, see `scaling.slo_load`
+
+    @property
+    def needs_are_known(self) -> bool:
+        """Whether its load says more than the number of its sessions."""
+        # A replica that has answered no robot yet knows no costs.
+        return self.robots == self.sessions and (self.load > 0 or not self.robots)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +115,20 @@ def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int
     return mine - leaving - -(-sum(loads) // len(loads))
 
 
+def excess_load(mine: ReplicaLoad, siblings: Sequence[ReplicaLoad], leaving: float = 0.0) -> float:
+    """Return the load that a replica should send away, without the `leaving` one.
+
+    It is the excess over the mean load; 0 if that is at most 25 % of the mean, or less than the
+    replica's mean robot needs.
+    """
+    loads = [mine.load, *(sibling.load for sibling in siblings)]
+    mean = sum(loads) / len(loads)
+    excess = mine.load - leaving - mean
+    tolerated = max(_SLACK * mean, mine.load / max(1, mine.robots))
+    is_clear = excess > tolerated and not math.isclose(excess, tolerated)
+    return excess if is_clear else 0.0
+
+
 def choose_connections(connections: Counter[str], count: int) -> set[str]:
     """Choose the connections to send away, given the number of sessions of each.
 
@@ -121,6 +145,18 @@ def choose_connections(connections: Counter[str], count: int) -> set[str]:
 
 def _tolerated(sessions: float) -> float:
     return sessions + max(1.0, _SLACK * sessions)
+
+
+@dataclass(frozen=True, slots=True)
+class _Excess:
+    """How much a replica should send away: sessions, or load in parts of a replica."""
+
+    sizes: Counter[str]  # by connection
+    amount: int  # in the unit of `sizes`
+    text: str  # for the log
+
+
+_EVEN = _Excess(Counter(), 0, "0")
 
 
 class Siblings(Protocol):
@@ -163,6 +199,8 @@ class Rebalancer:
         self._asked_near: set[ClientLocation] = set()  # locations of that request
         self._wanted_near: set[ClientLocation] = set()  # those of clients that came after it
         self._uneven = False  # whether the last comparison found too many sessions here
+        # Names of the replicas of the comparisons so far; None before the first one.
+        self._compared: set[str] | None = None
         self._placing = asyncio.Lock()  # held while a replica for a client is chosen
 
     async def run(self) -> None:
@@ -235,33 +273,73 @@ class Rebalancer:
 
     async def compare(self) -> None:
         """Compare the loads, and ask clients to reconnect if this replica had too many sessions
-        twice in a row.
+        twice in a row, or if a replica has joined.
         """
         drain_list, sessions = self._engine.drain_list, self._engine.sessions
         drain_list.forget_older(_RECONNECT_S)
         sessions.drop_idle()
 
         mine = self.load()
-        too_many = 0
+        excess = _EVEN
+        has_joined = False
         active = sessions.by_connection(MOVABLE, _ACTIVE_S)
         asked = drain_list.asked_within(_SETTLE_S)
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
             siblings = [load for load in await self._siblings.some_loads() if load.accepts]
+            has_joined = self._have_joined(siblings)
             if siblings and all(load.version == mine.version for load in siblings):
-                leaving = sum(count for group, count in active.items() if group in asked)
-                too_many = excess_sessions(
-                    mine.sessions, [load.sessions for load in siblings], leaving
-                )
+                excess = self._excess(mine, siblings, active, asked)
 
-        if too_many <= 0 or not self._uneven:
+        # An uneven moment may pass by itself. A replica that has joined stays empty.
+        if excess.amount <= 0 or not (self._uneven or has_joined):
             drain_list.mark(set())
         else:
             lately = drain_list.asked_within(_RECONNECT_S)
             movable = Counter(
-                {group: count for group, count in active.items() if group not in lately}
+                {group: size for group, size in excess.sizes.items() if group not in lately}
             )
-            drain_list.mark(choose_connections(movable, min(too_many, _AT_ONCE)))
+            chosen = choose_connections(movable, excess.amount)
+            drain_list.mark(set(sorted(chosen)[:_AT_ONCE]))
             logger.info(
-                "%d sessions, %d more than a fair share: sending some away", mine.sessions, too_many
+                "%d sessions, %s more than a fair share: sending some away",
+                mine.sessions,
+                excess.text,
             )
-        self._uneven = too_many > 0
+        self._uneven = excess.amount > 0
+
+    def _have_joined(self, siblings: Sequence[ReplicaLoad]) -> bool:
+        """Return whether some of the replicas were in no comparison before, and record them."""
+        names = {load.replica for load in siblings}
+        is_first, before = self._compared is None, self._compared or set()
+        self._compared = names | before
+        return not is_first and not names <= before
+
+    def _excess(
+        self,
+        mine: ReplicaLoad,
+        siblings: Sequence[ReplicaLoad],
+        active: Counter[str],
+        asked: set[str],
+    ) -> _Excess:
+        """Return how much this replica should send away.
+
+        Args:
+            mine: The load of this replica.
+            siblings: The loads of the others.
+            active: The number of sessions by connection that can be asked to reconnect.
+            asked: The connections that were asked, and have not left.
+        """
+        if all(load.needs_are_known for load in (mine, *siblings)):
+            movable = [
+                session
+                for session in self._engine.sessions.all()
+                if session.origin.connection in active
+            ]
+            loads = loads_by_connection(self._engine, movable)
+            leaving = sum(size for group, size in loads.items() if group in asked)
+            load = excess_load(mine, siblings, leaving / PARTS)
+            return _Excess(loads, math.ceil(load * PARTS), f"a load of {load:.2f}")
+
+        leaving = sum(count for group, count in active.items() if group in asked)
+        count = excess_sessions(mine.sessions, [load.sessions for load in siblings], leaving)
+        return _Excess(active, min(count, _AT_ONCE), str(count))

@@ -153,6 +153,10 @@ function showFleet(now) {
     byId("checkpoint").title = digests.join("\n");
     document.title = `${policies[0].policy}, live`;
   }
+  // Robots that report their ticks, and those of them that had enough actions in time.
+  const total = (name) => policies.reduce((sum, one) => sum + one.robots[name], 0);
+  byId("goodput").hidden = !total("robots");
+  byId("goodput").textContent = `${total("in_time")} of ${total("robots")} robots in time`;
   const several = new Set(policies.map((one) => one.policy)).size > 1;
   const rows = [...replicas].sort().map(([name, one]) => {
     const { said, events } = one;
@@ -225,7 +229,7 @@ class Card {
   constructor(id) {
     this.id = id;
     this.missed = 0;
-    this.values = { step: null, server: null, "batch of": null, "weights version": null, "last request": null };
+    this.values = { step: null, "ticks in time": null, "age p95": null, server: null, "batch of": null, "weights version": null, "last request": null };
     this.series = new Map(); // by part of the state: its last rows
     this.plots = new Map(); // by name
     this.images = new Map(); // by camera
@@ -273,6 +277,11 @@ class Card {
     this.halt(said.commands, said.step);
     if (said.last) this.act(said.last);
     this.root.classList.toggle("silent", said.silent_s > 5);
+    const inTime = said.in_time;
+    this.tell({
+      "ticks in time": inTime ? `${(100 * inTime.share).toFixed(1)} %` : null,
+      "age p95": inTime && inTime.age_p95_ms !== null ? `${Math.round(inTime.age_p95_ms)} ms` : null,
+    });
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
   }
 
