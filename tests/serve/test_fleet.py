@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import pytest
 from hypothesis import given
@@ -14,6 +15,7 @@ from vlagents_ray.serve.fleet import (
     USABLE,
     CostCurve,
     RobotNeed,
+    answer_s,
     most_robots,
     replica_load,
 )
@@ -117,3 +119,56 @@ def test_robots_that_replan_as_told_use_no_more_than_the_replica_has(
     requests_hz = sum(count / load.replan_s(need) for need, count in robots.items())
     used = requests_hz * curve.cost_s(load.batch_size) / load.batch_size
     assert used == pytest.approx(USABLE)
+
+
+def load_by_size(
+    costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int, transport_s: float
+) -> list[float]:
+    """The load with each size of batches, robot by robot, until some robot is late."""
+    robots = sum(needs.values())
+    loads = []
+    for size in range(1, min(max_batch_size, robots) + 1):
+        latency_s = answer_s(costs, size, robots) + transport_s
+        intervals_s = [need.interval_s(latency_s) for need in needs for _ in range(needs[need])]
+        if 0.0 in intervals_s:
+            break
+        needed_hz = sum(1 / interval_s for interval_s in intervals_s)
+        loads.append(needed_hz * costs.cost_s(size) / size)
+    return loads
+
+
+different_needs = st.builds(
+    RobotNeed,
+    st.floats(0.5, 50.0),
+    st.sampled_from([1, 2, 8, 50]),
+    st.none() | st.floats(0.05, 5.0),
+)
+
+
+@given(
+    costs=costs,
+    needs=st.dictionaries(different_needs, st.integers(1, 4), min_size=1, max_size=30),
+    max_batch_size=st.integers(1, 64),
+    transport_s=st.floats(0.0, 0.1),
+)
+def test_the_load_of_different_robots_is_that_of_one_after_the_other(
+    costs: CostCurve, needs: dict[RobotNeed, int], max_batch_size: int, transport_s: float
+) -> None:
+    load = replica_load(costs, needs, max_batch_size, transport_s)
+    loads = load_by_size(costs, needs, max_batch_size, transport_s)
+    if not loads:
+        assert (load.load, load.batch_size) == (math.inf, 1)
+        return
+    assert load.load == pytest.approx(min(loads))
+    assert loads[load.batch_size - 1] == pytest.approx(min(loads))
+    robots = sum(needs.values())
+    assert load.latency_s == answer_s(costs, load.batch_size, robots) + transport_s
+
+    # The robots together send as many requests as the replica can answer, and no robot starves.
+    paced_s = {need: load.replan_s(need) for need in needs}
+    if load.load <= USABLE:
+        usable_hz = USABLE * load.batch_size / costs.cost_s(load.batch_size)
+        asked_hz = sum(count / paced_s[need] for need, count in needs.items())
+        assert asked_hz <= usable_hz * (1 + 1e-9)
+    for need, interval_s in paced_s.items():
+        assert interval_s <= need.interval_s(load.latency_s) * (1 + 1e-12)
