@@ -11,8 +11,11 @@ from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
+from vlagents_ray.serve.in_time import RobotReport, RobotTimes
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
+
+SERIES = 24  # those with values of a replica without a GPU, whatever its number of robots
 
 
 def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,4 +47,51 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
         "gpu_ms": [(3.5,)],
         "graph_replays": [(2,)],
     }
+    engine.close()
+
+
+@pytest.mark.parametrize("robots", [10, 10_000])
+def test_the_number_of_series_does_not_grow_with_the_robots(
+    monkeypatch: pytest.MonkeyPatch, robots: int
+) -> None:
+    series_of_values: set[tuple[str, tuple[tuple[str, str], ...]]] = set()
+
+    def series(_tags: object, _kind: object, name: str, *_: object, **__: object) -> Any:
+        def write(_value: float = 1.0, tags: dict[str, str] | None = None) -> None:
+            series_of_values.add((name, tuple(sorted((tags or {}).items()))))
+
+        return SimpleNamespace(set=write, inc=write, observe=write)
+
+    monkeypatch.setattr(metrics, "series", series)
+    monkeypatch.setattr(metrics, "_PAUSE_S", 0.0)
+    engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
+    engine.start()
+    exporter = Exporter(engine, {})
+    engine.stats.enable()
+
+    report = RobotReport(10, 1, 30.0)
+    times = []
+    for _ in range(robots):
+        robot_times = RobotTimes()
+        robot_times.add(report, engine.clock())
+        times.append(robot_times)
+        engine.stats.report("robot", report)
+        engine.stats.handled(("act", "websocket", "robot", "ok"), (5.0, 1.0, 1.0, 2.0, 1.0))
+    monkeypatch.setattr(engine.sessions, "times", lambda: times)
+    exporter.export()
+
+    in_time = {"ticks", "starved_ticks", "executed_age_ms", "robots", "goodput"}
+    labels = {name: [] for name in in_time}
+    for name, tags in sorted(series_of_values):
+        if name in in_time:
+            labels[name].append(tags)
+    robot, simulation = (("priority", "robot"),), (("priority", "simulation"),)
+    assert labels == {
+        "ticks": [robot],
+        "starved_ticks": [robot],
+        "executed_age_ms": [robot],
+        "robots": [robot, simulation],
+        "goodput": [robot, simulation],
+    }
+    assert len(series_of_values) == SERIES
     engine.close()
