@@ -42,6 +42,7 @@ __all__ = [
     "Ahead",
     "ChecksHealth",
     "ContinuesPlans",
+    "CountsTicks",
     "Forwards",
     "HasCheck",
     "HasControl",
@@ -248,6 +249,18 @@ class HasControl(InProcess, Protocol):
 
     control: Any
     """The `vlagents_ray.chunking.control.RobotControl` of the robot."""
+
+
+@runtime_checkable
+class CountsTicks(InProcess, Protocol):
+    """The agent counts the ticks at which its policy was to act, and those without an action in
+    time.
+    """
+
+    timeliness: Any
+    """The `vlagents_ray.chunking.timeliness.Timeliness` of the episode, which a reset replaces. The
+    control loop adds the ticks at which it did not call `act`, as it was busy.
+    """
 
 
 @runtime_checkable

@@ -104,8 +104,10 @@ def main(url):
         )
 
     print(f"{TASK}: {'done' if robot.task_done else 'not done'}")
-    for model, figures in (("policy", report.timeliness), ("planner", robot.planner_timeliness)):
-        print(f"{model}: {figures.share:.1%} of {figures.ticks} ticks in time")
+    for model, timeliness in (("policy", report.timeliness), ("planner", robot.planner_timeliness)):
+        figures = timeliness.time_share
+        if figures.share is not None:
+            print(f"{model}: {figures.share:.1%} of {figures.ticks} ticks in time")
     print(f"held for: {report.reasons or 'nothing'}")
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyUnavailable
 from vlagents_ray.chunking import player as player_module
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
-from vlagents_ray.chunking.timeliness import Timeliness
+from vlagents_ray.chunking.timeliness import Timeliness, TimeShare, in_words
 from vlagents_ray.interface import (
     AGE_MS,
     EXECUTED_AGE,
@@ -143,7 +143,7 @@ def test_a_lost_server_starves_its_robot() -> None:
     for _ in range(4):
         driver.tick()
         driver.answer()
-    assert driver.player.timeliness.to_json()["starved"] == 2
+    assert driver.player.timeliness.starved == 2
     driver.close()
 
 
@@ -159,7 +159,7 @@ def test_a_row_that_the_guard_refuses_was_in_time() -> None:
     act = player.act(Obs())
     assert act.info[IN_TIME] is True
     assert SAFE in act.info
-    assert player.timeliness.share == 1.0
+    assert player.timeliness.time_share.share == 1.0
     agent.let = 10**9
     player.close()
 
@@ -260,8 +260,26 @@ def test_an_operators_ticks_do_not_count() -> None:
     timeliness.count({IN_TIME: True, AGE_MS: 30.0})
     timeliness.count({IN_TIME: False})
     timeliness.count_missed(2)
-    assert (timeliness.ticks, timeliness.starved, timeliness.share) == (4, 3, 0.25)
-    assert timeliness.to_json()["age_p95_ms"] == 30.0
+    assert timeliness.time_share == TimeShare(4, 3, 30.0, 30.0, 30.0)
+    assert timeliness.time_share.share == 0.25
+
+
+def test_figures_have_nearest_rank_ages_and_are_unknown_without_ticks() -> None:
+    assert Timeliness().time_share.to_json() == {
+        "ticks": 0,
+        "starved": 0,
+        "age_p50_ms": None,
+        "age_p95_ms": None,
+        "age_p99_ms": None,
+        "share": None,
+    }
+    time_share = TimeShare.from_ages(200, 100, map(float, range(100, 0, -1)))
+    assert time_share == (200, 100, 50.0, 95.0, 99.0)
+    assert in_words(time_share) == (
+        "in time: 50.00% of 200 ticks of the policy; age of its actions p50 50 ms, p95 95 ms, "
+        "p99 99 ms"
+    )
+    assert in_words(TimeShare(3, 3)) == "in time: 0.00% of 3 ticks of the policy"
 
 
 def test_a_player_states_the_rows_that_it_executes_at_most() -> None:

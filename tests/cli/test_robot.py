@@ -154,6 +154,7 @@ def test_a_policy_alone_is_loaded_once_and_recorded_without_columns_that_nobody_
     run = robot("scripted", *QUICK, "--episodes", "2", "--hz", "200", "--record", str(tmp_path))
     assert run.exit_code == 0, run.output
     assert run.output.count("success: ") == 2
+    assert run.output.count("ticks of the policy; age of its actions p50") == 2
     assert "recorded: 2 episodes" in run.output
     assert "intervention" not in frames(tmp_path, 1)
     assert len(loads) == 1

@@ -64,7 +64,8 @@ _POLICY = {
     "transport": "transport",
 }
 _SUITE = {
-    name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs")
+    name: name
+    for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs", "clock")
 }
 _WORKER = {
     "cpus_per_worker": "cpus",

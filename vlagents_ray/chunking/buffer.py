@@ -174,12 +174,16 @@ class ChunkBuffer:
         self.advance()
         return step
 
-    def replace(self, rows: np.ndarray, step: int | None = None) -> None:
-        """Replace all chunks by one of `rows`, (H, D), the first of which is for `step`; None:
-        for the next step.
+    def replace(self, rows: np.ndarray, step: int | None = None, tick: int = 0) -> None:
+        """Replace all chunks by one.
+
+        Args:
+            rows: Its rows, (H, D).
+            step: The step of its first row; None: the next step.
+            tick: The tick of its observation.
         """
         self._chunks.clear()
-        self.add(Chunk(0, self.executed if step is None else step, rows))
+        self.add(Chunk(0, self.executed if step is None else step, rows, tick=tick))
 
     def leftover(self) -> np.ndarray | None:
         """Return the remaining actions, (H', D); None if there are none."""

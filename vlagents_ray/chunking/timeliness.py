@@ -3,43 +3,79 @@
 A tick counts if the policy was to act at it: not while the robot is paused, stopped or moved by an
 operator, nor while it waits for the first answer after one of these. It is *starved* if no answer
 had a row for it. What becomes of the row, such as a refusal by the guard, does not matter here.
+
+Chunk players, the control loop of a robot, evaluations in real time and replicas all count with
+`Timeliness`, or report a `TimeShare`.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from vlagents_ray.interface import AGE_MS, IN_TIME
 
 KEPT_AGES = 10_000  # the number of ages that are kept: 1,000 s at 10 Hz
 
 
+class TimeShare(NamedTuple):
+    """How well a robot, or several, were served in some time."""
+
+    ticks: int  # ticks at which the policy was to act
+    starved: int  # those of them without a row of an answer
+    age_p50_ms: float | None = None  # age of executed actions; None if none is known
+    age_p95_ms: float | None = None
+    age_p99_ms: float | None = None
+
+    @classmethod
+    def from_ages(cls, ticks: int, starved: int, ages_ms: Iterable[float]) -> TimeShare:
+        """Return the figures of ticks with the ages of their executed actions, ms."""
+        ordered = sorted(ages_ms)
+        p50, p95, p99 = (_quantile(ordered, share) for share in (0.5, 0.95, 0.99))
+        return cls(ticks, starved, p50, p95, p99)
+
+    @property
+    def share(self) -> float | None:
+        """The share of the ticks in time, in [0, 1]; None without ticks."""
+        return None if self.ticks == 0 else 1 - self.starved / self.ticks
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields and the `share`."""
+        return {**self._asdict(), "share": self.share}
+
+
 class Timeliness:
-    """Counts ticks by `Act.info` of a chunk player; see the module for what is counted."""
+    """Counts ticks; see the module for what is counted."""
 
     def __init__(self) -> None:
         self.ticks = 0  # at which the policy was to act
         self.starved = 0  # those of them without a row
         self._ages_ms: deque[float] = deque(maxlen=KEPT_AGES)
 
+    def add(self, *, in_time: bool, age_ms: float | None = None) -> None:
+        """Count a tick at which the policy was to act.
+
+        Args:
+            in_time: Whether an answer had a row for it.
+            age_ms: The age of its executed action, ms; None if none was executed.
+        """
+        self.ticks += 1
+        if not in_time:
+            self.starved += 1
+        elif age_ms is not None:
+            self._ages_ms.append(age_ms)
+
     def count(self, info: Mapping[str, Any]) -> None:
-        """Count a tick.
+        """Count a tick of a chunk player, if the policy was to act at it.
 
         Args:
             info: The info of its action.
         """
         in_time = info.get(IN_TIME)
-        if in_time is None:
-            return
-        self.ticks += 1
-        if not in_time:
-            self.starved += 1
-        elif AGE_MS in info:
-            self._ages_ms.append(info[AGE_MS])
+        if in_time is not None:
+            self.add(in_time=in_time, age_ms=info.get(AGE_MS))
 
     def count_missed(self, ticks: int) -> None:
         """Count ticks that passed while the loop was busy, such as with waiting for an answer."""
@@ -47,20 +83,24 @@ class Timeliness:
         self.starved += ticks
 
     @property
-    def share(self) -> float:
-        """The share of ticks in time, in [0, 1]; 1 before the first tick."""
-        return 1.0 if not self.ticks else 1.0 - self.starved / self.ticks
+    def time_share(self) -> TimeShare:
+        """The figures so far, with the ages of the last `KEPT_AGES` actions."""
+        return TimeShare.from_ages(self.ticks, self.starved, self._ages_ms)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures: `ticks`, `starved`, `share`, and the ages of executed actions
-        `age_p50_ms`, `age_p95_ms` and `age_p99_ms`, which are absent without one.
-        """
-        figures: dict[str, Any] = {
-            "ticks": self.ticks,
-            "starved": self.starved,
-            "share": self.share,
-        }
-        if self._ages_ms:
-            for percent in (50, 95, 99):
-                figures[f"age_p{percent}_ms"] = float(np.percentile(self._ages_ms, percent))
-        return figures
+
+def in_words(time_share: TimeShare) -> str:
+    """Return the figures as people read them; there must be a tick."""
+    text = f"in time: {time_share.share:.2%} of {time_share.ticks} ticks of the policy"
+    if time_share.age_p50_ms is not None:
+        text += (
+            f"; age of its actions p50 {time_share.age_p50_ms:.0f} ms, p95 "
+            f"{time_share.age_p95_ms:.0f} ms, p99 {time_share.age_p99_ms:.0f} ms"
+        )
+    return text
+
+
+def _quantile(ordered: Sequence[float], share: float) -> float | None:
+    """Return the nearest-rank quantile of sorted values; None without values."""
+    if not ordered:
+        return None
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]

@@ -26,6 +26,7 @@ from typing import Any, get_args
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.chunking.timeliness import in_words
 from vlagents_ray.cli.arguments import number, one_of, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
@@ -332,8 +333,9 @@ def _is_task_done(robot: Robot) -> bool:
 def _say_planner(robot: Robot, say: Callable[[str], None]) -> None:
     """Print how punctual the planner of a robot was, if it has one."""
     if isinstance(robot, RobotWithPlanner):
-        figures = robot.planner_timeliness
-        say(f"planner: {figures.share:.2%} of {figures.ticks} answers in time")
+        figures = robot.planner_timeliness.time_share
+        if figures.share is not None:
+            say(f"planner: {figures.share:.2%} of {figures.ticks} answers in time")
 
 
 def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) -> Guard:
@@ -488,16 +490,10 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
 
 def _say_timeliness(report: LoopReport, say: Callable[[str], None]) -> None:
     """Print the share of ticks in time, the ages of actions, and the server's answer to the SLO."""
-    figures = report.timeliness.to_json()
-    if not figures["ticks"]:
+    time_share = report.timeliness.time_share
+    if not time_share.ticks:
         return
-    line = f"in time: {figures['share']:.2%} of {figures['ticks']} ticks of the policy"
-    if "age_p50_ms" in figures:
-        line += (
-            f"; age of its actions p50 {figures['age_p50_ms']:.0f} ms, p95 "
-            f"{figures['age_p95_ms']:.0f} ms, p99 {figures['age_p99_ms']:.0f} ms"
-        )
-    say(line)
+    say(in_words(time_share))
     if not report.slo.get("in_time", True):
         say(f"the server foresaw that this robot is not served in time: {report.slo['reason']}")
 

@@ -13,6 +13,7 @@ import typer
 from vlagents_ray.abilities import HasControl, ability
 from vlagents_ray.chunking.control import Leader, RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.chunking.timeliness import in_words
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.client.agent import RemoteAgent
@@ -194,6 +195,9 @@ class RobotRun:
             f"  {label()}: {robot.steps} steps, {report.interventions} by the operator; paused for "
             f"{report.paused} ticks"
         )
+        time_share = report.timeliness.time_share
+        if time_share.ticks:
+            out.print(f"  {in_words(time_share)}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         """Open the operator's device, if the options name one."""

@@ -44,6 +44,11 @@ def _of_episode(name: str, value_type: Type, meaning: str) -> Column:
     return Column(name, value_type, meaning, lambda _case, episode: getattr(episode, name))
 
 
+def _share(_case: CaseResults, episode: Episode) -> float | None:
+    time_share = episode.result.time_share
+    return None if time_share is None else time_share.share
+
+
 COLUMNS = (
     _of_result(
         "key",
@@ -135,7 +140,6 @@ COLUMNS = (
         "latency_ms", "number", "in real-time mode: median latency of an answer, in the env's time"
     ),
     _of_result("ticks_waited", "integer", "steps executed while the policy computed"),
-    _of_result("ticks_held", "integer", "of these, steps without a remaining row of a chunk"),
     _of_result("timing_ms", "json", "median duration of each stage of an answer on the server"),
     _of_result("transport", "string", "transport of the observations"),
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
@@ -163,6 +167,16 @@ COLUMNS = (
         "string",
         "digest of the policy's files, including its code; null if installed",
     ),
+    _of_result(
+        "ticks",
+        "integer",
+        "ticks at which the policy was to act; null where the env waits for the policy",
+    ),
+    _of_result("starved", "integer", "of these, ticks without a row of an answer"),
+    Column("share", "number", "share of the ticks in time, in [0, 1]", _share),
+    _of_result("age_p50_ms", "number", "median age of the executed actions"),
+    _of_result("age_p95_ms", "number", "their 95th percentile"),
+    _of_result("age_p99_ms", "number", "their 99th percentile"),
 )
 
 

@@ -205,5 +205,6 @@ def _metrics(label: str, group: Group) -> dict[str, float]:
         "return": group.mean_return,
         "steps": group.mean_steps,
         "episodes": group.episodes,
+        "share_in_time": None if group.time_share is None else group.time_share.share,
     }
     return {f"{label}/{name}": float(value) for name, value in values.items() if value is not None}

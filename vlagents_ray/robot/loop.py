@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 
 from vlagents_ray.abilities import (
+    CountsTicks,
     HasCheck,
     HasControl,
     HasStatistics,
@@ -538,6 +539,10 @@ def run_loop(
             if reads is not None and reads.reads_slo:
                 reset_options[SLO] = (options.slo or Slo(hz)).to_json()
             reset_info = agent.reset(obs, instruction, **reset_options)
+            counts_ticks = ability(agent, CountsTicks)
+            if counts_ticks is not None:
+                report.timeliness = counts_ticks.timeliness
+                run.agent_counts_ticks = True
             # A policy in this process may return anything.
             told: object = reset_info.get(SLO) if isinstance(reset_info, dict) else None
             report.slo = read_answer(told)
@@ -630,6 +635,8 @@ class _Run:
     view: LoopView
     report: LoopReport
     fit: Fit | None  # None after the policy's first action
+    counts: bool = False  # whether the policy was to act at the last tick
+    agent_counts_ticks: bool = False  # whether `act` counts its tick in the report's timeliness
     standing: bool = True  # before the first action, and after a stop until the next one
     last: np.ndarray | None = None  # the last action that was applied, (D,)
     apply_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TICKS))
@@ -652,6 +659,7 @@ class _Run:
                 tick = pacer.wait()
                 if end_tick is not None and tick >= end_tick:
                     pacer.forget(end_tick)
+                    self._count_missed(pacer.missed - missed)
                     break
 
                 obs = _observed(self.robot)
@@ -665,7 +673,8 @@ class _Run:
                         "in a ChunkPlayer"
                     )
                 self.report.done = act.done
-                self._count(act, missed=pacer.missed - missed)
+                self._count(act)
+                self._count_missed(pacer.missed - missed)
                 missed = pacer.missed
 
                 # This comes before the sign of life of this tick, which may be late.
@@ -691,17 +700,20 @@ class _Run:
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
 
-    def _count(self, act: Act, missed: int) -> None:
-        """Count whether the tick, and those `missed` before it, had an action of the policy in
-        time.
-        """
+    def _count(self, act: Act) -> None:
+        """Count whether the tick had an action of the policy in time."""
         info: Mapping[str, Any] = act.info
         if not self.agent_has_control and self.control.state == "autonomous":
             # An agent without a plan answers at the tick itself.
             info = {IN_TIME: SAFE not in info, **info}
-        self.report.timeliness.count(info)
-        if IN_TIME in info:
-            self.report.timeliness.count_missed(missed)
+        if not self.agent_counts_ticks:
+            self.report.timeliness.count(info)
+        self.counts = IN_TIME in info
+
+    def _count_missed(self, ticks: int) -> None:
+        """Count ticks that passed before this one without a call of the agent."""
+        if self.counts:
+            self.report.timeliness.count_missed(ticks)
 
     def _give_signs_of_life(self, act: Act) -> None:
         """Report to the watchdog that the loop is alive, and when the server last was."""

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.interface import EXECUTED_AGE, TICKS
 from vlagents_ray.protocol.messages import Priority
@@ -68,21 +69,6 @@ class RobotReport(NamedTuple):
         return cls(all_ticks, starved, float(age_ms))
 
 
-class TimeShare(NamedTuple):
-    """How well a robot was served in some time."""
-
-    ticks: int  # ticks at which the policy was to act
-    starved: int  # those of them without a row of an answer
-    age_p50_ms: float | None  # age of executed actions; None if none was reported
-    age_p95_ms: float | None
-    age_p99_ms: float | None
-
-    @property
-    def share(self) -> float | None:
-        """The share of the ticks in time, in [0, 1]; None without ticks."""
-        return None if self.ticks == 0 else 1 - self.starved / self.ticks
-
-
 class RobotTimes:
     """The ticks and the ages that the robot of one session reports. Thread-safe."""
 
@@ -115,19 +101,25 @@ class RobotTimes:
     def lately(self, now: float) -> TimeShare:
         """Return how well the robot was served in the last `WINDOW_S` seconds before `now`, s."""
         with self._lock:
-            oldest = math.floor(now) - WINDOW_S
-            seconds = [each for each in self._seconds if each[0] > oldest]
-            ages = sorted(age_ms for when, age_ms in self._ages if when > now - WINDOW_S)
-        ticks = sum(ticks for _, ticks, _ in seconds)
-        starved = sum(starved for _, _, starved in seconds)
-        p50, p95, p99 = (_quantile(ages, share) for share in (0.5, 0.95, 0.99))
-        return TimeShare(ticks, starved, p50, p95, p99)
+            ages_ms = [age_ms for when, age_ms in self._ages if when > now - WINDOW_S]
+        return TimeShare.from_ages(*self._ticks_lately(now), ages_ms)
+
+    def _ticks_lately(self, now: float) -> tuple[int, int]:
+        """Return the ticks and the starved ticks in the last `WINDOW_S` seconds before `now`, s."""
+        oldest = math.floor(now) - WINDOW_S
+        all_ticks = all_starved = 0
+        with self._lock:
+            for second, ticks, starved in self._seconds:
+                if second > oldest:
+                    all_ticks += ticks
+                    all_starved += starved
+        return all_ticks, all_starved
 
     def is_in_time(self, now: float) -> bool | None:
         """Return whether the robot's share was at least its target in the last `WINDOW_S` seconds
         before `now`, s; None if it reported no ticks.
         """
-        share = self.lately(now).share
+        share = TimeShare(*self._ticks_lately(now)).share  # the ages take ten times as long
         return None if share is None else share >= self.target_share
 
 
@@ -173,13 +165,6 @@ def describe(times: Iterable[RobotTimes], now: float) -> dict[str, Any]:
     return {
         "robots": served.robots,
         "in_time": served.in_time,
-        "share": None if ticks == 0 else 1 - starved / ticks,
+        "share": TimeShare(ticks, starved).share,
         "age_p95_ms": max(ages_ms, default=None),
     }
-
-
-def _quantile(ordered: list[float], share: float) -> float | None:
-    """Return the nearest-rank quantile of sorted values; None without values."""
-    if not ordered:
-        return None
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]

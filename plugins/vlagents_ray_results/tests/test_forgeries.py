@@ -74,7 +74,11 @@ FORGERIES: dict[str, list[tuple[str, str]]] = {
     "error": [("'policy_failed: no'", FAILED)],
     "latency_ms": [("5.0", SOLVED)],
     "ticks_waited": [("1", SOLVED)],
-    "ticks_held": [("1", SOLVED)],
+    "ticks": [("1", SOLVED)],
+    "starved": [("1", SOLVED)],
+    "age_p50_ms": [("5.0", SOLVED)],
+    "age_p95_ms": [("5.0", SOLVED)],
+    "age_p99_ms": [("5.0", SOLVED)],
     "checkpoint": [("'b'", SOLVED)],
     "weights": [("'sha256:0'", SOLVED)],
     "policy_version": [("1", SOLVED), ("NULL", SOLVED)],
@@ -183,6 +187,45 @@ def test_a_column_that_is_changed_alone_contradicts_the_bundle(
     with contextlib.suppress(ConfigError):  # also a contradiction: no evaluation writes this value
         found = forged(change)
         assert not found.holds, [(one.subject, one.verdict) for one in found.findings]
+
+
+@pytest.fixture(scope="module")
+def in_real_time(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recorded episodes of a policy whose answers take two ticks."""
+    out = tmp_path_factory.mktemp("real_time") / "run"
+    options = {"envs": [LINE], "episodes": 3, "seed": 3, "record": "all", "video": "none"}
+    clock = {"latency": 0.2, "neutral": [0]}
+    results = play(flat_config(**options, clock=clock, out=out), lambda: Versioned(chunk=4))
+    assert all(result.starved for result in results.cases[0].counted)
+    return out
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        "ticks = NULL",
+        "ticks = ticks + 1",
+        "starved = NULL",
+        "starved = ticks_waited + 1",
+        "starved = -1",
+        "age_p50_ms = -1.0",
+        "age_p50_ms = NULL",
+        "age_p95_ms = age_p99_ms + 1",
+        "age_p99_ms = 0.0",
+        "age_p50_ms = NULL, age_p95_ms = NULL, age_p99_ms = NULL",
+        "starved = ticks, ticks_waited = ticks",
+    ],
+)
+def test_ticks_in_time_that_cannot_be_contradict_the_bundle(
+    in_real_time: Path, tmp_path: Path, changes: str
+) -> None:
+    write_bundle(in_real_time, tmp_path / "honest.zip")
+    assert verify(tmp_path / "honest.zip", replay=0).holds
+    unpack(tmp_path / "honest.zip", tmp_path / "files")
+    update(f"UPDATE episodes SET {changes}")(tmp_path / "files")
+    pack(tmp_path / "files", tmp_path / "forged.zip")
+    found = verify(tmp_path / "forged.zip", replay=0)
+    assert "differs" in {one.verdict for one in found.findings if one.subject == "episodes"}
 
 
 @pytest.mark.parametrize("column", ["status", "success_once", "success_at_end", "first_success"])

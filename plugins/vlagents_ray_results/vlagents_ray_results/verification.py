@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.recorder import NO_VERSION, Trajectory
 from vlagents_ray.evaluate.episode.failures import env_side
-from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, Status
+from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, Status
 from vlagents_ray.evaluate.episode.second_pass import play_actions
 from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
@@ -350,14 +350,41 @@ def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
                 f"({expected[2]})"
             )
 
-    waited = (result.ticks_waited, result.ticks_held, result.latency_ms)
-    if case.settings.get("clock") is None and waited != (0, 0, None):
+    yield from _inconsistent_ticks(case, result)
+
+
+def _inconsistent_ticks(case: CaseResults, result: EpisodeResult) -> Iterator[str]:
+    """Yield the contradictions between the columns about ticks, and with the clock of the case."""
+    has_clock = case.settings.get("clock") is not None
+    if not has_clock and (result.ticks_waited, result.latency_ms) != (0, None):
         yield "it waited for answers, but its environment stood still meanwhile"
-    if not 0 <= result.ticks_held <= result.ticks_waited <= result.steps:
+
+    ages_ms = [result.age_p50_ms, result.age_p95_ms, result.age_p99_ms]
+    known_ages_ms = [age_ms for age_ms in ages_ms if age_ms is not None]
+    time_share = result.time_share
+    if not has_clock and case.settings.get("robot") is None:
+        if (result.ticks, result.starved, known_ages_ms) != (None, None, []):
+            yield "it has ticks in time, but its environment waited for the policy"
+        return
+    if time_share is None:
+        yield "its ticks are missing"
+        return
+
+    ticks, starved = time_share.ticks, time_share.starved
+    if has_clock and (ticks != result.steps or not starved <= result.ticks_waited <= ticks):
         yield (
-            f"{result.ticks_held} ticks without an action, {result.ticks_waited} waited, of "
+            f"{starved} starved of {ticks} ticks, {result.ticks_waited} waited, of "
             f"{result.steps} steps"
         )
+    if not 0 <= starved <= ticks:
+        yield f"{starved} starved of {ticks} ticks"
+    has_ages = [True] * 3 if known_ages_ms else [False] * 3
+    if [age_ms is not None for age_ms in ages_ms] != has_ages:
+        yield f"it has some of the ages {ages_ms}, but not all"
+    if known_ages_ms != sorted(known_ages_ms) or min(known_ages_ms, default=0.0) < 0:
+        yield f"expected ages in ascending order, none below 0 ms, got {known_ages_ms}"
+    if has_clock and bool(known_ages_ms) != (starved < ticks):
+        yield f"{ticks - starved} ticks in time, but the ages {ages_ms}"
 
 
 def _check_trajectories(results: Results) -> Finding:

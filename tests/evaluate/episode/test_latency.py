@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from in_process_episode import run_episode
 from pydantic import ValidationError
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER, Act, Obs
+from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER, Act, Agent, Obs
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
@@ -84,7 +85,7 @@ def test_holding_repeats_the_last_action_and_zero_keeps_only_the_gripper() -> No
         list(player.ticks(CHUNK, 0.0))
     held = next(holding.ticks(CHUNK, 0.1))
     stopped = next(still.ticks(CHUNK, 0.1))
-    assert (held.action.tolist(), held.waited, held.held) == ([4, -1], True, True)
+    assert (held.action.tolist(), held.waited, held.starved) == ([4, -1], True, True)
     assert stopped.action.tolist() == [0, -1]
 
 
@@ -174,14 +175,18 @@ def episode(seed: int, timing: ClockConfig | None, execute: int | None = None) -
 
 
 def outcome(result: EpisodeResult) -> dict[str, Any]:
-    return result.outcome | {"latency_ms": 0}
+    ticks_in_time = dict.fromkeys(TimeShare._fields)
+    return result.outcome | {"latency_ms": 0} | ticks_in_time
 
 
 @pytest.mark.parametrize("execute", [None, 1, 3])
 @pytest.mark.parametrize("meanwhile", ["chunk", "hold", "zero"])
 def test_without_latency_it_is_the_synchronous_episode(meanwhile: Any, execute: int | None) -> None:
     timing = ClockConfig(latency=0, meanwhile=meanwhile, neutral=[0])
-    assert outcome(episode(3, timing, execute)) == outcome(episode(3, None, execute))
+    in_real_time, synchronous = episode(3, timing, execute), episode(3, None, execute)
+    assert outcome(in_real_time) == outcome(synchronous)
+    assert synchronous.time_share is None
+    assert (in_real_time.ticks, in_real_time.starved) == (in_real_time.steps, 0)
 
 
 def test_latency_lowers_success_and_repeats_exactly() -> None:
@@ -197,6 +202,94 @@ def test_latency_lowers_success_and_repeats_exactly() -> None:
         for one in late
     )
     assert [outcome(one) for one in again] == [outcome(one) for one in late]
+
+
+class Endless(Line):
+    """An environment that no action solves, with the number of its steps."""
+
+    max_steps = 60
+    steps = 0
+
+    def reset(self, **arguments: Any) -> tuple[Obs, dict[str, Any]]:
+        self.steps = 0
+        return super().reset(**arguments)
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        obs, reward, _, _, _ = super().step(act)
+        return obs, reward, False, self.steps == self.max_steps, {"success": False}
+
+
+class Numbering(Agent):
+    """Returns rows that name the step of their observation and their number in the chunk."""
+
+    contract = Contract(action=ActionSpec(dim=1, delta=True))
+
+    def __init__(self, env: Endless, rows: int) -> None:
+        self._env, self._rows = env, rows
+
+    def act(self, obs: Obs) -> Act:
+        numbers = 1000.0 * (1 + self._env.steps) + np.arange(self._rows)
+        return Act(numbers.astype(np.float32)[:, np.newaxis])
+
+
+def observed(
+    rows: int, execute: int | None, timing: ClockConfig
+) -> tuple[EpisodeResult, list[float]]:
+    """An episode, and the ages, ms, of the actions that an observer of the robot sees: one that is
+    no row, or is the row of the tick before again, is of none.
+    """
+    env = Endless()
+    executed: list[float] = []
+    result = run_episode(
+        env,
+        Numbering(env, rows),
+        EpisodeKey("line", 0, 1, "0"),
+        execute=execute,
+        clock=timing,
+        executed=lambda action, _reward, _success: executed.append(float(action[0])),
+    )
+    ages_ms = []
+    for step, action in enumerate(executed):
+        if action and (step == 0 or action != executed[step - 1]):
+            ages_ms.append(1e3 * (step - (int(action) // 1000 - 1)) / 10.0)
+    return result, ages_ms
+
+
+@given(
+    latency=st.floats(0, 2),
+    rows=st.integers(1, 12),
+    execute=st.none() | st.integers(1, 12),
+    meanwhile=st.sampled_from(["chunk", "hold", "zero"]),
+    align=st.booleans(),
+)
+def test_ticks_in_time_are_those_that_an_observer_of_the_robot_sees(
+    latency: float, rows: int, execute: int | None, meanwhile: Any, align: bool
+) -> None:
+    timing = ClockConfig(latency=latency, meanwhile=meanwhile, align=align, neutral=[0])
+    result, ages_ms = observed(rows, execute, timing)
+    in_time = result.time_share
+    assert in_time is not None
+    assert in_time.ticks == Endless.max_steps
+    assert in_time == TimeShare.from_ages(60, 60 - len(ages_ms), ages_ms)
+
+
+def test_ticks_in_time_of_known_episodes() -> None:
+    # First 2 ticks without a row, and 4 rows that are 200 to 500 ms old; while the policy thinks,
+    # the 2 rows that are left, at 600 and 700 ms. From then on each chunk gives 4 rows of 200 to
+    # 500 ms, the last two of them while the policy thinks.
+    timing = ClockConfig(latency=0.2, neutral=[0])
+    result, _ = observed(6, 4, timing)
+    assert result.time_share == TimeShare(60, 2, 400.0, 500.0, 700.0)
+
+    # Each second tick waits for an answer.
+    result, _ = observed(1, None, ClockConfig(latency=0.1, neutral=[0]))
+    assert result.time_share == TimeShare(60, 30, 100.0, 100.0, 100.0)
+    assert result.time_share.share == 0.5
+
+    # The first answer comes after the end.
+    result, _ = observed(4, None, ClockConfig(latency=9.0, neutral=[0]))
+    assert result.time_share == TimeShare(60, 60, None, None, None)
 
 
 def test_measured_latency_is_what_the_policy_took() -> None:
@@ -227,5 +320,6 @@ def test_an_episode_never_has_more_steps_than_its_env_allows(
         Line(), ToZero(chunk=rows), EpisodeKey("line", 0, 1, "0"), execute=execute, clock=timing
     )
     assert result.steps <= Line.max_steps
-    assert result.ticks_held <= result.ticks_waited <= result.steps
+    assert result.time_share is not None
+    assert result.starved <= result.ticks_waited <= result.steps == result.ticks
     assert not rows > 1 or latency > 0 or result.ticks_waited == 0

@@ -5,12 +5,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE
 from rich.console import Console
 
-from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
+from vlagents_ray.chunking.timeliness import TimeShare
+from vlagents_ray.evaluate import EvalConfig, Summary, compare, print_summary, synchronous_twin
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
@@ -18,6 +20,7 @@ from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import resolve
 from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize, write_summary
@@ -162,7 +165,7 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     )
 
 
-def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
+def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: Any) -> Summary:
     """The summary of an evaluation whose suites had these outcomes."""
     with Store(resolve(settings)) as store:
         store.begin_run(versions())
@@ -184,7 +187,7 @@ def printed(summary: Summary) -> str:
 
 
 def in_real_time(
-    out: Path, outcomes: dict[str, list[bool]], envs: Sequence[str] = (LINE,), **fields: int
+    out: Path, outcomes: dict[str, list[bool]], envs: Sequence[str] = (LINE,), **fields: Any
 ) -> tuple[Summary, str]:
     """The summary of suites of which only "waits" is synchronous, and what is printed of it."""
     suites = [
@@ -200,7 +203,7 @@ def in_real_time(
 
 def test_a_case_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
     outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "smaller": [True] * 4}
-    summary, text = in_real_time(tmp_path, outcomes, ticks_waited=5, ticks_held=2)
+    summary, text = in_real_time(tmp_path, outcomes, ticks_waited=5)
     waits, moves, smaller = summary.results.cases
     assert synchronous_twin(summary.results, moves) is waits
     assert synchronous_twin(summary.results, waits) is None
@@ -211,7 +214,51 @@ def test_a_case_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path
         None,
     ]
     assert "policy, moves on in real time: -75.0 points to the synchronous score (" in text
-    assert ", 4 pairs); 50% of its ticks waited for an answer, 20% with nothing to execute" in text
+    assert ", 4 pairs); 50% of its ticks waited for an answer" in text
+
+
+def test_ticks_in_time_are_told_of_each_case_that_has_a_clock(tmp_path: Path) -> None:
+    outcomes = {"waits": [True] * 4, "moves on": [True] * 4}
+    figures = TimeShare(10, 2, 100.0, 200.0, 300.0)
+    summary, text = in_real_time(tmp_path, outcomes, ticks_waited=5, **figures._asdict())
+    in_time = {"ticks": 40, "starved": 8, "share": 0.8}
+    in_time |= {"age_p50_ms": 100.0, "age_p95_ms": 200.0, "age_p99_ms": 300.0}
+    cases = summary.to_json()["cases"]
+    assert [case["time_share"] for case in cases] == [None, in_time]
+    assert summary.to_json()["totals"][0]["time_share"] == in_time
+    assert text.count("in time: ") == 1
+    assert (
+        f"policy moves on {LINE}: in time: 80.00% of 40 ticks of the policy; age of its actions "
+        "p50 100 ms, p95 200 ms, p99 300 ms"
+    ) in text
+    [gap] = clock_gaps(summary.results)
+    assert gap.to_json()["time_share_a"] == in_time
+    assert gap.to_json()["time_share_b"] is None
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+    assert "80.00</td>" in page
+    assert "Ticks in time do not apply to 1 case in which the env waits for the policy." in page
+
+
+def test_a_comparison_has_the_ticks_in_time_of_both_policies(tmp_path: Path) -> None:
+    policies = [{"name": name, "url": "http://localhost:1"} for name in ("a", "b")]
+    suite = {"name": "moves on", "envs": [LINE], "episodes": 2, "clock": {"latency": 0.2}}
+    settings = EvalConfig.model_validate(
+        {"policies": policies, "suites": [suite], "out": tmp_path / "out"}
+    )
+    summary = recorded(settings, {"moves on": [True, False]}, ticks=10, starved=1)
+    compared = compare(summary.results, "a", "b").to_json()
+    for policy in ("a", "b"):
+        figures = compared[f"time_share_{policy}"]
+        assert (figures["ticks"], figures["starved"], figures["share"]) == (20, 2, 0.9)
+
+
+def test_episodes_without_an_executed_row_have_no_age(tmp_path: Path) -> None:
+    outcomes = {"moves on": [False] * 3}
+    summary, text = in_real_time(tmp_path, outcomes, ticks=10, starved=10)
+    assert summary.total.time_share == TimeShare(30, 30, None, None, None)
+    assert ": in time: 0.00% of 30 ticks of the policy\n" in text
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+    assert "do not apply" not in page
 
 
 def test_a_case_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import SimulatedTime
 from robot_trials import (
     NAMES,
     URLS,
@@ -26,6 +27,7 @@ from robot_trials import (
     typed,
 )
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.plan.cases import plan_cases
@@ -98,6 +100,46 @@ class Talkative(Reaching):
         )
         logging.getLogger("ray.serve").error("replica of %s", self.name)
         return super().act(obs)
+
+
+class VirtualTime(SimulatedTime):
+    """In place of the module `time`, with the time of day."""
+
+    time = SimulatedTime.monotonic
+
+
+def test_a_trial_has_the_ticks_in_time_and_the_ages_of_its_actions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = VirtualTime()
+    for module in ("chunking.buffer", "chunking.player", "robot.loop", "robot.pacing"):
+        monkeypatch.setattr(f"vlagents_ray.{module}.time", clock)
+
+    class Slow(Reaching):
+        """Answers with four rows after two and a half ticks."""
+
+        def act(self, obs: Obs) -> Act:
+            clock.now += 0.25
+            return super().act(obs)
+
+    config = plan(
+        tmp_path / "out",
+        robot={"hz": 10, "tasks": tasks(max_steps=14)},
+        suite={"envs": ["drawer"], "episodes": 1},
+    )
+    summary = evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies(Slow))
+
+    # The reset waits for the first chunk: rows of 250, 350, 450 and 550 ms. Each later chunk costs
+    # a tick, the one after its request, and its rows have 250, 250, 300 and 400 ms.
+    ages_ms = [250.0, 350.0, 450.0, 550.0, *[250.0, 250.0, 300.0, 400.0] * 2]
+    expected = TimeShare.from_ages(14, 2, ages_ms)
+    for case in summary.results.cases:
+        [result] = case.counted
+        assert result.steps == 12
+        assert result.time_share == pytest.approx(expected, abs=1.0)
+    total = summary.total.time_share
+    assert total is not None
+    assert (total.ticks, total.starved) == (28, 4)
 
 
 def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path) -> None:

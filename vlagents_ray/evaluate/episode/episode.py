@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import ERROR, BatchEnv, Environment
@@ -43,7 +44,6 @@ _FIELDS_OF_RESULT = (  # those that `EpisodeStats` and a result have in common
     "reset_ms",
     "policy_seconds",
     "ticks_waited",
-    "ticks_held",
     "checkpoint",
     "weights",
     "revision",
@@ -80,7 +80,7 @@ class EpisodeStats:
     policy_seconds: float = 0.0
     latency_ms: list[float] = field(default_factory=list)
     ticks_waited: int = 0
-    ticks_held: int = 0
+    timeliness: Timeliness | None = None  # None where the environment waits for the policy
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def began(self, info: object) -> None:
@@ -118,12 +118,14 @@ class EpisodeStats:
         """
         seconds = perf_counter() - self.started
         common = {name: getattr(self, name) for name in _FIELDS_OF_RESULT}
+        time_share = {} if self.timeliness is None else self.timeliness.time_share._asdict()
         medians_ms = {
             stage: float(np.median(times)) for stage, times in sorted(self.timing_ms.items())
         }
 
         result = EpisodeResult(
             **common,
+            **time_share,
             status="done",
             success_once=self.first_success is not None,
             success_at_end=self.success,
@@ -261,7 +263,10 @@ def run_episodes(
         keys, sessions, observers, observations, instructions, strict=True
     ):
         observer.add_observation(obs)
-        stats = EpisodeStats(key, start, instructions=[text], reset_ms=reset_ms)
+        timeliness = None if clock is None else Timeliness()
+        stats = EpisodeStats(
+            key, start, instructions=[text], reset_ms=reset_ms, timeliness=timeliness
+        )
         episodes.append(_Episode(len(episodes), session, stats, observer, new_executor, obs))
 
     watch("policy reset", 0)
@@ -398,7 +403,8 @@ class _Episode:
         tick, stats = self.ticks.popleft(), self.stats
         stats.steps += 1
         stats.ticks_waited += tick.waited
-        stats.ticks_held += tick.held
+        if stats.timeliness is not None:
+            stats.timeliness.add(in_time=not tick.starved, age_ms=tick.age_ms)
         stats.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
         return tick
 

@@ -31,7 +31,9 @@ class Tick(NamedTuple):
 
     action: np.ndarray  # (D,) float32
     waited: bool = False  # executed while waiting for an answer
-    held: bool = False  # no row of any chunk is left for it
+    starved: bool = False  # no row of an answer is executed
+    # Real-time mode: the time from the observation of which the action was computed, ms.
+    age_ms: float | None = None
 
 
 class ChunkExecutor:
@@ -73,6 +75,7 @@ class ChunkExecutor:
             )
 
         self._plan = ChunkBuffer()
+        self._tick = 0  # the number of the next tick in real-time mode
         self._last: np.ndarray | None = None  # (D,) action
         self._delay = DelayEstimate()
 
@@ -118,38 +121,49 @@ class ChunkExecutor:
         # The ticks between the observation and its answer.
         ticks_waited = math.ceil(latency_s * self._hz - _EXACTLY)
         self._delay.add(ticks_waited)
+        observed = self._tick
         executed_at_request = self._plan.executed
-        for tick in self._waiting(ticks_waited, rows.shape[1]):
-            self._last = tick.action
-            yield tick
+        yield from self._waiting(ticks_waited, rows.shape[1])
         if self._plan.outruns(executed_at_request, info or {}):
             return
 
         # The last row is always executed, else a policy slower than its chunks would never act.
         latest_start = self._plan.executed - len(rows) + 1
         start = max(executed_at_request, latest_start)
-        self._plan.replace(rows, start if self._clock.align else None)
+        self._plan.replace(rows, start if self._clock.align else None, observed)
         first = self._plan.take()
-        self._last = first.action
-        yield Tick(first.action)
+        yield self._executed(first.action, observed)
         for action in rows[first.row + 1 : execute]:
             self._plan.advance()
-            self._last = action
-            yield Tick(action)
+            yield self._executed(action, observed)
 
     def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
         for _ in range(ticks):
             step = self._plan.next if self._clock.meanwhile == "chunk" else None
             if step is None:
-                tick = Tick(self._held(dim), waited=True, held=True)
-                # A relative action that is repeated moves the robot on, so that it counts as a row.
+                action = self._held(dim)
+                # A relative action that is repeated moves the robot on, so that the plan goes on.
                 repeats = self._clock.meanwhile == "hold" and self._plan.executed > 0
                 if repeats and stopping(self._spec) == "zero":
                     self._plan.advance()
-                yield tick
+                yield self._executed(action, None, waited=True)
             else:
                 self._plan.advance()
-                yield Tick(step.action, waited=True)
+                yield self._executed(step.action, step.chunk.tick, waited=True)
+
+    def _executed(self, action: np.ndarray, observed: int | None, *, waited: bool = False) -> Tick:
+        """Return the next tick in real-time mode.
+
+        Args:
+            action: Its action, (D,).
+            observed: The tick of the observation of which the action was computed; None for an
+                action in place of a row.
+            waited: Whether an answer is awaited.
+        """
+        age_ms = None if observed is None else 1e3 * (self._tick - observed) / self._hz
+        self._tick += 1
+        self._last = action
+        return Tick(action, waited, observed is None, age_ms)
 
     def _held(self, dim: int) -> np.ndarray:
         """Return the action of a tick for which no row is left, (D,)."""

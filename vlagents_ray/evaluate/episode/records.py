@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.ray_tools.git_state import GitState
@@ -42,7 +43,13 @@ class EpisodeResult:
     policy_seconds: float | None = None  # computing time of the policy for this episode
     latency_ms: float | None = None  # real-time mode: median of the latencies of acts
     ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
-    ticks_held: int = 0  # of these, ticks with no row of a chunk left
+    # The next five fields are those of a `TimeShare`. They are None where the environment waits for
+    # the policy.
+    ticks: int | None = None  # ticks at which the policy was to act
+    starved: int | None = None  # those of them without a row of an answer
+    age_p50_ms: float | None = None  # of executed actions
+    age_p95_ms: float | None = None
+    age_p99_ms: float | None = None
     # Medians of the times in `act.info["timing"]`.
     timing_ms: dict[str, float] = field(default_factory=dict)
     transport: str = "local"
@@ -56,6 +63,15 @@ class EpisodeResult:
     first_policy_version: int | None = None  # of the weights that computed the first act
     # Digest of the executed actions, (steps, D) little-endian float32, row by row.
     actions_sha256: str | None = None
+
+    @property
+    def time_share(self) -> TimeShare | None:
+        """How many ticks had an action in time; None where the environment waits for the policy."""
+        if self.ticks is None or self.starved is None:
+            return None
+        return TimeShare(
+            self.ticks, self.starved, self.age_p50_ms, self.age_p95_ms, self.age_p99_ms
+        )
 
     @property
     def full_key(self) -> str:

@@ -21,6 +21,7 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import EvalConfig
@@ -45,7 +46,8 @@ from vlagents_ray.evaluate.report.success import (
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import CaseResults, Results, Run, by_timing, rate_of
-from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, reported, summarize
+from vlagents_ray.evaluate.results.statistics import median
+from vlagents_ray.evaluate.results.summary import Summary, pushed_of, reported, summarize
 
 FILE = "report.html"
 STAGES = {  # the stages in `act.info["timing"]`, in their order, and their names on the page
@@ -258,6 +260,8 @@ class Latency:
     rows: list[tuple[str, list[float | None], float | None, int]]
     transports: list[str]
     timed: int  # number of policy ids with stages; the chart shows the first `MOST_BARS`
+    # (policy id, task, figures) by case; None where the environment waits for the policy
+    in_time: list[tuple[str, str, TimeShare | None]]
 
 
 def latency(summary: Summary) -> Latency | None:
@@ -292,7 +296,11 @@ def latency(summary: Summary) -> Latency | None:
 
     bars = dict(itertools.islice(timed.items(), MOST_BARS))
     chart = charts.bar_chart(bars, "Time of one call of the policy, by stage") if bars else None
-    return Latency(chart, stages, rows, summary.transports, len(timed))
+    in_time = [
+        (group.policy_id, f"{group.suite} {group.env}".strip(), group.time_share)
+        for group in summary.cases
+    ]
+    return Latency(chart, stages, rows, summary.transports, len(timed), in_time)
 
 
 _SETTINGS = ("env_options", "reset_options", "clock")

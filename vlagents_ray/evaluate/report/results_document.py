@@ -16,7 +16,13 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.terminal import Progress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
-from vlagents_ray.evaluate.results.reader import CaseResults, Episode, Results, rate_of
+from vlagents_ray.evaluate.results.reader import (
+    CaseResults,
+    Episode,
+    Results,
+    rate_of,
+    time_share_of,
+)
 from vlagents_ray.evaluate.results.statistics import Rate
 
 STARTING = "starting"
@@ -148,6 +154,7 @@ class ResultsDocument:
 
 
 def _case(case: CaseResults) -> dict[str, Any]:
+    time_share = time_share_of(case.counted)
     return {
         "policy": case.policy_id,
         "task": case.task,
@@ -155,6 +162,8 @@ def _case(case: CaseResults) -> dict[str, Any]:
         "planned": _planned(case),
         "stopped": case.stopped_at is not None,
         "sequence": case.stop is not None,
+        # Of the ticks at which the policy was to act; None where the environment waits for it.
+        "share_in_time": None if time_share is None else time_share.share,
     } | _rate(rate_of([case], "success_once"))
 
 

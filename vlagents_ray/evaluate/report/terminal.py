@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from vlagents_ray.chunking.timeliness import in_words
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
@@ -285,6 +286,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines = [*_speed(summary), *_losses(summary)]
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     lines += [*_pushed_weights(summary), *_early_stops(summary), *_clock_gaps(summary)]
+    lines += _times(summary)
     if summary.state == RUNNING:
         lines.append("still running")
     elif summary.state != "complete":
@@ -381,14 +383,24 @@ def _clock_gaps(summary: Summary) -> list[str]:
         # The number of steps is 0 if the policy failed before the first step of each episode.
         steps = max(1, sum(result.steps for result in counted))
         waited = sum(result.ticks_waited for result in counted) / steps
-        without_row = sum(result.ticks_held for result in counted) / steps
         low, high = gap.total.interval
         lines.append(
             f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous "
             f"score ({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
-            f"{waited:.0%} of its ticks waited for an answer, {without_row:.0%} with nothing to "
-            "execute"
+            f"{waited:.0%} of its ticks waited for an answer"
         )
+    return lines
+
+
+def _times(summary: Summary) -> list[str]:
+    """Return a line for each case in real time, or on a robot: its ticks in time, and the ages of
+    its actions.
+    """
+    lines = []
+    for group in summary.cases:
+        if group.time_share is not None and group.time_share.ticks:
+            name = " ".join(filter(None, (group.policy_id, group.suite, group.env)))
+            lines.append(f"{name}: {in_words(group.time_share)}")
     return lines
 
 

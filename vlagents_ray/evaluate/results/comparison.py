@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.changes import (
     Change,
@@ -18,7 +19,13 @@ from vlagents_ray.evaluate.results.changes import (
     listed,
     program_changes,
 )
-from vlagents_ray.evaluate.results.reader import CaseResults, Results, by_timing, synchronous_twin
+from vlagents_ray.evaluate.results.reader import (
+    CaseResults,
+    Results,
+    by_timing,
+    synchronous_twin,
+    time_share_of,
+)
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 from vlagents_ray.naming import did_you_mean
 
@@ -79,6 +86,9 @@ class Comparison:
     total: Line
     cases: tuple[CaseResults, ...] = ()  # the cases in real time; only of `clock_gaps`
     changes: tuple[Change, ...] = ()  # accepted differences between the two environments
+    # Of the compared cases; None where their environments waited for the policy.
+    time_share_a: TimeShare | None = None
+    time_share_b: TimeShare | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON; `lines` has one entry for each suite, and the total last."""
@@ -87,6 +97,8 @@ class Comparison:
             "a": self.a,
             "b": self.b,
             "lines": lines,
+            "time_share_a": None if self.time_share_a is None else self.time_share_a.to_json(),
+            "time_share_b": None if self.time_share_b is None else self.time_share_b.to_json(),
             "accepted_changes": [asdict(change) for change in self.changes],
         }
 
@@ -147,10 +159,12 @@ def comparisons(
     not_shown = max(0, (chosen_of or 0) - len(policy_pairs))
     suites_of_pairs: list[dict[str, Strata]] = []
     changes_of_pairs: list[list[Change]] = []
+    time_shares_of_pairs: list[list[TimeShare | None]] = []
     for a, b in policy_pairs:
-        suites, changes = _shared(results, a, b, accept_changes=accept_changes)
+        suites, changes, compared = _shared(results, a, b, accept_changes=accept_changes)
         suites_of_pairs.append(suites)
         changes_of_pairs.append(changes)
+        time_shares_of_pairs.append([_time_share(cases) for cases in zip(*compared, strict=True)])
 
     strata_of_pairs: list[list[Pairs]] = []
     names: dict[str, None] = {}  # the names of all suites, in order
@@ -174,10 +188,21 @@ def comparisons(
         for index, line in zip(members, family, strict=True):
             lines[index].append(line)
 
-    return [
-        Comparison(a, b, tuple(lines[i]), totals[i], changes=tuple(changes_of_pairs[i]))
-        for i, (a, b) in enumerate(policy_pairs)
-    ]
+    compared_pairs = []
+    for i, (a, b) in enumerate(policy_pairs):
+        changes, (time_share_a, time_share_b) = changes_of_pairs[i], time_shares_of_pairs[i]
+        compared_pairs.append(
+            Comparison(
+                a,
+                b,
+                tuple(lines[i]),
+                totals[i],
+                changes=tuple(changes),
+                time_share_a=time_share_a,
+                time_share_b=time_share_b,
+            )
+        )
+    return compared_pairs
 
 
 def comparable(
@@ -226,7 +251,7 @@ def clock_gaps(results: Results) -> list[Comparison]:
 
     lines = _lines(ALL, [list(by_env.values()) for by_env in strata.values()])
     return [
-        Comparison(a, b, (), line, tuple(compared))
+        Comparison(a, b, (), line, tuple(compared), time_share_a=_time_share(compared))
         for ((a, b), compared), line in zip(cases.items(), lines, strict=True)
     ]
 
@@ -241,10 +266,17 @@ def gap_to_synchronous(results: Results, case: CaseResults) -> float | None:
     return None if counterpart is None else _pairs(case, counterpart).difference
 
 
+def _time_share(cases: Iterable[CaseResults]) -> TimeShare | None:
+    """Return the figures of all counted episodes of these cases."""
+    return time_share_of(list(itertools.chain.from_iterable(case.counted for case in cases)))
+
+
 def _shared(
     results: Results, a: str, b: str, *, accept_changes: bool
-) -> tuple[dict[str, Strata], list[Change]]:
-    """Return the pairs of outcomes by suite and env, and the accepted changes between the two."""
+) -> tuple[dict[str, Strata], list[Change], list[tuple[CaseResults, CaseResults]]]:
+    """Return the pairs of outcomes by suite and env, the accepted changes between the two, and the
+    compared cases of A and B.
+    """
     unknown = sorted({a, b} - set(results.policy_ids))
     if unknown:
         raise ConfigError(
@@ -255,7 +287,7 @@ def _shared(
     cases_of_b = {(case.suite, case.env): case for case in results.of(b)}
     suites: dict[str, Strata] = {}
     changes: dict[Change, None] = {}
-    compared: list[CaseResults] = []
+    compared: list[tuple[CaseResults, CaseResults]] = []
     for case in results.of(a):
         other = cases_of_b.get((case.suite, case.env))
         if other is None:
@@ -266,9 +298,9 @@ def _shared(
         pairs = _pairs(case, other)
         if pairs.total:
             suites.setdefault(case.suite, {})[case.env] = pairs
-            compared.append(case)
+            compared.append((case, other))
 
-    timings = by_timing(compared)
+    timings = by_timing([case for case, _ in compared])
     if len(timings) > 1:
         raise ConfigError(
             "compare: expected one clock, as episodes of several clocks have no common rate, got "
@@ -278,7 +310,7 @@ def _shared(
         raise ConfigError(
             f"compare: {a!r} and {b!r} share no finished episode; evaluate both with the same seeds"
         )
-    return suites, list(changes)
+    return suites, list(changes), compared
 
 
 _COMPARE_ALL_THE_SAME = "or compare them nevertheless and have the report say so (--accept-changes)"

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
@@ -26,7 +27,7 @@ from vlagents_ray.evaluate.results.database import (
     read_only,
     require_readable,
 )
-from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_plan, pooled
+from vlagents_ray.evaluate.results.statistics import Rate, Stopping, median, place_in_plan, pooled
 
 KILLED = "killed"  # the state of a run that was killed, so that it recorded no end
 
@@ -429,6 +430,23 @@ def have_common_rate(cases: Sequence[CaseResults]) -> bool:
     from success while the env waits.
     """
     return len({case.stopped_at for case in cases}) <= 1 and len(by_timing(cases)) <= 1
+
+
+def time_share_of(results: Sequence[EpisodeResult]) -> TimeShare | None:
+    """Return the figures of episodes in real time, or on a robot, together; None if there are none.
+
+    Ticks are summed. The ages are the medians of the episodes' percentiles.
+    """
+    time_shares = [result.time_share for result in results if result.time_share is not None]
+    if not time_shares:
+        return None
+    return TimeShare(
+        ticks=sum(share.ticks for share in time_shares),
+        starved=sum(share.starved for share in time_shares),
+        age_p50_ms=median(share.age_p50_ms for share in time_shares),
+        age_p95_ms=median(share.age_p95_ms for share in time_shares),
+        age_p99_ms=median(share.age_p99_ms for share in time_shares),
+    )
 
 
 SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"

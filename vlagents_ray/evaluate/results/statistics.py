@@ -428,3 +428,9 @@ def _boundary(is_inside: Callable[[float], bool], inside: float, outside: float)
         else:
             outside = middle
     return outside
+
+
+def median(values: Iterable[float | None]) -> float | None:
+    """Return the median of the values that are not None; None if all are."""
+    known_values = [value for value in values if value is not None]
+    return float(np.median(known_values)) if known_values else None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
+from vlagents_ray.chunking.timeliness import TimeShare
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
@@ -20,8 +21,9 @@ from vlagents_ray.evaluate.results.reader import (
     by_timing,
     have_common_rate,
     rate_of,
+    time_share_of,
 )
-from vlagents_ray.evaluate.results.statistics import Rate
+from vlagents_ray.evaluate.results.statistics import Rate, median
 
 FILE = "summary.json"
 TOTAL = "total"
@@ -52,6 +54,7 @@ class Group:
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians
     policy_p95_ms: float | None  # median of the episodes' 95th percentiles
+    time_share: TimeShare | None  # see `time_share_of`
 
     @property
     def episodes(self) -> int:
@@ -79,7 +82,13 @@ class Group:
             "success_at_end": self.success_at_end.to_json(),
         }
         lost = {name: self.with_lost(getattr(self, name)) for name in rates}
-        return asdict(self) | {"episodes": self.episodes} | rates | {"with_lost": lost}
+        time_share = None if self.time_share is None else self.time_share.to_json()
+        return (
+            asdict(self)
+            | {"episodes": self.episodes}
+            | rates
+            | {"with_lost": lost, "time_share": time_share}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,13 +354,8 @@ def group_of(name: tuple[str, str, str], cases: Sequence[CaseResults]) -> Group:
         env_step_ms=median(result.env_step_ms for result in finished),
         policy_ms=median(result.policy_ms for result in finished),
         policy_p95_ms=median(result.policy_p95_ms for result in finished),
+        time_share=time_share_of(finished),
     )
-
-
-def median(values: Iterable[float | None]) -> float | None:
-    """Return the median of the values that are not None; None if all are."""
-    known_values = [value for value in values if value is not None]
-    return float(np.median(known_values)) if known_values else None
 
 
 def _share(seconds: Sequence[float | None], total_s: float) -> float | None:

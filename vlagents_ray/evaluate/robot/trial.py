@@ -285,8 +285,9 @@ def play(
                 # behaviour is its result.
                 fit=fit_of(player, robot, trained=Trained()),
                 reset_options={**case.policy_options, "env": case.env, "seed": trial.job.key.seed},
+                report=report,
             )
-            report = run_loop(
+            run_loop(
                 robot,
                 player,
                 hz=settings.hz,
@@ -302,23 +303,13 @@ def play(
         except PolicyFailed as error:
             failed = error
 
-        # Failures of infrastructure do not count as failures of the policy.
-        for bark in report.barks:
-            if bark == _STOPPED:
-                continue
-            if bark.startswith("server"):
-                raise PolicyUnavailable(f"the policy's server was silent: {bark}")
-            raise EnvFailed(f"robot: the control loop was blocked: {bark}")
-        if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
-            raise PolicyUnavailable(
-                f"the policy's server could not be reached: {report.reasons['lost']}"
-            )
-
+        if failed is None:
+            _require_infrastructure(report)
         if report.done:
             stats.ending = "policy_done"
         else:
             stats.ending = "terminated" if stopped else "truncated"
-        stats.ticks_held = report.safe_ticks
+        stats.timeliness = report.timeliness
         result = replace(stats.result(transport_of(agent), failed), env_seconds=None)
 
         # The text does not contain whether the policy considered the task finished, as only some
@@ -328,6 +319,20 @@ def play(
         else:
             ending = _STOPPED if stopped else "the trial is over"
         return PlayedTrial(result, dict(getattr(agent, "metadata", {})), ending)
+
+
+def _require_infrastructure(report: LoopReport) -> None:
+    """Raise an error if infrastructure failed, which does not count as a failure of the policy."""
+    for bark in report.barks:
+        if bark == _STOPPED:
+            continue
+        if bark.startswith("server"):
+            raise PolicyUnavailable(f"the policy's server was silent: {bark}")
+        raise EnvFailed(f"robot: the control loop was blocked: {bark}")
+    if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
+        raise PolicyUnavailable(
+            f"the policy's server could not be reached: {report.reasons['lost']}"
+        )
 
 
 def rehearse(

@@ -73,7 +73,8 @@ function showCases(said) {
 function cellOf(result) {
   if (!result) return element("td", { className: "case" }, "–");
   const known = result.rate !== null;
-  const counts = `${result.done} of ${result.planned} episodes${result.stopped ? ", certain enough" : ""}`;
+  const inTime = result.share_in_time === null ? "" : `, ${(100 * result.share_in_time).toFixed(1)}\u00a0% of ticks in time`;
+  const counts = `${result.done} of ${result.planned} episodes${result.stopped ? ", certain enough" : ""}${inTime}`;
   return element("td", { className: "case" }, element("b", {}, known ? percent(result.rate) : "–"),
     element("span", { className: "note" }, known ? ` ${interval(result)}` : ""), intervalBar(known ? result : null),
     element("progress", { max: result.planned || 1, value: result.planned ? result.done : 1, ariaLabel: counts }),
