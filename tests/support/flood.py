@@ -1012,6 +1012,11 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
                     send(message, where, key_of(way), end)
             time.sleep(0.001)
 
+    if way in HTTP and way != OWN_HTTP:
+        # An attacker has a machine of its own. Its threads would take the turns of HAProxy, the
+        # server and the robot, through all of which a request goes: p50 3 -> 15 ms on two cores,
+        # of which this leaves 4.7 -> 5.1 ms, while the flood takes as much of the cores as before.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     threads = [threading.Thread(target=flood, daemon=True) for _ in range(connections)]
     for thread in threads:
         thread.start()
