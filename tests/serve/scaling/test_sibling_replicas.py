@@ -12,7 +12,7 @@ from ray import serve
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 
 from vlagents_ray.errors import InvalidWeights
-from vlagents_ray.serve.scaling import sibling_replicas
+from vlagents_ray.serve.scaling import session_migration, sibling_replicas
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.sibling_replicas import (
@@ -70,6 +70,27 @@ def test_a_part_of_another_replica_has_its_own_time_limit(monkeypatch: pytest.Mo
     assert isinstance(late, PeerUnreachable)
     assert "no answer within 0.1 s" in str(late)
     assert cluster.asked == [("a", "counter"), ("late", "counter")]
+
+
+def test_a_replica_that_still_loads_delays_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the one that replaces a killed replica does: it answers nothing, and has no session."""
+    Cluster(monkeypatch, loading="no answer")
+
+    async def never(actor: str) -> bool:
+        await asyncio.sleep(3600)
+        return True
+
+    monkeypatch.setattr(sibling_replicas.private, "replica_is_initialized", never)
+    assert sibling_replicas._INITIALIZED_S < session_migration._SEARCH_S
+    monkeypatch.setattr(session_migration, "_SEARCH_S", 3600.0)
+    monkeypatch.setattr(sibling_replicas, "_INITIALIZED_S", 0.01)
+
+    async def search() -> None:
+        [loading] = await SiblingReplicas().others()
+        with pytest.raises(PeerUnreachable):
+            await loading.ask(HeldSessions.versions_of, ["session"])
+
+    asyncio.run(search())
 
 
 class Cluster:

@@ -30,7 +30,9 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 _NAMESPACE = "serve"
-_ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
+# Time limit for a replica to answer that it is initialized. One that still loads does not answer,
+# and has no session. After a kill, every search waits for the replica that replaces the killed one.
+_INITIALIZED_S = 0.3
 _TRANSFER_S = 600.0  # time limit for the answer to a request that contains weights
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time without further requests for a silent replica's load
@@ -124,7 +126,7 @@ class SiblingReplica(Peer):
                 # Serve answers a request to a replica that is not initialized with a traceback in
                 # its log.
                 if not await asyncio.wait_for(
-                    private.replica_is_initialized(self._actor), _ANSWER_S
+                    private.replica_is_initialized(self._actor), _INITIALIZED_S
                 ):
                     raise PeerUnreachable("it is not initialized yet")
                 self._initialized.add(self.name)
