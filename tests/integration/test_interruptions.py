@@ -1,6 +1,6 @@
 """The longest time without an action when a replica is killed or frozen, or HAProxy is killed.
 
-Robots act at 20 Hz over each transport, with time limits far above these times: nothing here is
+Robots act at 20 Hz over each transport, at a replica's own port and through the proxy, with time limits far above these times: nothing here is
 recovered because a call has timed out.
 """
 
@@ -23,7 +23,10 @@ from eval_fakes import wait_for
 
 from tests.integration.conftest import serving, states
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client import connection
+from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.client.transports.websocket import WebSocketTransport
 from vlagents_ray.serve.launch.server import Server
 
 REPLICAS, ROBOTS = 2, 6
@@ -32,19 +35,48 @@ FROZEN_S = 12.0  # time after which a frozen replica continues
 FRAME = np.zeros((8, 8, 3), np.uint8)
 FAULTS = ("kill", "freeze", "kill of HAProxy")
 
-# The longest time without an action, s: about twice what two shared cores need. Clients find out in
-# 2.5 s that a replica is frozen. HAProxy is back about 3 s after its end.
-BOUNDS_S: dict[tuple[TransportName, str], float] = {
-    ("shm", "kill"): 4.0,
-    ("websocket", "kill"): 4.0,
-    ("http", "kill"): 4.0,
-    ("shm", "freeze"): 6.0,
-    ("websocket", "freeze"): 6.0,
-    ("http", "freeze"): 6.0,
-    ("shm", "kill of HAProxy"): 2.0,
-    ("websocket", "kill of HAProxy"): 2.0,
-    ("http", "kill of HAProxy"): 12.0,
+# Ways to a replica: the name of the transport, and whether its connection ends at the proxy, as that
+# of a client behind a firewall, or of one with TLS.
+WAYS: dict[str, tuple[TransportName, bool]] = {
+    "shm": ("shm", False),
+    "websocket": ("websocket", False),
+    "http": ("http", False),
+    "handle": ("handle", False),
+    "websocket through the proxy": ("websocket", True),
+    "http through the proxy": ("http", True),
 }
+
+# The longest time without an action, s: about twice what two shared cores need. HAProxy is back
+# about 3 s after its end.
+NEEDS_HAPROXY = ("http", "websocket through the proxy", "http through the proxy")
+PING_AFTER_S = 0.5
+
+
+def bound_s(way: str, fault: str) -> float:
+    """Return the longest time without an action after a fault, which is the same for all ways that
+    depend on the process that it hits.
+    """
+    if fault == "freeze":  # the clients have left by then
+        return 2.4 * (PING_AFTER_S + connection.FROZEN_S)
+    if fault == "kill":
+        return 4.0
+    return 12.0 if way in NEEDS_HAPROXY else 2.0
+
+
+@pytest.fixture
+def reach(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], TransportName]:
+    """A function that returns the transport of a way, and closes the replicas' own ports to this
+    process if the way goes through the proxy.
+    """
+
+    def transport_of(way: str) -> TransportName:
+        transport, is_proxied = WAYS[way]
+        if is_proxied:
+            monkeypatch.setattr(HttpTransport, "_set_direct", lambda *_: None)
+            monkeypatch.setattr(WebSocketTransport, "_direct", lambda *_: None)
+        return transport
+
+    return transport_of
 
 
 @dataclass
@@ -117,13 +149,18 @@ def haproxy_processes() -> list[int]:
     return found
 
 
+def url_of(server: Server, transport: TransportName) -> str:
+    """Return the address for clients of a transport."""
+    return "serve://Ledger" if transport == "handle" else server.url
+
+
 @contextmanager
 def acting(server: Server, transport: TransportName) -> Iterator[list[Robot]]:
     """Robots that act, some at each replica."""
     names = [f"{transport}-{time.monotonic_ns()}-{number}" for number in range(ROBOTS)]
+    url = url_of(server, transport)
     robots = [
-        Robot(RemoteAgent(server.url, transport=transport, timeout_s=TIMEOUT_S), name)
-        for name in names
+        Robot(RemoteAgent(url, transport=transport, timeout_s=TIMEOUT_S), name) for name in names
     ]
 
     def are_spread() -> bool:
@@ -162,10 +199,15 @@ def have_acted_since(robots: list[Robot], moment: float) -> Callable[[], bool]:
 @pytest.mark.slow
 @pytest.mark.integration
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("transport", ["shm", "websocket", "http"])
+@pytest.mark.parametrize("way", WAYS)
 def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
-    server: Server, ledger: Path, transport: TransportName, fault: str
+    server: Server,
+    ledger: Path,
+    reach: Callable[[str], TransportName],
+    way: str,
+    fault: str,
 ) -> None:
+    transport = reach(way)
     wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
     with acting(server, transport) as robots:
         hit = robots[0].pid
@@ -187,7 +229,7 @@ def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
                 os.kill(hit, signal.SIGCONT)
         time.sleep(2.0)  # the acts of a frozen replica are late now
 
-    print(f"{transport}, {fault}: {len(left)} robots hit, no action for {gap_s:.1f} s")
+    print(f"{way}, {fault}: {len(left)} robots hit, no action for {gap_s:.1f} s")
     assert not [robot.error for robot in robots if robot.error is not None]
     for robot in robots:
         acts = executed(ledger, robot.name)
@@ -197,19 +239,21 @@ def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
         for process in {pid for _, pid, _ in acts}:
             numbers = [number for number, pid, _ in acts if pid == process]
             assert len(set(numbers)) == len(numbers), f"{robot.name}: doubled"
-    assert gap_s < BOUNDS_S[transport, fault]
+    assert gap_s < bound_s(way, fault)
 
 
 @pytest.mark.slow
 @pytest.mark.integration
-@pytest.mark.parametrize("transport", ["shm", "websocket", "http"])
+@pytest.mark.parametrize("way", WAYS)
 def test_a_session_stays_at_a_replica_whose_policy_is_slow(
-    server: Server, transport: TransportName
+    server: Server, reach: Callable[[str], TransportName], way: str
 ) -> None:
     """Its first slow act, after fast ones: something else in its process answers."""
+    transport = reach(way)
     wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
-    with RemoteAgent(server.url, transport=transport, timeout_s=TIMEOUT_S) as agent:
-        robot = Robot(agent, f"slow-{transport}")
+    url = url_of(server, transport)
+    with RemoteAgent(url, transport=transport, timeout_s=TIMEOUT_S) as agent:
+        robot = Robot(agent, f"slow-{way}")
         robot.begin()
         for _ in range(20):
             agent.act(robot.observation(0))

@@ -196,11 +196,13 @@ class Connection:
         self._must_reconnect = self._asked_to_move = False
         self._connected(next_transport.metadata)
 
-    def _on_silence(self, silent_s: float) -> None:
+    def _on_silence(self, silent_s: float, is_proxied: bool) -> None:
         """Look for another replica while the present one does not answer a ping, and leave it when
         another one has answered; called by the transport, see `ReplicaWatch`.
 
-        If there is no other one, the call goes on to wait.
+        If there is no other one, the call goes on to wait. Through a proxy, the next replica cannot
+        be compared with the present one. It has just answered, however, which a frozen one does
+        not.
 
         Raises:
             ReplicaSilent: Another replica is connected.
@@ -213,7 +215,12 @@ class Connection:
             return
 
         next_metadata = self._next.metadata
-        if next_metadata is None or _is_same_replica(self.metadata, next_metadata):
+        is_same = (
+            next_metadata is not None
+            and not is_proxied
+            and _is_same_replica(self.metadata, next_metadata)
+        )
+        if next_metadata is None or is_same:
             self._drop_next()
             self._look_up_at = time.monotonic() + _LOOK_UP_PAUSE_S
             return

@@ -349,6 +349,13 @@ def replica_is_initialized(replica: Any) -> Any:
     return replica.was_initialized.remote()
 
 
+def ping_replica(replica: Any) -> Any:
+    """Call a method of a replica's actor that its process answers while the policy is at work, as
+    Serve's own router does; return the pending answer.
+    """
+    return replica.get_num_ongoing_requests.remote()
+
+
 def replica_request(request_id: str, method: str) -> bytes:
     """Return the header of a call of a replica's method, as Serve's own router sends it to the
     replica's actor.

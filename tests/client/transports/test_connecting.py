@@ -52,7 +52,7 @@ def over_http(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -
 
 
 def through_the_proxy(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    def proxied(url: str, credentials: Credentials, timeout_s: float) -> str:
+    def proxied(url: str, credentials: Credentials, timeout_s: float, watch: object) -> str:
         clock.ask(timeout_s, TimeoutError("timed out"))
         return "connected"
 

@@ -4,6 +4,7 @@ it is not.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ import pytest
 from eval_fakes import wait_for
 from in_flight import kernel_timestamps
 
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports import http
 from vlagents_ray.client.transports.base import CodecChoice, ReplicaSilent, ReplicaWatch, Transport
 from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.shm import ShmTransport
@@ -58,7 +61,7 @@ class Watch(ReplicaWatch):
         self.signs = threading.Event()  # a sign of life since a ping
         self.silent = threading.Event()
 
-    def _note_silence(self, silent_s: float) -> None:
+    def _note_silence(self, silent_s: float, is_proxied: bool) -> None:
         self.pinged = True
         self.silent.set()
         if silent_s > self.limit_s:
@@ -192,6 +195,35 @@ def test_a_replica_that_continues_in_time_is_not_left(replica: Replica, transpor
     assert reply.error is None
     assert Gated.acts == ["delayed"]
     client.close()
+
+
+def test_through_the_proxy_only_the_replica_of_the_call_shows_that_it_is_alive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The proxy gives later pings to another replica when it marks this one as down."""
+    answering = ["a"]
+
+    def exchange(*_: Any) -> tuple[int, str, bytes]:
+        stream = {"port": 9000, "path": f"/v1/stream/{answering[0]}"}
+        return 200, "application/json", json.dumps({"stream": stream}).encode()
+
+    monkeypatch.setattr(http._Link, "exchange", exchange)
+    url = urlsplit("http://127.0.0.1:1")
+    link = '<//127.0.0.1:9000/v1/stream/a/act>; rel="alternate"'
+    answered_by = http._replica_of_link(link, "act")
+
+    probe = http._ProxiedProbe(url, Credentials(""), "session", answered_by)
+    assert probe()
+    answering[0] = "b"
+    assert not probe()
+    answering[0] = "a"
+    assert probe()
+
+    # A call that arrives at another replica than the one before.
+    answering[0] = "b"
+    probe = http._ProxiedProbe(url, Credentials(""), "session", answered_by)
+    assert probe()
+    assert probe()
 
 
 def test_a_local_client_that_floods_pings_is_cut_off(replica: Replica) -> None:

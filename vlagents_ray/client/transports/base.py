@@ -7,6 +7,7 @@ import math
 import os
 import select
 import socket
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol, get_args
@@ -32,6 +33,7 @@ FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is
 # The time without an answer after which a replica is pinged, the shortest time between two pings of
 # a connection, and the time between two checks, s. A server permits one ping each second.
 _PING_AFTER_S, _PING_PERIOD_S, _CHECK_PERIOD_S = 0.5, 1.25, 0.25
+PROBE_S = 5.0  # time limit of a ping that has a thread
 
 
 def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
@@ -65,14 +67,16 @@ class ReplicaWatch:
     long batch or a checkpoint is loaded, but nothing does while the process is frozen.
     """
 
-    def __init__(self, on_silence: Callable[[float], None] | None = None) -> None:
+    def __init__(self, on_silence: Callable[[float, bool], None] | None = None) -> None:
         """Watch a replica.
 
         Args:
             on_silence: Called several times a second while the replica does not answer a ping, with
-                the time since the first such ping, s. It raises `ReplicaSilent` to end the call. If
-                None, the replica is not pinged.
+                the time since the first such ping, s, and `is_proxied`. It raises `ReplicaSilent`
+                to end the call. If None, the replica is not pinged.
         """
+        # Whether the connection ends at a proxy, so that the metadata may be from another replica.
+        self.is_proxied = False
         self._on_silence = on_silence
         self._check_at = float("inf")  # time of the next check, time.monotonic()
         self._pinged_at = float("-inf")  # time of the latest ping
@@ -106,19 +110,48 @@ class ReplicaWatch:
             TimeoutError: The deadline has passed.
             ReplicaSilent: The replica is given up.
         """
-        while True:
-            try:
-                wait(connection, event, min(deadline, self._check_at))
-            except TimeoutError:
-                if time.monotonic() >= deadline:
-                    raise
-            else:
-                return
-            self._check(connection, event, ping)
+        self.wait_until(lambda limit_s: _is_ready(connection, event, limit_s), deadline, ping)
 
-    def _check(
-        self, connection: socket.socket, event: int, ping: Callable[[], None] | None
+    def wait_until(
+        self,
+        is_ready: Callable[[float], bool],
+        deadline: float,
+        ping: Callable[[], None] | None = None,
     ) -> None:
+        """Wait as `wait` does, but for something other than a socket.
+
+        Args:
+            is_ready: Waits for at most the time that it is given, s, and returns whether the answer
+                is there. It may be called again after it has returned True.
+            deadline: The time limit, time.monotonic().
+            ping: Sends a ping, without waiting.
+
+        Raises:
+            TimeoutError: The deadline has passed.
+            ReplicaSilent: The replica is given up.
+        """
+        while True:
+            left_s = min(deadline, self._check_at) - time.monotonic()
+            if left_s > 0 and is_ready(left_s):
+                return
+            if time.monotonic() >= deadline:
+                raise TimeoutError
+            self._check(is_ready, ping)
+
+    def probe(self, is_alive: Callable[[], bool]) -> None:
+        """Ping on another thread, by a call that waits for the answer of the replica.
+
+        Args:
+            is_alive: Returns whether the replica has answered, after `PROBE_S` at the latest.
+        """
+
+        def ping() -> None:
+            if is_alive():
+                self.received()
+
+        threading.Thread(target=ping, name="ping", daemon=True).start()
+
+    def _check(self, is_ready: Callable[[float], bool], ping: Callable[[], None] | None) -> None:
         now = time.monotonic()
         self._check_at = now + _CHECK_PERIOD_S
         if now - self._pinged_at >= _PING_PERIOD_S:
@@ -129,9 +162,9 @@ class ReplicaWatch:
                 self._silent_since = now
 
         # This process may have been paused itself, with the answer waiting in the socket.
-        is_silent = self._silent_since is not None and not _is_ready(connection, event)
+        is_silent = self._silent_since is not None and not is_ready(0.0)
         if is_silent and self._silent_since is not None and self._on_silence is not None:
-            self._on_silence(now - self._silent_since)
+            self._on_silence(now - self._silent_since, self.is_proxied)
 
 
 class Transport(Protocol):
@@ -224,11 +257,11 @@ def wait(connection: socket.socket, event: int, deadline: float) -> None:
         raise TimeoutError
 
 
-def _is_ready(connection: socket.socket, event: int) -> bool:
-    """Return whether the socket is ready for `event` now."""
+def _is_ready(connection: socket.socket, event: int, limit_s: float) -> bool:
+    """Return whether the socket is ready for `event`, or becomes ready within a time limit."""
     poller = select.poll()
     poller.register(connection, event)
-    return bool(poller.poll(0))
+    return bool(poller.poll(math.ceil(limit_s * 1e3)))
 
 
 def await_answer(
@@ -237,7 +270,7 @@ def await_answer(
     spin_until: float,
     deadline: float,
     watch: ReplicaWatch,
-    ping: Callable[[], None],
+    ping: Callable[[], None] | None,
 ) -> None:
     """Wait for `connection`, which `poller` polls, as `watch.wait` does, but sleep only after
     `spin_until`, s of `perf_counter`.

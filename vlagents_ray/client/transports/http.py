@@ -13,10 +13,10 @@ import json
 import select
 import socket
 import ssl
-import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -31,6 +31,7 @@ from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.client.transports.base import (
     DIRECT_S,
     FAST_S,
+    PROBE_S,
     SPIN_S,
     CodecChoice,
     ConnectReport,
@@ -67,7 +68,6 @@ from vlagents_ray.protocol.messages import (
     read_address,
 )
 
-_PROBE_S = 5.0  # time limit of a ping
 _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
 
 
@@ -91,15 +91,16 @@ class HttpTransport:
 
         Args:
             machine: The least loaded replica on this machine is preferred; see `MACHINE_HEADER`.
-            watch: Finds out whether a replica is frozen that is called at its own port. Through the
-                server's port, another replica might answer a ping.
+            watch: Finds out whether the replica is frozen, at its own port and behind the proxy.
         """
         self._watch = watch
         self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
-        self._link = _Link(self._url, credentials)
+        self._link = _Link(self._url, credentials, watch)
+        # The replica behind the proxy that answered the last request; "" before the first answer.
+        self._answered_by = ""
         self._direct: _Link | None = None  # to the own port of the replica that answered
         self._unreachable = False  # whether this client cannot reach the replicas' own ports
         self._has_answered = False  # whether an own port has answered
@@ -144,6 +145,7 @@ class HttpTransport:
         if self._machine:
             headers[MACHINE_HEADER] = self._machine
 
+        self._answered_by = ""
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
             raise ConfigError(
@@ -188,7 +190,12 @@ class HttpTransport:
         op = requests[0].op
         answer = self._call_direct(op, frame, headers, deadline)
         if answer is None:
-            answer = self._link.exchange("POST", f"/v1/{op}", frame, headers, left_s(deadline))
+            if self._watch is not None:
+                self._watch.is_proxied = True
+            probe = _ProxiedProbe(self._url, self._credentials, self._session, self._answered_by)
+            path = f"/v1/{op}"
+            answer = self._link.exchange("POST", path, frame, headers, left_s(deadline), probe)
+            self._answered_by = _replica_of_link(self._link.alternate, op)
         status, kind, body = answer
         if status == 200:
             return decode_replies(body)
@@ -226,7 +233,10 @@ class HttpTransport:
             return None
 
         try:
-            answer = link.exchange("POST", f"/{op}", frame, headers, left_s(deadline))
+            path = f"/{op}"
+            if self._watch is not None:
+                self._watch.is_proxied = False
+            answer = link.exchange("POST", path, frame, headers, left_s(deadline), link.is_alive)
         except ConnectionLost:
             # The port may belong to a server of another protocol.
             self._unreachable = not self._has_answered
@@ -254,13 +264,25 @@ class _Link:
         self._watch = watch or ReplicaWatch()
         self._credentials = credentials
         self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+        self.alternate = ""  # the header `Link` of the last answer
         self._poller = select.poll()  # polls the connection
         self._answers_fast = True  # whether the last answer was immediate
 
     def exchange(
-        self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
+        self,
+        method: str,
+        path: str,
+        body: bytes | None,
+        headers: dict[str, str],
+        timeout_s: float,
+        probe: Callable[[], bool] | None = None,
     ) -> tuple[int, str, bytes]:
         """Send a request; return the status, content type and body of the answer.
+
+        Args:
+            probe: Pings the replica, and returns whether it is alive. It is called on other
+                threads, as one connection carries one request at a time. If None, the replica is
+                not watched.
 
         Raises:
             NoReplica: Nothing was sent, as the address cannot be reached.
@@ -274,7 +296,7 @@ class _Link:
             target = self.url.path.rstrip("/") + path
             with deadline_socket.sending_at_once():
                 connection.request(method, target, body, headers | self._credentials.headers)
-            self._await_answer(connection.sock, begun + timeout_s)
+            self._await_answer(connection.sock, begun + timeout_s, probe)
             answer = connection.getresponse()
 
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
@@ -284,6 +306,7 @@ class _Link:
                     f"{self.url.geturl()}: expected the answer of a policy server, got more than "
                     f"{DEFAULT_LIMITS.body_bytes} bytes; check the URL"
                 )
+            self.alternate = answer.headers.get("link", "")
             return answer.status, answer.headers.get("content-type", ""), content
         except ReplicaSilent:
             self.close()
@@ -337,29 +360,72 @@ class _Link:
             connection.close()
             self._connection = None
 
-    def _await_answer(self, sock: socket.socket, deadline: float) -> None:
+    def is_alive(self) -> bool:
+        """Send a request over another connection. Whatever its answer, the process at the address
+        is alive.
+        """
+        link = _Link(self.url, self._credentials)
+        with contextlib.closing(link), contextlib.suppress(VLAgentsError):
+            link.exchange("GET", "/ping", None, {}, PROBE_S)
+            return True
+        return False
+
+    def _await_answer(
+        self, sock: socket.socket, deadline: float, probe: Callable[[], bool] | None
+    ) -> None:
         """Wait for the first byte of an answer, and poll for it at first if the last one was
         immediate.
         """
         begun = time.perf_counter()
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
-        self._watch.begin()
-        await_answer(self._poller, sock, spin_until, deadline, self._watch, self._ping)
-        self._watch.received()
+        watch = ReplicaWatch() if probe is None else self._watch
+        watch.begin()
+        ping = None if probe is None else partial(watch.probe, probe)
+        await_answer(self._poller, sock, spin_until, deadline, watch, ping)
+        watch.received()
         self._answers_fast = time.perf_counter() - begun < FAST_S
 
-    def _ping(self) -> None:
-        """Send a request over another connection, on another thread, since one connection carries
-        one request at a time. Whatever its answer, the process at the address is alive.
-        """
-        threading.Thread(target=self._probe, name="ping", daemon=True).start()
 
-    def _probe(self) -> None:
-        probe = http.client.HTTPConnection(self.url.hostname or "", self.url.port, timeout=_PROBE_S)
-        with contextlib.closing(probe), contextlib.suppress(OSError, http.client.HTTPException):
-            probe.request("GET", f"{self.url.path}/ping", headers=self._credentials.headers)
-            probe.getresponse()
-            self._watch.received()
+class _ProxiedProbe:
+    """Pings the replica of one call through the proxy, which may give a ping to another replica.
+
+    The header of the session leads a ping to the replica that has the request, until the proxy
+    marks that one as down. An answer is therefore a sign of life only if it comes from the replica
+    that answered the call before, or from the one that answered the first ping of this call.
+    """
+
+    def __init__(
+        self, url: SplitResult, credentials: Credentials, session: str, answered_by: str
+    ) -> None:
+        self._url, self._credentials = url, credentials
+        self._headers = {SESSION_HEADER: session}
+        self._replicas = {answered_by} - {""}
+        self._is_first = True
+
+    def __call__(self) -> bool:
+        """Return whether the replica of the call has answered a ping."""
+        is_first, self._is_first = self._is_first, False
+        link = _Link(self._url, self._credentials)
+        with contextlib.closing(link), contextlib.suppress(VLAgentsError):
+            status, _, body = link.exchange("GET", "/v1/metadata", None, self._headers, PROBE_S)
+            metadata = _json(body)
+            if status != 200 or not isinstance(metadata, dict):
+                return False
+
+            address = read_address(StreamAddress, metadata.get("stream"))
+            if address is None:  # the replicas cannot be told apart, so that none is left
+                return True
+            replica = f"{address.port}{address.path}"
+            if is_first:
+                self._replicas.add(replica)
+            return replica in self._replicas
+        return False
+
+
+def _replica_of_link(header: str, op: str) -> str:
+    """Return the port and path of the replica that sent this header `Link`; "" if there is none."""
+    target = header.partition(">")[0]
+    return target.rpartition(":")[2].removesuffix(f"/{op}")
 
 
 def _is_executed(answer: tuple[int, str, bytes]) -> bool:

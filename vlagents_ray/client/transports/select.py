@@ -68,7 +68,7 @@ class AutoTransport:
         handle: HandleTransport | None = None
         metadata_source: HandleTransport | HttpTransport
         if parts.scheme == "serve":
-            handle = HandleTransport(parts.netloc, must_be_near=self._only_shm)
+            handle = HandleTransport(parts.netloc, self._watch, must_be_near=self._only_shm)
             metadata_source = handle
         else:
             metadata_source = HttpTransport(self._url, self._codec, self._credentials, boot_id())
@@ -175,7 +175,8 @@ def select_transport(
     credentials.use_at(url)
     if transport in ("handle", "plasma"):
         app = urlsplit(url).netloc
-        return HandleTransport(app) if transport == "handle" else PlasmaTransport(app, watch)
+        kind = HandleTransport if transport == "handle" else PlasmaTransport
+        return kind(app, watch)
     if transport in ("http", "websocket"):
         if transport == "http":
             return HttpTransport(url, codec, credentials, watch=watch)

@@ -8,14 +8,18 @@ server's side of the channel.
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, ClassVar, Protocol
 
 from vlagents_ray.client.transports.base import (
+    PROBE_S,
     ConnectReport,
+    ReplicaSilent,
     ReplicaWatch,
     connection_lost,
     first_timeout_s,
@@ -81,16 +85,20 @@ class HandleTransport:
     name = "handle"
     holds_sessions = False
 
-    def __init__(self, app: str, *, must_be_near: bool = False) -> None:
+    def __init__(
+        self, app: str, watch: ReplicaWatch | None = None, *, must_be_near: bool = False
+    ) -> None:
         """Set the application.
 
         Args:
             app: The name of the application.
+            watch: Finds out whether the replica is frozen.
             must_be_near: Whether to accept only replicas on this machine, even if others have far
                 less load.
         """
         self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
+        self._watch = watch or ReplicaWatch()
         self._replica: Any = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -163,15 +171,18 @@ class HandleTransport:
             self._replica, ClientApi.call, self._session, frame, request_id=requests[0].request_id
         )
         try:
-            return decode_replies(ray.get(pending, timeout=timeout_s))
-        except ray.exceptions.GetTimeoutError as error:
-            ray.cancel(pending)
-            raise no_answer(f"serve://{self._app}", timeout_s) from error
-        except ray.exceptions.RayTaskError as error:
+            return decode_replies(self._answer(pending, time.monotonic() + timeout_s))
+        except ray.exceptions.RayTaskError as error:  # may be a TimeoutError of the replica
             # It is unknown whether the replica executed the request.
             raise ConnectionLost(
                 f"serve://{self._app}: the replica failed: {error.cause}; reset again"
             ) from error
+        except ReplicaSilent:
+            ray.cancel(pending)
+            raise
+        except TimeoutError as error:
+            ray.cancel(pending)
+            raise no_answer(f"serve://{self._app}", timeout_s) from error
         except ray.exceptions.RayError as error:
             # The replica is gone, or its node with the frame or the answer.
             raise self._lost(error) from error
@@ -203,6 +214,31 @@ class HandleTransport:
     def close(self) -> None:
         """Release the chosen replica."""
         self._replica = None
+
+    def _answer(self, pending: Any, deadline: float) -> bytes:
+        """Return the answer to a call of the replica, which is pinged meanwhile."""
+        import ray
+
+        replica = self._replica
+
+        def is_alive() -> bool:
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.get(private.ping_replica(replica), timeout=PROBE_S)
+                return True
+            return False
+
+        answers: list[bytes] = []
+
+        def is_ready(limit_s: float) -> bool:
+            with contextlib.suppress(ray.exceptions.GetTimeoutError):
+                if not answers:
+                    answers.append(ray.get(pending, timeout=limit_s))
+            return bool(answers)
+
+        self._watch.begin()
+        self._watch.wait_until(is_ready, deadline, partial(self._watch.probe, is_alive))
+        self._watch.received()
+        return answers[0]
 
     def _lost(self, error: Exception) -> ConnectionLost:
         return connection_lost(

@@ -15,6 +15,7 @@ import ssl
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -36,6 +37,7 @@ from vlagents_ray.client.limited_websocket import LimitedWebSocket
 from vlagents_ray.client.transports.base import (
     DIRECT_S,
     FAST_S,
+    PROBE_S,
     SPIN_S,
     CodecChoice,
     ReplicaSilent,
@@ -84,10 +86,22 @@ _NO_MASK = bytes(4)
 
 
 class ProxiedSocket:
-    """A connection through the proxy; a thread answers its pings."""
+    """A connection through the proxy; a thread answers its pings, and reads the answers to those of
+    this client, which only the replica at the other end sends.
+    """
 
-    def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
+    def __init__(
+        self,
+        url: str,
+        credentials: Credentials,
+        timeout_s: float,
+        watch: ReplicaWatch | None = None,
+    ) -> None:
         """Connect; raises the errors of `websockets`."""
+        self._watch = watch or ReplicaWatch()
+        self._watch.is_proxied = True
+        self._messages: list[bytes] = []
+        self._silent = False  # whether the replica was given up
         # In websockets 17.1, `connect` must be used as a context manager.
         self._open = contextlib.ExitStack()
         connection = self._open.enter_context(
@@ -113,17 +127,50 @@ class ProxiedSocket:
         self.send(b"".join(pieces), timeout_s)
 
     def recv(self, timeout_s: float) -> bytes:
-        """Return the next message as bytes, even if it is text."""
-        return self._websocket.connection.recv(timeout=timeout_s, decode=False)
+        """Return the next message as bytes, even if it is text.
+
+        Raises:
+            TimeoutError: No message arrived in time.
+            ReplicaSilent: The replica is given up.
+        """
+        self._watch.begin()
+        ping = partial(self._watch.probe, self._is_alive)
+        try:
+            self._watch.wait_until(self._is_received, time.monotonic() + timeout_s, ping)
+        except ReplicaSilent:
+            self._silent = True
+            raise
+        self._watch.received()
+        return self._messages.pop(0)
 
     def close(self) -> None:
-        """Close the connection, within the time limit of the closing handshake."""
+        """Close the connection, within the time limit of the closing handshake, and without one to
+        a replica that was given up.
+        """
+        if self._silent:
+            self._websocket.shut_down()
         self._websocket.close(2 * _CLOSE_S)
         self._open.close()
 
+    def _is_received(self, limit_s: float) -> bool:
+        """Return whether a message is there, or arrives within a time limit."""
+        if not self._messages:
+            with contextlib.suppress(TimeoutError):
+                message = self._websocket.connection.recv(timeout=limit_s, decode=False)
+                self._messages.append(message)
+        return bool(self._messages)
 
-def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:
-    """Connect to a path of a server's port.
+    def _is_alive(self) -> bool:
+        """Return whether the replica answers a ping."""
+        with contextlib.suppress(ConnectionClosed, OSError):
+            return self._websocket.connection.ping().wait(PROBE_S)
+        return False
+
+
+def open_websocket(
+    url: str, credentials: Credentials, timeout_s: float, watch: ReplicaWatch | None = None
+) -> ProxiedSocket:
+    """Connect to a path of a server's port. The `watch` finds out whether its replica is frozen.
 
     Raises:
         NoReplica: The server cannot be reached, or has no replica yet.
@@ -131,7 +178,7 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
         VLAgentsError: The server rejects the key.
     """
     try:
-        return ProxiedSocket(url, credentials, timeout_s)
+        return ProxiedSocket(url, credentials, timeout_s, watch)
     except ssl.SSLError as error:
         raise tls_failure(url, error) from error
     except InvalidStatus as error:
@@ -205,6 +252,7 @@ class Stream:
                 if self._protocol.handshake_exc is not None:
                     raise self._protocol.handshake_exc
             self._received.attach(self._protocol)
+            self._watch.is_proxied = False
             self._watch.received()
         except BaseException:
             self._socket.close()
@@ -445,7 +493,7 @@ class WebSocketTransport:
         while True:
             limit_s = max(0.1, min(attempt_s, deadline - time.monotonic()))
             try:
-                return open_websocket(self._url, self._credentials, limit_s)
+                return open_websocket(self._url, self._credentials, limit_s, self._watch)
             except (PolicyUnavailable, UnknownApp) as error:
                 cause = error.__cause__
                 is_transient = (
