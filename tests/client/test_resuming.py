@@ -470,7 +470,7 @@ def test_one_session_that_fails_leaves_its_neighbours_alone(
 def test_a_replica_that_has_fallen_silent_is_left(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    monkeypatch.setattr(session_migration, "_SEARCH_S", 0.2)
+    monkeypatch.setattr(session_migration, "_ANSWER_S", 0.2)
     served = replicas(2)
     call = InProcess.call
 

@@ -42,13 +42,13 @@ WAYS: dict[str, tuple[TransportName, bool]] = {
     "websocket": ("websocket", False),
     "http": ("http", False),
     "handle": ("handle", False),
-    "websocket through the proxy": ("websocket", True),
-    "http through the proxy": ("http", True),
+    "websocket-proxied": ("websocket", True),
+    "http-proxied": ("http", True),
 }
 
 # The longest time without an action, s: about twice what two shared cores need. HAProxy is back
 # about 3 s after its end.
-NEEDS_HAPROXY = ("http", "websocket through the proxy", "http through the proxy")
+NEEDS_HAPROXY = ("http", "websocket-proxied", "http-proxied")
 PING_AFTER_S = 0.5
 
 

@@ -81,8 +81,8 @@ def test_a_replica_that_still_loads_delays_no_search(monkeypatch: pytest.MonkeyP
         return True
 
     monkeypatch.setattr(sibling_replicas.private, "replica_is_initialized", never)
-    assert sibling_replicas._INITIALIZED_S < session_migration._SEARCH_S
-    monkeypatch.setattr(session_migration, "_SEARCH_S", 3600.0)
+    assert sibling_replicas._INITIALIZED_S < session_migration._ANSWER_S
+    monkeypatch.setattr(session_migration, "_ANSWER_S", 3600.0)
     monkeypatch.setattr(sibling_replicas, "_INITIALIZED_S", 0.01)
 
     async def search() -> None:

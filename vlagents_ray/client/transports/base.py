@@ -83,6 +83,11 @@ class ReplicaWatch:
         # Time of the first ping since the last sign of life; None if none is unanswered.
         self._silent_since: float | None = None
 
+    @property
+    def is_silent(self) -> bool:
+        """Whether a ping, perhaps of an earlier call, is unanswered."""
+        return self._silent_since is not None
+
     def begin(self) -> None:
         """Begin to wait for an answer."""
         if self._on_silence is not None:

@@ -193,6 +193,9 @@ class HttpTransport:
             if self._watch is not None:
                 self._watch.is_proxied = True
             probe = _ProxiedProbe(self._url, self._credentials, self._session, self._answered_by)
+            # After a silence, the proxy may give this call to a replica that would search for the
+            # session at the silent one. The client leaves as if that one had this call, too.
+            probe.accepts_first = self._watch is None or not self._watch.is_silent
             path = f"/v1/{op}"
             answer = self._link.exchange("POST", path, frame, headers, left_s(deadline), probe)
             self._answered_by = _replica_of_link(self._link.alternate, op)
@@ -400,11 +403,12 @@ class _ProxiedProbe:
         self._url, self._credentials = url, credentials
         self._headers = {SESSION_HEADER: session}
         self._replicas = {answered_by} - {""}
-        self._is_first = True
+        # Whether the replica that answers the first ping is taken for the one of this call.
+        self.accepts_first = True
 
     def __call__(self) -> bool:
         """Return whether the replica of the call has answered a ping."""
-        is_first, self._is_first = self._is_first, False
+        is_first, self.accepts_first = self.accepts_first, False
         link = _Link(self._url, self._credentials)
         with contextlib.closing(link), contextlib.suppress(VLAgentsError):
             status, _, body = link.exchange("GET", "/v1/metadata", None, self._headers, PROBE_S)

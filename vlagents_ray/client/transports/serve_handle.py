@@ -100,6 +100,7 @@ class HandleTransport:
         self._session = uuid.uuid4().hex
         self._watch = watch or ReplicaWatch()
         self._replica: Any = None
+        self._unanswered: list[Any] = []  # attempts to choose a replica that are still pending
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Choose a replica, or another one if the chosen one has ended; return its metadata."""
@@ -111,7 +112,14 @@ class HandleTransport:
                 "(`vlagents-ray eval` does, with --address), or use http://"
             )
 
-        deadline = time.monotonic() + timeout_s
+        try:
+            return self._attach_until(time.monotonic() + timeout_s, timeout_s)
+        finally:
+            for attaching in self._unanswered:
+                attaching.cancel()
+            self._unanswered.clear()
+
+    def _attach_until(self, deadline: float, timeout_s: float) -> dict[str, Any]:
         attempt_s = first_timeout_s(timeout_s)
         report = ConnectReport(f"serve://{self._app}", timeout_s)
         while True:
@@ -146,7 +154,8 @@ class HandleTransport:
         except RayServeException as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error}") from error
         except TimeoutError as error:
-            attaching.cancel()
+            # While it is pending, Serve counts it as load, and chooses another replica next.
+            self._unanswered.append(attaching)
             raise DeadlineExceeded(
                 f"serve://{self._app}: no replica within {timeout_s:g} s"
             ) from error

@@ -66,11 +66,9 @@ UserOf = Callable[[SessionState, float], Origin | None]
 _Callback = tuple[Callable[[], None], UserOf]
 # Largest number of concurrent searches of a caller. Further requests get `UnknownSession`.
 _PENDING = 4096
-# Time limit for another replica's answer.
+# Time limit for another replica's answer, which a frozen replica does not send. The clients of that
+# one do not wait for it, as they begin their sessions again.
 _ANSWER_S = 3.0
-# The same for a search, which a request waits for, and for which a frozen replica does not answer.
-# It leaves a robot with a `timeout_s` of 2 s the time to resume its session within the same call.
-_SEARCH_S = 1.0
 # Time limit for the remaining answers, once a replica has answered that it holds the session.
 _OTHERS_S = 0.3
 _SILENT_S = 3.0  # time without further requests to a silent replica
@@ -607,7 +605,7 @@ class SessionMigrator:
         """Return that replica's answer; None if it does not answer in time."""
         try:
             return await asyncio.wait_for(
-                peer.ask(HeldSessions.versions_of, session_ids), _SEARCH_S
+                peer.ask(HeldSessions.versions_of, session_ids), _ANSWER_S
             )
         except Exception as error:  # noqa: BLE001 - an error of one replica must not stop the search at the others
             logger.info("another replica does not answer: %r", error)
@@ -621,7 +619,7 @@ class SessionMigrator:
         peer_of = {task: peer for peer, task in answers.items()}
         holders: list[tuple[Version, Peer]] = []
         waiting = set(peer_of)
-        until = self._loop.time() + _SEARCH_S
+        until = self._loop.time() + _ANSWER_S
         while waiting:
             left_s = max(0.0, until - self._loop.time())
             completed, waiting = await asyncio.wait(
