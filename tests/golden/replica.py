@@ -6,7 +6,6 @@ Only this module knows how a replica is built: traces hold the bytes of a rebuil
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import threading
 from collections import deque
@@ -22,6 +21,7 @@ from api_key_replica import PlasmaChannel, plasma_server
 from asgi_server import served
 from dialect_server import METADATA
 from eval_fakes import wait_for
+from in_flight import answer_to_frame
 from in_memory_keys import ChangingKeys
 from in_process_replicas import Replicas
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -333,10 +333,8 @@ class Server:
         return NoKey.OPEN if self._keys is None else partial(self._keys.check, app="app")
 
     def _handle(self, engine: Engine, name: str) -> Line:
-        from vlagents_ray.serve.replica.replica import answer_frame
-
-        call = partial(answer_frame, engine, LIMITS, f"session-{name}")
-        return CallLine(lambda data, _: ("binary", masked(asyncio.run(call(data)))))
+        call = partial(answer_to_frame, engine, LIMITS, f"session-{name}")
+        return CallLine(lambda data, _: ("binary", masked(call(data))))
 
     def _open_gateway(self, name: str) -> None:
         assert self._replicas is not None

@@ -1,7 +1,7 @@
 """The longest time without an action when a replica is killed or frozen, or HAProxy is killed.
 
-Robots act at 20 Hz over each transport, at a replica's own port and through the proxy, with time limits far above these times: nothing here is
-recovered because a call has timed out.
+Robots act at 20 Hz over each transport, at a replica's own port and through the proxy, with time
+limits far above these times: nothing here is recovered because a call has timed out.
 """
 
 from __future__ import annotations

@@ -229,9 +229,9 @@ def test_what_comes_with_a_right_handshake_is_read(keyed: Replica, cut: int) -> 
 
 def test_who_forgets_to_say_whose_requests_they_are_fails(keyed: Replica) -> None:
     with pytest.raises(TypeError, match="caller"):
-        Sender(keyed.engine, "http")  # type: ignore[call-arg]
+        Sender(keyed.engine, "http", has_left=None)  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="expected a Caller"):
-        Sender(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
+        Sender(keyed.engine, "http", caller=None, has_left=None)  # type: ignore[arg-type]
     unguarded = TestClient(
         build_http_app(keyed.engine, dict, MessageLimits()), raise_server_exceptions=False
     )

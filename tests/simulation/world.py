@@ -142,7 +142,9 @@ class Replica:
 
         Returns what the end of its connection does.
         """
-        sender = Sender(self.engine, "http", session_id, connected=False, caller=NoKey.OPEN)
+        sender = Sender(
+            self.engine, "http", session_id, connected=False, caller=NoKey.OPEN, has_left=None
+        )
         if timed:
             task = self.loop.create_task(ask(sender, [request]))
             task.add_done_callback(lambda done: None if done.cancelled() else answer(done.result()))
@@ -159,7 +161,7 @@ class Link:
     def __init__(self, world: World, replica: Replica) -> None:
         self.replica = replica
         self._world = world
-        self._sender = Sender(replica.engine, "websocket", caller=NoKey.OPEN)
+        self._sender = Sender(replica.engine, "websocket", caller=NoKey.OPEN, has_left=None)
         self._latest = 0.0  # time at which the last message arrives
 
     def carry(self, deliver: Callable[[], None]) -> None:

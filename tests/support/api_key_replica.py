@@ -4,7 +4,6 @@ endpoints, as one word.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import http.client
 import itertools
@@ -25,6 +24,7 @@ from asgi_server import served
 from dialect_server import ALL, METADATA, body, libero, seen
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
+from in_flight import answer_to_frame
 from in_memory_keys import ChangingKeys
 from in_process_replicas import InProcess
 from lerobot_messages import AsyncClient, robot_saw
@@ -516,13 +516,9 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
 
 def over_handle(visitor: Visitor, _when: str) -> str:
     """The actor's own entry point, as a Serve handle calls it."""
-    from vlagents_ray.serve.replica.replica import answer_frame
-
     visitor.become()
     frame = encode_requests([Request("reset", Obs(), visitor.mark)])
-    [reply] = decode_replies(
-        asyncio.run(answer_frame(visitor.replica.engine, LIMITS, visitor.name, frame))
-    )
+    [reply] = decode_replies(answer_to_frame(visitor.replica.engine, LIMITS, visitor.name, frame))
     return "done" if reply.error is None else str(reply.error.status)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import queue
 import socket
@@ -13,7 +14,7 @@ from typing import Any
 from eval_fakes import wait_for
 
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import PRIORITIES, Reply, Request
+from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.access.charges import Account
 from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
@@ -134,6 +135,18 @@ def in_order(decoded: Decoded) -> list[Request | Reply]:
 def read_requests(*arguments: Any) -> list[Request | Reply]:
     """What `decode_requests` reads, in order."""
     return in_order(decode_requests(*arguments))
+
+
+def answer_to_frame(engine: Engine, limits: MessageLimits, session_id: str, frame: bytes) -> bytes:
+    """The answer to a frame that arrives as over a Serve handle."""
+    from vlagents_ray.serve.replica.replica import answer_frame
+
+    pause = 0.0
+    while True:
+        answer = asyncio.run(answer_frame(engine, limits, session_id, frame, pause))
+        if isinstance(answer, bytes):
+            return answer
+        pause = answer
 
 
 @contextlib.contextmanager

@@ -125,7 +125,10 @@ class InProcess:
         )
         for number, engine in numbered:
             if number not in self._replicas.dead | self._replicas.frozen and not engine.draining:
-                self._number, self._sender = number, Sender(engine, "in process", caller=NoKey.OPEN)
+                self._number, self._sender = (
+                    number,
+                    Sender(engine, "in process", caller=NoKey.OPEN, has_left=None),
+                )
                 contract = engine.contract
                 return {
                     "protocol": PROTOCOL_VERSION,

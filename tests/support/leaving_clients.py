@@ -5,6 +5,7 @@ half a message, leaves.
 from __future__ import annotations
 
 import abc
+import asyncio
 import contextlib
 import http.client
 import json
@@ -55,6 +56,7 @@ from vlagents_ray.serve.dialects.base import (
     dialect_routes,
 )
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.asgi_websocket import _own_poller
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.own_port import OwnPortServer
@@ -162,6 +164,7 @@ class StoppableServer:
         self.near.open()
         self.engine.start()
         self.shutdown = Shutdown()
+        self._loop: asyncio.AbstractEventLoop | None = None  # of the requests to the server's port
         self.requests = 0  # of HTTP, and WebSockets, that are under way
         routes = dialect_routes(
             DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
@@ -195,6 +198,25 @@ class StoppableServer:
         request = Request(op, Obs({"front": image(brightness)}))
         self.engine.intake.submit([pending(session, request, replies.put)])
         return replies
+
+    def freeze(self) -> threading.Event:
+        """Let no thread read the connections until the event that is returned is set."""
+        continues = threading.Event()
+        self.stack.callback(continues.set)
+        schedules = [self.engine.queue.poller.call_soon, _own_poller().call_soon]
+        if self._loop is not None:
+            schedules.append(self._loop.call_soon_threadsafe)
+
+        for schedule in schedules:
+            frozen = threading.Event()
+
+            def stand_still(frozen: threading.Event = frozen) -> None:
+                frozen.set()
+                continues.wait(4 * BOUND_S)
+
+            schedule(stand_still)
+            assert frozen.wait(BOUND_S)
+        return continues
 
     def is_stopping(self) -> bool:
         """Whether all parts of the server have begun to stop that can begin before the policy's
@@ -245,8 +267,7 @@ class StoppableServer:
         """
 
         async def run(scope: Scope, receive: Receive, send: Send) -> None:
-            import asyncio
-
+            self._loop = asyncio.get_running_loop()
             self.requests += 1
             try:
                 if scope["type"] != "http":

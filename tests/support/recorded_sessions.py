@@ -56,7 +56,7 @@ class Recorded:
     recorder: SessionRecorder
 
     def robot(self) -> Robot:
-        return Robot(Sender(self.engine, "shm", caller=NoKey.OPEN))
+        return Robot(Sender(self.engine, "shm", caller=NoKey.OPEN, has_left=None))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -41,6 +41,15 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.engine.admission import MessageAdmission
 
 logger = logging.getLogger(__name__)
+
+HasLeft: TypeAlias = Callable[[], bool]
+"""Returns whether a client has left: closed its connection, which the thread that reads the
+connection may not know yet. Called on any thread.
+"""
+
+# Wait of a request, s, up to which its client is not asked whether it has left: a client waits
+# longer, and to ask takes about 2 us.
+_CERTAIN_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +139,9 @@ class PendingRequest:
     # Whether the requests of other robots go first, as the replica cannot serve all in time.
     waits_behind_others: bool = False
     origin: Origin = NOWHERE
+    has_left: HasLeft | None = None  # of its client; None if that cannot be asked
+    # Time for which its message waited before it was read, s; `inf` if that is unknown.
+    unread_s: float = 0.0
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
@@ -192,15 +204,22 @@ class PendingRequest:
         return now > self.deadline
 
     def is_useless(self, now: float) -> bool:
-        """Return whether the deadline has passed at `now`, s, or the connection that sent the
-        request has ended.
+        """Return whether the deadline has passed at `now`, s, or the client has left.
+
+        The queue asks this of each request before a batch takes it, whatever its way to the queue:
+        a client leaves a frozen replica, and its session goes on at another one. When the replica
+        continues, it may execute what has waited before it reads that the client has left.
         """
-        return self.origin.ended or now > self.deadline
+        if self.origin.ended or now > self.deadline:
+            return True
+        if self.has_left is None or now - self.arrived + self.unread_s < _CERTAIN_S:
+            return False
+        return self.has_left()
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether the request is over, or the connection that sent it has ended."""
-        return self.over or self.origin.ended
+        """Whether the request is over, or its client has left."""
+        return self.over or self.origin.ended or (self.has_left is not None and self.has_left())
 
 
 Answer: TypeAlias = tuple[PendingRequest, Reply]

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import ray
 from ray import serve
@@ -23,8 +24,9 @@ from ray.exceptions import (
 from vlagents_ray.client.transports import serve_handle
 from vlagents_ray.client.transports.serve_handle import HandleTransport
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable
-from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.messages import Request
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol.frames import encode_replies
+from vlagents_ray.protocol.messages import Reply, Request
 
 REQUEST = Request("act", Obs(gripper=1.0), session="s", request_id="r")
 
@@ -67,6 +69,23 @@ def test_a_replica_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     with pytest.raises(ConnectionLost, match="the replica failed: no such layout"):
         HandleTransport("app").call([REQUEST], 1)
+
+
+def test_a_frame_is_sent_again_with_the_pause_that_it_may_have_waited_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The replica has not executed it, and learns so that its client still waits."""
+    reply = encode_replies([Reply("r", act=Act(np.ones(2, np.float32)))])
+    pauses: list[float] = []
+    answers: Iterator[Any] = iter([7.5, reply, reply])
+    monkeypatch.setattr(ray, "put", lambda _: "frame")
+    monkeypatch.setattr(serve_handle, "call_replica", lambda *args, **_: pauses.append(args[-1]))
+    monkeypatch.setattr(ray, "get", lambda *_, **__: next(answers))
+    transport = HandleTransport("app")
+    for _ in range(2):
+        [answer] = transport.call([REQUEST], 5)
+        assert answer.error is None
+    assert pauses == [0.0, 7.5, 7.5]
 
 
 class TestConnecting:

@@ -327,7 +327,11 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
     token = new_key(file, "arm", rate=3)
     caller = Keys.from_file(file).check(token, "noop")
     engine, requests = Engine(Noop.from_config({})), [Request("reset", Obs())] * 3
-    sender, decoded, admission = Sender(engine, "any", caller=caller), Decoded(requests, {}), None
+    sender, decoded, admission = (
+        Sender(engine, "any", caller=caller, has_left=None),
+        Decoded(requests, {}),
+        None,
+    )
     charge = Account(caller).charge()
     if not compact:
         admission = message_admission(engine, charge, DEFAULT_LIMITS)
@@ -345,7 +349,7 @@ def test_an_engine_accepts_no_message_that_is_not_charged_to_its_sender(file: Pa
     token = new_key(file, "arm")
     caller = Keys.from_file(file).check(token, "noop")
     engine = Engine(Noop.from_config({}))
-    sender = Sender(engine, "any", caller=caller)
+    sender = Sender(engine, "any", caller=caller, has_left=None)
     uncharged, free_of_charge = IncomingMessage("any"), sender.message(free(NoKey.OPEN))
     for message in (uncharged, free_of_charge):
         with pytest.raises(TypeError, match="expected one that is charged to its sender's key"):
@@ -484,7 +488,7 @@ def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
     engine.start()
     answered: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
     send(
-        Sender(engine, "http", "robot-1", connected=False, caller=caller),
+        Sender(engine, "http", "robot-1", connected=False, caller=caller, has_left=None),
         [Request("reset", Obs())],
         answered.put,
     )

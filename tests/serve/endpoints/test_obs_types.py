@@ -288,7 +288,7 @@ def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
     choices = {"arm7": {"dim": 7}, "arm3": {"dim": 3}}
     engine = Engine(Checkpoints(lambda config: Joints(config.get("dim", 0)), {}, choices))
     engine.start()
-    sender = Sender(engine, "websocket", caller=NoKey.OPEN)
+    sender = Sender(engine, "websocket", caller=NoKey.OPEN, has_left=None)
     observations = {n: Obs(state={"joints": np.zeros(n, np.float32)}) for n in (3, 7)}
 
     def ask(*requests: Request) -> list[Reply]:

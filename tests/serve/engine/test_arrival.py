@@ -265,7 +265,7 @@ def test_a_request_that_serve_read_late_after_a_pause_is_not_acted_on() -> None:
     engine.pauses.stop()
     engine.pauses = PauseDetector(lambda: now)
     engine.pauses._checked = now
-    sender = Sender(engine, "http", caller=NoKey.OPEN)
+    sender = Sender(engine, "http", caller=NoKey.OPEN, has_left=None)
 
     def ask(op: str) -> Reply:
         request = Request(op, Obs(), request_id="1", deadline_ms=60_000.0)

@@ -162,7 +162,10 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
 def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
     """It would stop the policy for it, again and again."""
     engine.start()
-    sender, answered = Sender(engine, "shm", caller=NoKey.OPEN), threading.Semaphore(0)
+    sender, answered = (
+        Sender(engine, "shm", caller=NoKey.OPEN, has_left=None),
+        threading.Semaphore(0),
+    )
 
     def ask(op: Op) -> None:
         send(sender, [Request(op, Obs())], lambda _: answered.release())

@@ -63,7 +63,9 @@ class Served:
         self.ask(self.first, "reset")
 
     def sender(self, name: str, *, connected: bool = True) -> Sender:
-        return Sender(self.engine, "test", name, caller=NoKey.OPEN, connected=connected)
+        return Sender(
+            self.engine, "test", name, caller=NoKey.OPEN, has_left=None, connected=connected
+        )
 
     def put(
         self, sender: Sender, op: str, info: dict[str, object] | None = None, **fields: Any
@@ -367,7 +369,7 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     policy = Listed()
     engine = Engine(policy)
     engine.start()
-    sender = Sender(engine, "test", "robot-1", caller=NoKey.OPEN, connected=False)
+    sender = Sender(engine, "test", "robot-1", caller=NoKey.OPEN, has_left=None, connected=False)
     replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
     send(sender, [Request("reset", Obs())], replies.put)
     assert replies.get(timeout=10)[0].error is None

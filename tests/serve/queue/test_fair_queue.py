@@ -84,7 +84,9 @@ def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(
 
     def act(key: str, session: str) -> None:
         caller = keys.keys.check(tokens[key], "app")
-        sender = Sender(engine, "http", "robot-1", caller=caller, connected=connected)
+        sender = Sender(
+            engine, "http", "robot-1", caller=caller, has_left=None, connected=connected
+        )
         send(sender, [Request("act", session=session)], ignore)
 
     for number in range(64):

@@ -79,7 +79,7 @@ def begin(
     **fields: Any,
 ) -> queue.SimpleQueue[Reply]:
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    sender = Sender(served.engines[at], "http", name, connected=False, caller=caller)
+    sender = Sender(served.engines[at], "http", name, connected=False, caller=caller, has_left=None)
     send(sender, [Request(op, Obs(), **fields)], lambda answers: replies.put(answers[0]))
     return replies
 

@@ -76,7 +76,7 @@ def begin(
     obs = Obs(info={"wait": True} if wait and op == "act" else {})
     if wait and op == "reset":
         fields["kwargs"] = {"wait": True}
-    sender = Sender(engine, "http", name, connected=False, caller=NoKey.OPEN)
+    sender = Sender(engine, "http", name, connected=False, caller=NoKey.OPEN, has_left=None)
     send(sender, [Request(op, obs, **fields)], lambda answers: replies.put(answers[0]))
     return replies
 
@@ -520,7 +520,7 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
 
         async def late(timed: bool) -> list[Reply]:
             request = Request("act", Obs(), deadline_ms=50)
-            sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+            sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN, has_left=None)
             if timed:  # as HTTP and the proxied WebSocket
                 return await ask_of(sender, [request])
             # As shared memory and the replica's own port.
@@ -546,7 +546,7 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
     with slow(b, "prepare") as (begun, release):
 
         async def go() -> None:
-            sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+            sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN, has_left=None)
             # Without a deadline.
             asked = asyncio.create_task(ask_of(sender, [Request("act", Obs())]))
             await asyncio.to_thread(begun.get, timeout=20)
@@ -568,7 +568,8 @@ def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(
     async def late(wait: bool) -> Reply:
         request = Request("act", Obs(info={"wait": wait}), deadline_ms=50)
         [reply] = await ask_of(
-            Sender(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN), [request]
+            Sender(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN, has_left=None),
+            [request],
         )
         return reply
 
@@ -597,7 +598,7 @@ def test_made_up_sessions_keep_no_other_from_moving(
     monkeypatch.setattr(a.sessions, "versions_of", counted)
     made_up = [Request("act", Obs(), session=f"none-{i}") for i in range(400)]
     answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-    sender = Sender(b, "websocket", "x", connected=True, caller=NoKey.OPEN)
+    sender = Sender(b, "websocket", "x", connected=True, caller=NoKey.OPEN, has_left=None)
     send(
         sender, [Request("reset", Obs()), *made_up], answers.put
     )  # its own session comes first, without which it may not act

@@ -65,8 +65,18 @@ class ClientApi(Protocol):
     ) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor of the best replica for a client on that node."""
 
-    async def call(self, session_id: str, frame: Any) -> bytes:
-        """Return the replies to a frame of requests."""
+    async def call(self, session_id: str, frame: Any, pause: float) -> bytes | float:
+        """Return the replies to a frame of requests.
+
+        If the replica's process was paused while the frame may have waited, nothing is executed, as
+        the client may have left. The result is then a number of that pause, with which the client
+        sends the frame again.
+
+        Args:
+            session_id: The caller's own session.
+            frame: The requests.
+            pause: The last number that the replica returned; 0.0 before the first one.
+        """
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a plasma channel for frames of `length` bytes; return its id and its capacity,
@@ -100,6 +110,7 @@ class HandleTransport:
         self._session = uuid.uuid4().hex
         self._watch = watch or ReplicaWatch()
         self._replica: Any = None
+        self._pause = 0.0  # of the replica, see `ClientApi.call`
         self._unanswered: list[Any] = []  # attempts to choose a replica that are still pending
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -149,6 +160,7 @@ class HandleTransport:
             attaching = handle.attach.remote(this_node() or "", boot_id(), self._must_be_near)
             metadata: dict[str, Any]
             metadata, self._replica = attaching.result(timeout_s=timeout_s)
+            self._pause = 0.0
         except ray.exceptions.RayTaskError as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except RayServeException as error:
@@ -164,8 +176,12 @@ class HandleTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Make one actor call; the frame is in plasma until the reply."""
+        """Make an actor call, and a second one if the first may have waited in a pause of the
+        replica; the frame is in plasma until the reply.
+        """
         import ray
+
+        deadline = time.monotonic() + timeout_s
 
         # Ray stores a plain buffer in plasma, separately from its pickle. The pickle of an array
         # would depend on the version of numpy.
@@ -176,11 +192,21 @@ class HandleTransport:
             raise PolicyUnavailable(
                 f"serve://{self._app}: {len(content.raw())} bytes cannot be sent: {error}"
             ) from error
-        pending = call_replica(
-            self._replica, ClientApi.call, self._session, frame, request_id=requests[0].request_id
-        )
+        pending = None
         try:
-            return decode_replies(self._answer(pending, time.monotonic() + timeout_s))
+            while True:
+                pending = call_replica(
+                    self._replica,
+                    ClientApi.call,
+                    self._session,
+                    frame,
+                    self._pause,
+                    request_id=requests[0].request_id,
+                )
+                answer = self._answer(pending, deadline)
+                if not isinstance(answer, float):
+                    return decode_replies(answer)
+                self._pause = answer
         except ray.exceptions.RayTaskError as error:  # may be a TimeoutError of the replica
             # It is unknown whether the replica executed the request.
             raise ConnectionLost(
@@ -224,7 +250,7 @@ class HandleTransport:
         """Release the chosen replica."""
         self._replica = None
 
-    def _answer(self, pending: Any, deadline: float) -> bytes:
+    def _answer(self, pending: Any, deadline: float) -> bytes | float:
         """Return the answer to a call of the replica, which is pinged meanwhile."""
         import ray
 
@@ -236,7 +262,7 @@ class HandleTransport:
                 return True
             return False
 
-        answers: list[bytes] = []
+        answers: list[bytes | float] = []
 
         def is_ready(limit_s: float) -> bool:
             with contextlib.suppress(ray.exceptions.GetTimeoutError):

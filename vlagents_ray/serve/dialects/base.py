@@ -89,6 +89,7 @@ from vlagents_ray.serve.config.dialects import (
 )
 from vlagents_ray.serve.endpoints import answers
 from vlagents_ray.serve.endpoints.charged_messages import ChargedMessages
+from vlagents_ray.serve.endpoints.client_socket import current_client
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     problem_response,
@@ -242,6 +243,7 @@ class RouteDialect(Dialect):
             self.name,
             session_id,
             caller=current_caller(),
+            has_left=current_client(),
             connected=not session_id,
         )
 
@@ -588,9 +590,9 @@ class HttpDialect(RouteDialect):
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
-        # Sessions by caller and session id in the engine. A new key with the name of a revoked one
+        # Episodes by caller and session id in the engine. A new key with the name of a revoked one
         # continues the sessions of that name, but not with the revoked key.
-        self._sessions: dict[tuple[Identity, str], ImplicitSession] = {}
+        self._episodes: dict[tuple[Identity, str], ImplicitEpisode] = {}
 
     async def answer(
         self,
@@ -656,21 +658,22 @@ class HttpDialect(RouteDialect):
         return Response(b"{}", media_type="application/json")
 
     async def _client_session(self, name: str) -> ImplicitSession:
-        """Return the session that a client names, which exists as long as it exists in an
-        engine.
+        """Return the session that a client names, for its present request; the session's episode
+        exists as long as the session exists in an engine.
         """
         sessions = self.context.engine.sessions
-        if len(self._sessions) > 2 * len(sessions) + 16:
+        if len(self._episodes) > 2 * len(sessions) + 16:
             # Sessions that the engine no longer has are forgotten.
-            self._sessions = {
-                key: session for key, session in self._sessions.items() if key[1] in sessions
+            self._episodes = {
+                key: episode for key, episode in self._episodes.items() if key[1] in sessions
             }
 
+        # The sender is that of the request, whose connection may be another one than before.
         sender = self.sender(name)
+        session = self.session(sender)
         session_name = sender.session_id
         key = (current_caller(), session_name)
-        if key not in self._sessions or session_name not in sessions:
-            session = self.session(sender)
+        if key not in self._episodes or session_name not in sessions:
             finder = self.context.engine.finder
             # A session that is not here may have been served by another replica.
             if finder is not None and session_name not in sessions:
@@ -679,5 +682,6 @@ class HttpDialect(RouteDialect):
                     await over
             if sessions.versions_of([session_name]):
                 session.episode.began(sessions.get(session_name).instruction)
-            self._sessions[key] = session
-        return self._sessions[key]
+            self._episodes[key] = session.episode
+        session.episode = self._episodes[key]
+        return session

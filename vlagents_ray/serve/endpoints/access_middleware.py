@@ -39,7 +39,13 @@ from vlagents_ray.serve.endpoints.asgi_websocket import (
     AsgiWebSockets,
     uncancel,
 )
-from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
+from vlagents_ray.serve.endpoints.client_socket import (
+    HTTP_KEY,
+    SCOPE_KEY,
+    ClientSocket,
+    HttpClient,
+    connected_by,
+)
 from vlagents_ray.serve.endpoints.forwarded_websocket import ForwardedWebSocket, cancel_again
 from vlagents_ray.serve.endpoints.http_messages import (
     DROPPED_BYTES,
@@ -141,7 +147,9 @@ class AccessMiddleware:
                         caller.hold(-1)
                 return
 
-            with charged(charge):
+            http_client: HttpClient | None = scope.get(HTTP_KEY) or HttpClient.below(receive)
+            has_left = None if http_client is None else http_client.has_left
+            with charged(charge), connected_by(has_left):
                 if _has_body(scope):
                     await _run_upload(self._app, scope, receive, send, self._slow_s, self._shutdown)
                 else:
@@ -184,7 +192,8 @@ class AccessMiddleware:
                 receive, send = client.receive, client.sending(send)
         if client is not None:
             websocket = AsgiWebSocket(self.websockets, client, caller, receive, send)
-            await websocket.run(self._app, scope)
+            with connected_by(websocket.has_left):
+                await websocket.run(self._app, scope)
         else:
             forwarded = ForwardedWebSocket(
                 caller, self._slow_s, self._idle_s, receive, send, self._shutdown

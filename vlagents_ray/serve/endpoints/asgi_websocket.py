@@ -193,6 +193,10 @@ class AsgiWebSocket:
             if self._connection is not None:
                 self._connection.end(reason, code)
 
+    def has_left(self) -> bool:
+        """Return whether the client has closed the connection; may be called on any thread."""
+        return self._connection is not None and self._connection.has_left()
+
     async def serve(self, make_handler: MakeHandler) -> None:
         """Accept the WebSocket, serve its messages with a handler, and wait for its end."""
         await self._receive_first()  # the "websocket.connect" message

@@ -1,4 +1,4 @@
-"""The connection below a WebSocket of uvicorn, from which it is taken once it is accepted.
+"""The connection below a request or a WebSocket of uvicorn.
 
 ASGI exposes no connection; uvicorn's bound method `receive` has its protocol and transport.
 """
@@ -9,12 +9,61 @@ import asyncio
 import contextlib
 import os
 import socket
+from collections.abc import Iterator
+from contextvars import ContextVar
 from typing import Any
 
 from starlette.types import Message, Receive, Send
 
+from vlagents_ray.serve.endpoints.connection import has_hung_up
+from vlagents_ray.serve.requests import HasLeft
+
 SCOPE_KEY = "vlagents_ray.client_socket"  # key of the `ClientSocket` in the ASGI scope
+HTTP_KEY = "vlagents_ray.http_client"  # key of the `HttpClient` in the ASGI scope
 _EXTENSIONS = "Sec-WebSocket-Extensions"
+
+_current: ContextVar[HasLeft | None] = ContextVar("vlagents_ray_client", default=None)
+
+
+def current_client() -> HasLeft | None:
+    """Return whether the client of the current request or WebSocket has left; None if another
+    process reads the connection.
+    """
+    return _current.get()
+
+
+@contextlib.contextmanager
+def connected_by(has_left: HasLeft | None) -> Iterator[None]:
+    """Set the result of `current_client` within this context."""
+    token = _current.set(has_left)
+    try:
+        yield
+    finally:
+        _current.reset(token)
+
+
+class HttpClient:
+    """The connection of a request, which uvicorn reads on its event loop."""
+
+    def __init__(self, transport: Any) -> None:
+        self._transport = transport
+        self._connection: socket.socket = transport.get_extra_info("socket")
+
+    @classmethod
+    def below(cls, receive: Receive) -> HttpClient | None:
+        """Return the client of the request with this `receive`; None if uvicorn is not below."""
+        transport = getattr(getattr(receive, "__self__", None), "transport", None)
+        if transport is None or transport.get_extra_info("socket") is None:
+            return None
+        return cls(transport)
+
+    def __reduce__(self) -> tuple[type[None], tuple[()]]:
+        """Pickle as None: Serve's own proxy sends the scope to another process."""
+        return type(None), ()
+
+    def has_left(self) -> bool:
+        """Return whether the client has closed the connection; may be called on any thread."""
+        return bool(self._transport.is_closing()) or has_hung_up(self._connection)
 
 
 class ClientSocket:

@@ -60,8 +60,6 @@ _STAMP = struct.Struct("@qq")  # wall clock, s and ns
 STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a message's control data
 ANSWERS_S = 1.0  # maximum time for clients to receive their last answers when a server ends
 _POLL_MS = 2
-# Time in a socket after which the client of a message may have left, s. Clients wait longer.
-LONG_WAIT_S = 0.25
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 AncillaryData = Sequence[tuple[int, int, bytes]]
@@ -111,6 +109,10 @@ class PolledConnection(ABC):
     def caller(self) -> Identity | None:
         """The caller of the connection; None until the client has sent its key."""
         return self.account.caller
+
+    def has_left(self) -> bool:
+        """Return whether the client has closed the connection; may be called on any thread."""
+        return self._ended or has_hung_up(self._connection)
 
     @abstractmethod
     def _read(self) -> None:
@@ -203,7 +205,7 @@ class PolledConnection(ABC):
         which would delay the key's other connections.
         """
         self._unpolled_for.discard(THROTTLED)
-        if not self._ended and _has_hung_up(self._connection):
+        if not self._ended and has_hung_up(self._connection):
             self.disconnect()
         return not self._ended and not self._throttle()
 
@@ -491,15 +493,6 @@ def time_in_socket_s(control: AncillaryData) -> float:
     return 0.0
 
 
-def is_abandoned(connection: socket.socket, waited_s: float) -> bool:
-    """Return whether a message that has waited in its socket for `waited_s` is not to be executed,
-    since its client has closed the connection meanwhile.
-
-    That is what a client does whose replica was frozen: its session goes on at another one.
-    """
-    return waited_s >= LONG_WAIT_S and _has_hung_up(connection)
-
-
 def accept_open(listener: socket.socket) -> socket.socket | None:
     """Accept the next connection that its client has not ended yet, and close those before it.
 
@@ -512,7 +505,7 @@ def accept_open(listener: socket.socket) -> socket.socket | None:
     """
     for _ in range(_ENDED_AT_ONCE):
         connection, _address = listener.accept()
-        if not _has_hung_up(connection):
+        if not has_hung_up(connection):
             return connection
         connection.close()
     return None
@@ -550,9 +543,15 @@ def _has_undelivered(connection: socket.socket) -> bool:
     return waiting[0] > 0
 
 
-def _has_hung_up(connection: socket.socket) -> bool:
-    """Return whether the peer has closed its end; there may be unread messages."""
+def has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the peer has closed its end; there may be unread messages.
+
+    May be called on any thread, and while another thread closes the connection.
+    """
     poller = select.poll()
-    # A full hang-up is reported in any case.
-    poller.register(connection, getattr(select, "POLLRDHUP", 0))
+    try:
+        # A full hang-up is reported in any case.
+        poller.register(connection, getattr(select, "POLLRDHUP", 0))
+    except ValueError:  # this process has closed it
+        return True
     return bool(poller.poll(0))

@@ -10,7 +10,7 @@ from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from vlagents_ray.errors import MalformedMessage, shown
-from vlagents_ray.serve.endpoints.client_socket import SCOPE_KEY, ClientSocket
+from vlagents_ray.serve.endpoints.client_socket import HTTP_KEY, SCOPE_KEY, ClientSocket, HttpClient
 from vlagents_ray.serve.endpoints.direct_requests import of_this_replica
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 
@@ -24,7 +24,8 @@ class FrontMiddleware:
     """Refuses headers that are not UTF-8, which Serve decodes.
 
     Lets requests of robots pass by Serve, see `DirectRequests`, and the application take the socket
-    of a WebSocket, see `ClientSocket`.
+    of a WebSocket, see `ClientSocket`, or ask whether the client of a request has left, see
+    `HttpClient`.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -50,6 +51,7 @@ class FrontMiddleware:
                 await self._app({**scope, SCOPE_KEY: client}, client.receive, client.sending(send))
                 return
         elif scope["type"] == "http":
+            scope = {**scope, HTTP_KEY: HttpClient.below(receive)}
             direct = of_this_replica()
             if direct is not None and direct.takes(scope):
                 await direct.serve(scope, receive, send)

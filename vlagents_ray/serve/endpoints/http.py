@@ -36,6 +36,7 @@ from vlagents_ray.serve.endpoints import answers, http_messages
 from vlagents_ray.serve.endpoints.asgi_websocket import SCOPE_KEY as WEBSOCKET
 from vlagents_ray.serve.endpoints.asgi_websocket import AsgiWebSocket
 from vlagents_ray.serve.endpoints.charged_messages import ChargedMessage, ChargedMessages
+from vlagents_ray.serve.endpoints.client_socket import current_client
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.request_stream import RequestStream
 from vlagents_ray.serve.engine.engine import Engine
@@ -150,7 +151,12 @@ class _HttpEndpoint:
             try:
                 session_id = http_messages.session_id(http)
                 sender = Sender(
-                    self.engine, "http", session_id, caller=current_caller(), connected=False
+                    self.engine,
+                    "http",
+                    session_id,
+                    caller=current_caller(),
+                    has_left=current_client(),
+                    connected=False,
                 )
                 priority = headers.get(messages.PRIORITY_HEADER, "robot")
                 admission = message_admission(self.engine, charge, self.limits, priority=priority)
@@ -201,7 +207,7 @@ class _HttpEndpoint:
     async def _stream_forwarded(self, socket: WebSocket) -> None:
         """Serve a WebSocket whose messages another process passes on."""
         caller = current_caller()
-        sender = Sender(self.engine, "websocket", caller=caller)
+        sender = Sender(self.engine, "websocket", caller=caller, has_left=current_client())
         await socket.accept()
         try:
             async with ChargedMessages(socket, caller) as arriving:

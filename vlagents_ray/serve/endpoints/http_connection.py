@@ -558,6 +558,7 @@ class HttpConnection(MessageConnection):
             "http",
             http_messages.session_id(head.http),
             caller=caller,
+            has_left=self.has_left,
             connected=False,
         )
         priority = head.headers.get(PRIORITY_HEADER, "robot")
@@ -598,6 +599,9 @@ class HttpConnection(MessageConnection):
             self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
+            # Of TCP, the kernel records the time of the last segment, such as the one that says
+            # that the client has left.
+            may_have_waited=True,
         )
 
     def deliver(self, message: IncomingMessage) -> None:

@@ -26,7 +26,6 @@ from vlagents_ray.serve.endpoints.connection import (
     PolledConnection,
     ReadBuffer,
     has_unread,
-    is_abandoned,
     time_in_socket_s,
     wait_delivered,
 )
@@ -186,8 +185,6 @@ class MessageConnection(PolledConnection):
             data, control = read_buffer.receive(self._connection, size)
             waited_s = time_in_socket_s(control)
             self._arrived = time.perf_counter() - waited_s
-            if is_abandoned(self._connection, waited_s):
-                data = b""
         except BlockingIOError:
             return False
         except OSError as error:

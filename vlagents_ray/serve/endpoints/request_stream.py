@@ -37,7 +37,7 @@ class RequestStream(MessageHandler):
         self._connection = connection
         self._engine = engine
         self._limits = limits
-        self._sender = Sender(engine, "websocket", caller=caller)
+        self._sender = Sender(engine, "websocket", caller=caller, has_left=connection.has_left)
         self.most_unanswered_bytes = limits.body_bytes
 
     def begin(self) -> Charge:
@@ -92,6 +92,9 @@ class RequestStream(MessageHandler):
             self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
+            # Of TCP, the kernel records the time of the last segment, such as the one that says
+            # that the client has left.
+            may_have_waited=True,
         )
 
     def deliver(self, message: IncomingMessage) -> None:

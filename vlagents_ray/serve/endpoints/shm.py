@@ -57,7 +57,6 @@ from vlagents_ray.serve.endpoints.connection import (
     ReadBuffer,
     enable_timestamps,
     has_unread,
-    is_abandoned,
     time_in_socket_s,
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
@@ -174,7 +173,9 @@ class UnixConnection(PolledConnection):
         self._pings = TokenBucket(CONTROL_FRAMES_PER_S, self._connected_at, CONTROL_FRAMES)
         if isinstance(server.admit, NoKey):
             self.account.identify(server.admit)
-            self._sender = Sender(server.engine, server.name, caller=server.admit)
+            self._sender = Sender(
+                server.engine, server.name, caller=server.admit, has_left=self.has_left
+            )
 
     def _read(self) -> None:
         if self._is_rated and self._throttle():
@@ -192,8 +193,7 @@ class UnixConnection(PolledConnection):
         descriptors = _descriptors_in(control)
         waited_s = time_in_socket_s(control)
         try:
-            # Each act passes here, and hardly any has waited, so nothing is called for most.
-            if not data or (waited_s and is_abandoned(self._connection, waited_s)):
+            if not data:
                 self.disconnect()
                 return
             if self._sender is not None and data == LocalAddress.PING:
@@ -312,7 +312,7 @@ class UnixConnection(PolledConnection):
 
         self.account.identify(caller)
         self._is_rated = True
-        self._sender = Sender(self._engine, self._name, caller=caller)
+        self._sender = Sender(self._engine, self._name, caller=caller, has_left=self.has_left)
         return None if is_key else self._sender
 
     def overdue(

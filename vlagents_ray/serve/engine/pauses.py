@@ -76,8 +76,9 @@ class PauseDetector:
         self._clock = clock
         self._checks = Periodic(_CHECK_S)
         self._checked: float | None = None  # time of the last check
-        # Start of the latest pause, and end of its backlog.
+        # Start of the first pause whose messages are still read, and the end of that backlog.
         self._pause_began, self._backlog_until = 0.0, float("-inf")
+        self._latest_began = 0.0  # start of the latest pause
 
     def start(self) -> None:
         """Start checking for pauses."""
@@ -101,6 +102,7 @@ class PauseDetector:
 
     def _record_pause(self, began: float, ended: float) -> None:
         lasted_s = ended - began
+        self._latest_began = began
         if began < self._backlog_until:
             self._backlog_until += lasted_s
             return
@@ -108,6 +110,17 @@ class PauseDetector:
         shortest_s, longest_s = _BACKLOG_S
         self._pause_began = began
         self._backlog_until = ended + max(shortest_s, min(longest_s, lasted_s / 2))
+
+    def latest(self) -> float:
+        """Return the start of the latest pause, s, of the clock, which identifies it; 0.0 if no
+        message can have waited in one.
+        """
+        checked, now = self._checked, self._clock()
+        if checked is None:
+            return 0.0
+        if now - checked > _PAUSE_S:  # this pause is not recorded yet
+            return checked
+        return self._latest_began if now < self._backlog_until else 0.0
 
     def waited_s(self) -> float:
         """Return how long a request that was just read may have waited, s: 0 unless there was a

@@ -178,7 +178,7 @@ class Runner:
     def run(self, taken: Taken) -> None:
         """Answer the expired requests, and run the batch. Called on the policy's thread."""
         for pending in taken.expired:
-            self._intake.fail(pending, _not_taken(pending))
+            self._intake.fail(pending, _not_taken(pending, self._clock()))
         if not taken.batch:
             self._sessions.drop_idle()
             return
@@ -531,9 +531,11 @@ class Runner:
                 act.info[REPLAN] = replan_s * 1e3
 
 
-def _not_taken(pending: PendingRequest) -> VLAgentsError:
-    """Return the error for a request that the policy has not received, and never will."""
-    if pending.origin.ended:
+def _not_taken(pending: PendingRequest, now: float) -> VLAgentsError:
+    """Return the error for a request that the policy has not received at `now`, s, and never
+    will.
+    """
+    if pending.origin.ended or not pending.expired(now):
         return ConnectionLost("its connection has ended: not acted on, and never will be")
     return DeadlineExceeded(
         f"no action within {pending.request.deadline_ms:g} ms: dropped before inference"

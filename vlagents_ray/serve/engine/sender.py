@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import uuid
 import weakref
 from collections.abc import Sequence
@@ -14,16 +15,16 @@ from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Priority, 
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
-from vlagents_ray.serve.requests import IncomingMessage, Origin, PendingRequest, Receiver
+from vlagents_ray.serve.requests import HasLeft, IncomingMessage, Origin, PendingRequest, Receiver
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
 
 T = TypeVar("T")
 
-# Wait of a message in a pause of the process, s, in which its caller may have left, and the time in
-# which the event loop notices that, s.
-_LONG_WAIT_S, _NOTICE_S = 0.25, 0.02
+# Wait of a message in a pause of the process, s, in which a client may have left that cannot be
+# asked, and the time in which the event loop notices that, s.
+_LONG_WAIT_S, _NOTICE_S = 0.25, 0.1
 
 
 class Sender:
@@ -45,6 +46,7 @@ class Sender:
         session_id: str = "",
         *,
         caller: Identity,
+        has_left: HasLeft | None,
         connected: bool = True,
     ) -> None:
         """Create a sender.
@@ -53,6 +55,8 @@ class Sender:
             session_id: Name of the sender's own session; a random one by default.
             caller: The authenticated caller, or the reason why none is needed. It has no default,
                 so that an endpoint without authentication fails.
+            has_left: Whether the client has left, so that no request of it is executed any more;
+                None if this process cannot know. It has no default, so that no endpoint omits it.
             connected: Whether the sender has a connection, whose end also ends its sessions.
 
         Raises:
@@ -68,6 +72,7 @@ class Sender:
         # Whether the client has to reconnect, so that its sessions move.
         self._asked_to_reconnect = False
         self._caller = caller if isinstance(caller, Caller) else None
+        self._has_left = has_left
 
         # Prefix of the sender's session ids.
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""
@@ -92,6 +97,7 @@ class Sender:
         *,
         admission: MessageAdmission | None = None,
         waited_s: float = 0.0,
+        may_have_waited: bool = False,
     ) -> list[PendingRequest]:
         """Submit the requests of a message.
 
@@ -100,6 +106,7 @@ class Sender:
             admission: Admission of the message, if it was decoded with one.
             waited_s: Time that the message waited before it was read, s, which counts towards the
                 deadlines.
+            may_have_waited: Whether it may have waited for longer than is known.
 
         Raises:
             TypeError: The message has no charge, or another key is charged for it.
@@ -143,6 +150,8 @@ class Sender:
                 PRIORITIES[request.priority],
                 now,
                 origin=self._origin,
+                has_left=self._has_left,
+                unread_s=math.inf if may_have_waited else waited_s,
                 index=index,
             )
             if request.deadline_ms is not None:
@@ -225,17 +234,24 @@ class Sender:
     ) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
-        If a pause of the process delayed a request, the delay counts towards its deadline. When the
-        caller stops waiting (deadline, disconnect), its requests that no batch has taken are
-        withdrawn.
+        If a pause of the process delayed a request, the delay counts towards its deadline. A busy
+        event loop may have delayed it as well. When the caller stops waiting (deadline,
+        disconnect), its requests that no batch has taken are withdrawn.
         """
         loop = asyncio.get_running_loop()
         waiting = WaitingTask()
         waited_s = self._engine.pauses.waited_s()
-        if waited_s > _LONG_WAIT_S:
+        if self._has_left is None and waited_s > _LONG_WAIT_S:
             # The caller may have left during the pause; this lets the loop read that, and cancel.
             await asyncio.sleep(_NOTICE_S)
-        sent = self.send(message, decoded, waiting, admission=admission, waited_s=waited_s)
+        sent = self.send(
+            message,
+            decoded,
+            waiting,
+            admission=admission,
+            waited_s=waited_s,
+            may_have_waited=True,
+        )
 
         timer = None
         if sent and all(request.deadline_ms is not None for request in decoded.requests):

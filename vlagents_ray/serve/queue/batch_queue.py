@@ -39,8 +39,8 @@ class Taken(NamedTuple):
     """
 
     batch: list[PendingRequest]
-    # Requests whose deadlines have passed, or whose connections have ended: not in the batch, and
-    # still unanswered.
+    # Requests whose deadlines have passed, or whose clients have left: not in the batch, and still
+    # unanswered.
     expired: list[PendingRequest]
 
 

@@ -207,11 +207,11 @@ class FairQueue:
                 behind others.
 
         Returns:
-            The batch, and the requests whose deadlines have passed or whose connections have ended,
+            The batch, and the requests whose deadlines have passed or whose clients have left,
             which are removed. Finished requests are dropped.
         """
         lone = self._lone
-        if lone is not None and not (lone.over or lone.origin.ended) and now <= lone.deadline:
+        if lone is not None and not (lone.over or lone.is_useless(now)):
             self._lone = None
             lone.begun = True
             self.depth[lone.priority] = self.size = 0

@@ -18,7 +18,7 @@ from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
-from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import GPU_SHARE, VISIBLE
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import (
@@ -324,11 +324,11 @@ class PolicyReplica(ClientApi, SiblingApi):
         location = ClientLocation(node, boot_id, must_be_near)
         return await self._rebalancer.redirect(location) or self._connection_info()
 
-    async def call(self, session_id: str, frame: Any) -> bytes:
+    async def call(self, session_id: str, frame: Any, pause: float) -> bytes | float:
         """Execute a frame of requests from inside the cluster. The frame is a buffer in plasma,
         which is read without a copy.
         """
-        return await answer_frame(self._engine, self._limits, session_id, frame)
+        return await answer_frame(self._engine, self._limits, session_id, frame, pause)
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a plasma channel for frames of `length` bytes to a client that got the address
@@ -458,16 +458,38 @@ def hide_gpus(assigned: Sequence[str]) -> None:
     os.environ[VISIBLE] = ""
 
 
-async def answer_frame(engine: Engine, limits: MessageLimits, session_id: str, frame: Any) -> bytes:
-    """Execute a frame of requests from inside the cluster, and return the frame of the replies."""
-    sender = Sender(engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+async def answer_frame(
+    engine: Engine, limits: MessageLimits, session_id: str, frame: Any, pause: float
+) -> bytes | float:
+    """Execute a frame of requests from inside the cluster, and return the frame of the replies.
+
+    A caller has no connection that shows whether it still waits. If the process was paused, it may
+    have left since, so nothing is executed, and the pause is returned. A caller that still waits
+    sends the frame again, with that `pause`, which shows that the frame is newer.
+    """
+
+    def may_have_left() -> bool:
+        """Return whether the frame may have waited in a pause that its caller does not name."""
+        return engine.pauses.latest() not in (0.0, pause)
+
+    sender = Sender(
+        engine,
+        "handle",
+        session_id,
+        caller=NoKey.INSIDE,
+        has_left=may_have_left,
+        connected=False,
+    )
     charge = free(NoKey.INSIDE)
     message, decoded = sender.message(charge), Decoded([], {})
     try:
         admission = message_admission(engine, charge, limits)  # the frame is in plasma
         decoded = await admission.decoded(partial(decode_requests, memoryview(frame)))
         message.decoded(decoded)
-        await sender.ask(message, decoded, admission)
+        replies = await sender.ask(message, decoded, admission)
+        if replies and all(isinstance(reply.error, ConnectionLost) for reply in replies):
+            engine.stats.record(message)
+            return engine.pauses.latest()
     except VLAgentsError as error:
         message.refuse(error)
     data = answers.as_frame(message)
