@@ -47,9 +47,10 @@ HasLeft: TypeAlias = Callable[[], bool]
 connection may not know yet. Called on any thread.
 """
 
-# Wait of a request, s, up to which its client is not asked whether it has left: a client waits
-# longer, and to ask takes about 2 us.
-_CERTAIN_S = 1e-3
+CERTAIN_S = 1e-3
+"""Wait of a request, s, up to which its client is not asked whether it has left: a client waits
+longer, and to ask takes about 2 us.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +141,8 @@ class PendingRequest:
     waits_behind_others: bool = False
     origin: Origin = NOWHERE
     has_left: HasLeft | None = None  # of its client; None if that cannot be asked
-    # Time for which its message waited before it was read, s; `inf` if that is unknown.
-    unread_s: float = 0.0
+    # Time until which its client has certainly not left, s, of the engine's clock.
+    certain_until: float = math.inf
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
@@ -212,9 +213,7 @@ class PendingRequest:
         """
         if self.origin.ended or now > self.deadline:
             return True
-        if self.has_left is None or now - self.arrived + self.unread_s < _CERTAIN_S:
-            return False
-        return self.has_left()
+        return now > self.certain_until and self.has_left is not None and self.has_left()
 
     @property
     def is_abandoned(self) -> bool:

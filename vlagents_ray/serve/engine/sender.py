@@ -15,7 +15,14 @@ from vlagents_ray.protocol.messages import PRIORITIES, MessageLimits, Priority, 
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.access.charges import Charge
 from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
-from vlagents_ray.serve.requests import HasLeft, IncomingMessage, Origin, PendingRequest, Receiver
+from vlagents_ray.serve.requests import (
+    CERTAIN_S,
+    HasLeft,
+    IncomingMessage,
+    Origin,
+    PendingRequest,
+    Receiver,
+)
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
@@ -119,6 +126,7 @@ class Sender:
             )
         engine, (requests, refused) = self._engine, decoded
         now = engine.clock()
+        certain_until = -math.inf if may_have_waited else now + CERTAIN_S - waited_s
         sent: list[PendingRequest] = []
 
         size = REQUEST_BYTES * len(requests)
@@ -151,7 +159,7 @@ class Sender:
                 now,
                 origin=self._origin,
                 has_left=self._has_left,
-                unread_s=math.inf if may_have_waited else waited_s,
+                certain_until=certain_until,
                 index=index,
             )
             if request.deadline_ms is not None:

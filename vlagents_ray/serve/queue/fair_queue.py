@@ -211,7 +211,13 @@ class FairQueue:
             which are removed. Finished requests are dropped.
         """
         lone = self._lone
-        if lone is not None and not (lone.over or lone.is_useless(now)):
+        if (
+            lone is not None
+            and not (lone.over or lone.origin.ended)
+            and now <= lone.deadline
+            # Nothing is called for most requests, which are taken at once.
+            and (now <= lone.certain_until or not lone.is_useless(now))
+        ):
             self._lone = None
             lone.begun = True
             self.depth[lone.priority] = self.size = 0
