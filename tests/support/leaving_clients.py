@@ -203,7 +203,10 @@ class StoppableServer:
         """Let no thread read the connections until the event that is returned is set."""
         continues = threading.Event()
         self.stack.callback(continues.set)
-        schedules = [self.engine.queue.poller.call_soon, _own_poller().call_soon]
+        schedules: list[Callable[[Callable[[], None]], object]] = [
+            self.engine.queue.poller.call_soon,
+            _own_poller().call_soon,
+        ]
         if self._loop is not None:
             schedules.append(self._loop.call_soon_threadsafe)
 

@@ -192,7 +192,7 @@ class HandleTransport:
             raise PolicyUnavailable(
                 f"serve://{self._app}: {len(content.raw())} bytes cannot be sent: {error}"
             ) from error
-        pending = None
+        pending: Any = None
         try:
             while True:
                 pending = call_replica(
