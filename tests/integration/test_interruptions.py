@@ -48,7 +48,7 @@ WAYS: dict[str, tuple[TransportName, bool]] = {
 
 # The longest time without an action, s: about twice what two shared cores need. HAProxy is back
 # about 3 s after its end.
-NEEDS_HAPROXY = ("http", "websocket-proxied", "http-proxied")
+NEEDS_HAPROXY = ("websocket-proxied", "http-proxied")
 PING_AFTER_S = 0.5
 
 
