@@ -563,12 +563,32 @@ def test_a_player_holds_while_a_chunk_is_late_and_leaves_out_no_row_for_it(
         player.reset()
         obs = {"info": {"wait": True, "value": 5}}
         assert [player.call("act", obs=obs, wait=False) for _ in range(3)] == [None] * 3
+        assert player.call("ticks") == {"ticks": 3, "starved": 3, "share": 0.0}
         server.policy.gate.set()
         commands = []
         while len(commands) < ROWS:
             if command := player.call("act", obs={"info": {"done": True}}, wait=False):
                 commands.append(command["action"])
         assert commands == [[5, 0], [5, 1], [5, 2], [5, 3]]
+
+
+def test_a_player_reports_its_ticks_to_the_server(server: Replica, programs: Path) -> None:
+    with CppClient(programs, server.url, ahead=0) as player:
+        player.reset()
+        assert player.call("ticks") == {"ticks": 0, "starved": 0, "share": None}
+        for _ in range(ROWS):
+            player.act()
+        player.call("missed", ticks=ROWS)
+        player.act()  # it asks for the next chunk
+        starved = {"ticks": 2 * ROWS + 1, "starved": ROWS, "share": (ROWS + 1) / (2 * ROWS + 1)}
+        assert player.call("ticks") == pytest.approx(starved)
+
+        times = server.engine.sessions.all()[-1].times
+        assert times is not None
+        assert (times.ticks, times.starved) == (2 * ROWS, ROWS)
+        assert (times.lately(server.engine.clock()).age_p50_ms or 0.0) > 0.0
+        player.reset()
+        assert player.call("ticks")["ticks"] == 0
 
 
 def test_a_player_throws_once_the_rows_are_executed(programs: Path) -> None:

@@ -38,18 +38,16 @@ int main(int argc, char** argv) try {
   constexpr auto period = std::chrono::milliseconds(50);
   auto tick = std::chrono::steady_clock::now();
   const auto end = tick + std::chrono::duration<double>(seconds);
-  int held = 0;
   while (tick < end) {
     if (const auto command = player.try_act(observe())) {
       apply(command->action);
       if (command->done) break;
-    } else {
-      ++held;  // no action is there in time: a robot that takes absolute targets stays where it is
-    }
+    }  // else no action is there in time: a robot that takes absolute targets stays where it is
     tick += period;
     std::this_thread::sleep_until(tick);
   }
-  std::printf("held %d ticks\n", held);
+  const vlagents_ray::Ticks ticks = player.ticks();
+  std::printf("in time: %.2f%% of %zu ticks\n", 100 * ticks.share().value_or(1), ticks.all);
   return 0;
 } catch (const vlagents_ray::Error& error) {
   std::fprintf(stderr, "%s\n", error.what());

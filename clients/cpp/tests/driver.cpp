@@ -75,6 +75,14 @@ class Driver {
       return player_ ? player_->reset(obs, instruction, kwargs) : client_->reset(obs, instruction, kwargs);
     }
     if (what == "act") return act(observation(asked.value("obs", Json::object())), asked.value("wait", true));
+    if (what == "missed") {
+      player_->count_missed(asked["ticks"].get<std::size_t>());
+      return {};
+    }
+    if (what == "ticks") {
+      const Ticks ticks = player_->ticks();
+      return {{"ticks", ticks.all}, {"starved", ticks.starved}, {"share", ticks.share() ? Json(*ticks.share()) : Json()}};
+    }
     if (what == "close") {
       client_->close();
       return {};

@@ -6,5 +6,5 @@ export * from "./errors.js";
 export {
   type Act, decodeReplies, encodeRequests, type Obs, pack, PROTOCOL_VERSION, type Priority, type Reply, type Request, unpack,
 } from "./frames.js";
-export { ChunkPlayer, type Played, type PlayerOptions } from "./player.js";
+export { ChunkPlayer, type Played, type PlayerOptions, type Ticks } from "./player.js";
 export { type DType, ImageFile, type Json, NdArray, type Pixels, type TypedArray, type Value, ValueReader } from "./values.js";

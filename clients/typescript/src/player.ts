@@ -28,23 +28,37 @@ export interface Played {
   answer: Answer;
 }
 
+/** The ticks of an episode at which the policy was to act. */
+export interface Ticks {
+  all: number;
+  /** Those of them for which no answer had a row. */
+  starved: number;
+  /** The share of the ticks in time, from 0 to 1; undefined without ticks. */
+  share: number | undefined;
+}
+
 interface Plan {
   answer: Answer;
   number: number;
   at: number; // the tick of its row 0
+  seenAt: number; // when its observation was passed to `act`, ms of `performance.now`
 }
 
 /**
  * Calls the policy once for each chunk, and returns one row of it at each tick.
  *
  * Row i of a chunk belongs to the i-th tick after its observation, so the rows that passed while it was on its way are
- * left out.
+ * left out. Each request reports the ticks since the last one, and the age of the last action, to the server.
  */
 export class ChunkPlayer {
   private tick = 0;
   private number = 0;
   private plan: Plan | undefined;
   private asked: Promise<Plan> | undefined;
+  private all = 0;
+  private starved = 0;
+  private reported = { all: 0, starved: 0 }; // by earlier requests
+  private executedAgeMs: number | undefined; // of the last action since the last request
 
   constructor(private readonly agent: RemoteAgent, private readonly options: PlayerOptions = {}) {
     const { ahead = 0 } = options;
@@ -56,8 +70,9 @@ export class ChunkPlayer {
   /** Begin an episode, after the chunk that may be on its way has come. */
   async reset(obs: Obs, instruction?: string, kwargs: Record<string, Value> = {}): Promise<Record<string, Value>> {
     await this.settled();
-    this.tick = this.number = 0;
-    this.plan = undefined;
+    this.tick = this.number = this.all = this.starved = 0;
+    this.reported = { all: 0, starved: 0 };
+    this.plan = this.executedAgeMs = undefined;
     return this.agent.reset(obs, instruction, kwargs);
   }
 
@@ -72,11 +87,25 @@ export class ChunkPlayer {
       }
     }
     if (this.asked === undefined && this.left() <= (this.options.ahead ?? 0)) this.ask(obs);
-    const { answer, number, at } = this.plan!;
+    const { answer, number, at, seenAt } = this.plan!;
     const row = this.tick - at;
     this.tick += 1;
+    this.all += 1;
+    this.executedAgeMs = performance.now() - seenAt;
     const action = answer.rows[row]!;
     return { action, row, chunk: number, ageTicks: row, done: answer.done && row === answer.rows.length - 1, answer };
+  }
+
+  /** Count ticks that passed while your loop was busy, such as with waiting in `act`: no action came in time for them. */
+  countMissed(ticks: number): void {
+    this.all += ticks;
+    this.starved += ticks;
+  }
+
+  /** The ticks of the episode so far: the calls of `act`, and those of `countMissed`. */
+  get ticks(): Ticks {
+    const { all, starved } = this;
+    return { all, starved, share: all === 0 ? undefined : 1 - starved / all };
   }
 
   /** End the session. */
@@ -91,9 +120,19 @@ export class ChunkPlayer {
   }
 
   private ask(obs: Obs): void {
-    const [at, number] = [this.tick, this.number++];
-    this.asked = this.agent.act(obs).then((answer) => ({ answer, number, at }));
+    const [at, number, seenAt] = [this.tick, this.number++, performance.now()];
+    const request = { ...obs, info: { ...obs.info, ...this.requestInfo() } };
+    this.asked = this.agent.act(request).then((answer) => ({ answer, number, at, seenAt }));
     this.asked.catch(() => undefined); // it is thrown where the chunk is needed
+  }
+
+  /** What a request tells the server of the ticks since the last one (docs/protocol.md). */
+  private requestInfo(): Record<string, Value> {
+    const { all, starved, reported, executedAgeMs } = this;
+    this.reported = { all, starved };
+    this.executedAgeMs = undefined;
+    const info = { ticks: [all - reported.all, starved - reported.starved] };
+    return executedAgeMs === undefined ? info : { ...info, executed_age_ms: executedAgeMs };
   }
 
   private async take(): Promise<void> {

@@ -48,3 +48,26 @@ test("a player says what failed where the rows are over, and goes on after it", 
   fails = false;
   assert.equal((await player.act({})).row, 0);
 });
+
+test("a player reports its ticks, those that the loop missed, and the age of its last action", async () => {
+  const infos = [];
+  const agent = {
+    reset: async () => ({}),
+    act: async ({ info }) => {
+      infos.push(info);
+      return { rows: [0, 1].map((row) => Float32Array.of(row)), done: false, info: {}, timing: {}, resumed: false };
+    },
+  };
+  const player = new ChunkPlayer(agent);
+  assert.deepEqual(player.ticks, { all: 0, starved: 0, share: undefined });
+  for (let tick = 0; tick < 5; tick++) {
+    await player.act({ info: { mine: tick } });
+    if (tick === 0) player.countMissed(3); // it waited for the first chunk
+  }
+  assert.deepEqual(player.ticks, { all: 8, starved: 3, share: 0.625 });
+  assert.deepEqual(infos.map(({ mine, ticks }) => [mine, ...ticks]), [[0, 0, 0], [2, 5, 3], [4, 2, 0]]);
+  assert.equal(infos[0].executed_age_ms, undefined);
+  assert.ok(infos[1].executed_age_ms >= 0);
+  await player.reset({});
+  assert.equal(player.ticks.all, 0);
+});

@@ -115,7 +115,9 @@ test("a player with a real policy plays rows that belong to their ticks", async 
       assert.deepEqual([...action].slice(0, 3), [chunk, row, 1]);
       assert.ok(chunk === asked || chunk === asked + 1);
       asked = chunk;
+      if (tick === 5) player.countMissed(2); // the server refuses an act whose report is wrong
     }
+    assert.deepEqual(player.ticks, { all: 22, starved: 2, share: 1 - 2 / 22 });
     assert.ok(asked >= 5);
   });
 });
