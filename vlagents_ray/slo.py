@@ -14,8 +14,9 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, printable, shown
 from vlagents_ray.naming import did_you_mean
 
-# Of a rate, Hz, and of an age, ms: the server computes with their reciprocals and products.
-_LEAST, _MOST = 1e-6, 1e9
+# Of a rate, Hz, of an age, ms, and of a number of rows: the server computes with their reciprocals
+# and products.
+_LEAST, MOST = 1e-6, 1e9
 _REASON_CHARACTERS = 1000  # of a server's reason why a robot is not served in time
 SHARE = 0.98
 """The share of ticks with an action in time that a robot needs if it states none."""
@@ -43,16 +44,16 @@ class Slo:
     rows: int | None = None
 
     def __post_init__(self) -> None:
-        if not (_is_number(self.hz) and _LEAST <= self.hz <= _MOST):
+        if not (_is_number(self.hz) and _LEAST <= self.hz <= MOST):
             raise ConfigError(
-                f"slo.hz: expected a rate from {_LEAST:g} to {_MOST:g} Hz, got {shown(self.hz)}; "
+                f"slo.hz: expected a rate from {_LEAST:g} to {MOST:g} Hz, got {shown(self.hz)}; "
                 "give the rate of the control loop"
             )
         if self.age_ms is not None and not (
-            _is_number(self.age_ms) and _LEAST <= self.age_ms <= _MOST
+            _is_number(self.age_ms) and _LEAST <= self.age_ms <= MOST
         ):
             raise ConfigError(
-                f"slo.age_ms: expected {_LEAST:g} to {_MOST:g} ms, got {shown(self.age_ms)}; leave "
+                f"slo.age_ms: expected {_LEAST:g} to {MOST:g} ms, got {shown(self.age_ms)}; leave "
                 "it out if actions of any age will do"
             )
         if not (_is_number(self.share) and 0 < self.share <= 1):
@@ -61,10 +62,10 @@ class Slo:
                 f"{SHARE} for 98 % of the ticks"
             )
 
-        if self.rows is not None and (type(self.rows) is not int or self.rows < 1):
+        if self.rows is not None and not (type(self.rows) is int and 1 <= self.rows <= MOST):
             raise ConfigError(
-                f"slo.rows: expected a whole number of at least 1, got {shown(self.rows)}; leave "
-                "it out if whole chunks are executed"
+                f"slo.rows: expected a whole number from 1 to {MOST:g}, got {shown(self.rows)}; "
+                "leave it out if whole chunks are executed"
             )
 
     @classmethod

@@ -23,7 +23,7 @@ from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.slo import SHARE, Slo
+from vlagents_ray.slo import MOST, SHARE, Slo
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
@@ -193,15 +193,17 @@ class SessionArgs(_DeploymentModel):
 class SloArgs(_DeploymentModel):
     """What a robot needs whose reset states no SLO, see `vlagents_ray.slo.Slo`."""
 
-    hz: float = Field(description="ticks of its control loop a second")
+    hz: float = Field(le=MOST, description="ticks of its control loop a second")
     age_ms: float | None = Field(
-        default=None, description="largest age of an executed action; unset: any"
+        default=None, le=MOST, description="largest age of an executed action; unset: any"
     )
     share: float = Field(
-        default=SHARE, description="least share of its ticks with an action in time"
+        default=SHARE, le=1, description="least share of its ticks with an action in time"
     )
     rows: int | None = Field(
-        default=None, description="rows of a chunk that it executes at most; unset: all of them"
+        default=None,
+        le=int(MOST),
+        description="rows of a chunk that it executes at most; unset: all of them",
     )
 
     @model_validator(mode="before")

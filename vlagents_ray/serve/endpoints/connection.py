@@ -529,9 +529,11 @@ def wait_delivered(connection: socket.socket, until: float) -> None:
             connection, which the client or another thread may end.
     """
     ended = select.poll()
-    ended.register(connection, 0)  # reports errors and the end of both directions
-    while time.monotonic() < until and _has_undelivered(connection) and not ended.poll(_POLL_MS):
-        pass
+    with contextlib.suppress(ValueError):  # another thread has closed it
+        ended.register(connection, 0)  # reports errors and the end of both directions
+        while time.monotonic() < until and _has_undelivered(connection):
+            if ended.poll(_POLL_MS):
+                break
 
 
 def _has_undelivered(connection: socket.socket) -> bool:
