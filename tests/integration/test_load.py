@@ -80,6 +80,7 @@ def gone() -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 def test_a_burst_of_robots_is_in_time_again_after_the_start_of_a_replica(shared_ray: None) -> None:
     """A replica is enough for ten of these robots, and 15 join the one that is there."""
     scaling = {"max_replicas": 2, "downscale_delay_s": 5}
