@@ -115,9 +115,6 @@ class Ticks:
     # Distance of each such action from the one before.
     step: list[float] = field(default_factory=list)
     twice: int = 0  # observations that the policy saw twice in one session
-    resumed: list[int] = field(
-        default_factory=list
-    )  # numbers of the chunks before which the session had to begin again
 
 
 class FarRobot(SimulatedRobot):
@@ -162,8 +159,20 @@ class NotingPlayer(ChunkPlayer):
         act = super().act(obs)
         if SAFE not in act.info:
             self.robot.note(act)
-            if act.info.get("resumed") and act.info["chunk"] not in self.robot.ticks.resumed:
-                self.robot.ticks.resumed.append(act.info["chunk"])
+        return act
+
+
+class NotingAgent(RemoteAgent):
+    """A client that counts the answers before which the session had to begin again, also those
+    that the player drops as the robot was stopped meanwhile.
+    """
+
+    resumed = 0
+
+    def act(self, obs: Obs) -> Act:
+        """Return the policy's answer."""
+        act = super().act(obs)
+        self.resumed += bool(act.info.get("resumed"))
         return act
 
 
@@ -179,7 +188,7 @@ def drive(
 
     With `recovers`, the run ends earlier if the policy has driven for a second since a stop.
     """
-    with RemoteAgent(url, timeout_s=RESET_S) as agent:
+    with NotingAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)
         low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
@@ -216,6 +225,7 @@ def drive(
             "transport": agent.transport,
             "codec": str(agent.codec),
             "reconnects": agent.reconnects,
+            "resumed": agent.resumed,
         }
         player.close()
     return found

@@ -137,7 +137,7 @@ def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_wh
     # Nothing that was planned before is executed after it.
     assert (at[seen[at[drove] > healed]] > healed).all()
     assert ticks["twice"] == 0
-    assert opened - before == 1 + len(ticks["resumed"])
+    assert opened - before == 1 + found["resumed"]
 
 
 @contextmanager
