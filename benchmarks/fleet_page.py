@@ -37,7 +37,7 @@ def title(plan: Mapping[str, Any]) -> str:
     robots = " and ".join(f"{kind['rows']} rows at {kind['hz']:g} Hz" for kind in plan["kinds"])
     continued = ", RTC" if plan["real_time_chunking"] else ""
     curve = f"{plan['base_ms']:g} + {plan['row_ms']:g} ms a row"
-    return f"{robots}{continued}, {plan['transport']}, {curve}"
+    return f"{robots}\n{plan['transport']}{continued}, {curve}"
 
 
 def most(plan: Mapping[str, Any]) -> int | None:
@@ -62,15 +62,19 @@ def markdown(fleets: Sequence[Mapping[str, Any]]) -> str:
     for fleet in fleets:
         systems = dict.fromkeys(point["system"] for point in fleet["points"])
         for system in systems:
-            points = [point for point in fleet["points"] if point["system"] == system]
+            points = sorted(
+                (point for point in fleet["points"] if point["system"] == system),
+                key=lambda point: int(point["robots"]),
+            )
             figures = "; ".join(
                 f"{point['robots']}: {point['share']:.1%}, {point['served']}, "
                 f"{point['age_p95_ms'] / 1e3:.2f}"
                 for point in points
             )
             last = points[-1]
+            robots = fleet["title"].replace("\n", ", ")
             lines.append(
-                f"| {fleet['title']} | {system} | {most_served(points, system)} | {figures} | "
+                f"| {robots} | {system} | {most_served(points, system)} | {figures} | "
                 f"{last['server_cpu_s']:.0f}, {last['client_cpu_s']:.0f} |"
             )
     return "\n".join(lines)

@@ -133,8 +133,11 @@ def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
 
 def _plot_shares(axes: Any, fleet: Mapping[str, Any], systems: Sequence[str]) -> None:
     for number, system in enumerate(systems):
-        points = [point for point in fleet["points"] if point["system"] == system]
-        ours = number == 0
+        points = sorted(
+            (point for point in fleet["points"] if point["system"] == system),
+            key=lambda point: int(point["robots"]),
+        )
+        ours = system == "vlagents_ray"
         axes.plot(
             [point["robots"] for point in points],
             [100 * point["share"] for point in points],
