@@ -18,7 +18,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import connect
 
-from vlagents_ray.client.limited_websocket import LimitedWebSocket
+from vlagents_ray.client.limited_websocket import LimitedWebSocket, OpeningLimit
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
@@ -36,6 +36,7 @@ _GET_ROS = (
     "ROS through a rosbridge, `link: ws://arm-pc:9090`"
 )
 _SEND_S = 0.2  # time limit of a message: a dead link would block the control loop for minutes
+_OPEN_S = 5.0  # time limit of the opening handshake
 _CLOSE_S = 1.0  # maximum time of a closing handshake
 _LARGEST = 64 << 20  # largest frame, bytes; a 4K image in base64 has 34 million
 
@@ -247,14 +248,17 @@ class Rosbridge:
         """Connect to the server, and announce and subscribe to the topics."""
         self._open.close()  # the previous connection
         try:
-            opening = connect(
-                self._url,
-                compression=None,
-                max_size=_LARGEST,
-                open_timeout=5,
-                close_timeout=_CLOSE_S,
-            )
-            socket = LimitedWebSocket(self._open.enter_context(opening))
+            with OpeningLimit(_OPEN_S) as limit:
+                opening = connect(
+                    self._url,
+                    compression=None,
+                    max_size=_LARGEST,
+                    open_timeout=limit.open_timeout_s,
+                    close_timeout=_CLOSE_S,
+                    create_connection=limit.create_connection,
+                )
+                connection = self._open.enter_context(opening)
+            socket = LimitedWebSocket(connection)
             self._open.callback(socket.shut_down)
             for topic, message_type in self._published_types.items():
                 announcement = {"op": "advertise", "topic": topic, "type": message_type}
