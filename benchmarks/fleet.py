@@ -248,15 +248,7 @@ def run_robots(fleet: Sequence[Robot], warm: float, seconds: float) -> RobotsRun
         seconds: The length of the measurement, s.
     """
     with contextlib.ExitStack() as stack:
-        processes = []
-        for first in range(0, len(fleet), _ROBOTS_A_PROCESS):
-            robots_of_process = fleet[first : first + _ROBOTS_A_PROCESS]
-            arguments = json.dumps([asdict(robot) for robot in robots_of_process])
-            command = [sys.executable, "-m", "benchmarks.fleet_robots", arguments]
-            processes.append(stack.enter_context(LineProcess("robots", command, our_environment())))
-        for process in processes:
-            process.read(CONNECT_S)
-
+        processes = start_robots(stack, fleet)
         client_pids = [process.pid for process in processes]
         server_pids = server_processes(os.getpid(), client_pids)
         begin = time.monotonic() + _AHEAD_S
@@ -272,6 +264,19 @@ def run_robots(fleet: Sequence[Robot], warm: float, seconds: float) -> RobotsRun
         return RobotsRun(
             figures, _cpu_s(client_pids) - clients_before, _cpu_s(server_pids) - server_before
         )
+
+
+def start_robots(stack: contextlib.ExitStack, fleet: Sequence[Robot]) -> list[LineProcess]:
+    """Start the processes of robots, which `stack` ends, and return them connected."""
+    processes = []
+    for first in range(0, len(fleet), _ROBOTS_A_PROCESS):
+        robots_of_process = fleet[first : first + _ROBOTS_A_PROCESS]
+        arguments = json.dumps([asdict(robot) for robot in robots_of_process])
+        command = [sys.executable, "-m", "benchmarks.fleet_robots", arguments]
+        processes.append(stack.enter_context(LineProcess("robots", command, our_environment())))
+    for process in processes:
+        process.read(CONNECT_S)
+    return processes
 
 
 def _cpu_s(pids: Sequence[int]) -> float:

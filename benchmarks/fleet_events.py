@@ -11,7 +11,6 @@ import contextlib
 import json
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,8 +21,8 @@ import typer
 
 from benchmarks.console import Out, save
 from benchmarks.figures import measured_on
-from benchmarks.fleet import CURVES
-from benchmarks.fleet_robots import CONNECT_S, Robot
+from benchmarks.fleet import CURVES, start_robots
+from benchmarks.fleet_robots import Robot
 from benchmarks.processes import program, server_processes
 from benchmarks.push import Trained, TrainedConfig, layers
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -31,11 +30,10 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
+from vlagents_ray_cluster.tune.line_process import LineProcess
 from vlagents_ray_learn import Publisher
 
 _PARAMETERS = 30_000_000  # of the pushed model
-_ROBOTS_A_PROCESS = 16
 _AHEAD_S = 1.0
 _LATE_S = 60.0
 _SETTLE_S = 10.0  # before the first event
@@ -112,8 +110,9 @@ def measure_events(
         Publisher(f"serve://{document.applications[0].name}") as learner,
         contextlib.ExitStack() as stack,
     ):
-        running = _connect(stack, plan, server.url, plan.robots)
-        joining = _connect(stack, plan, server.url, plan.joining)
+        robot = Robot(server.url, plan.hz, plan.rows, way=plan.transport)
+        running = start_robots(stack, [robot] * plan.robots)
+        joining = start_robots(stack, [robot] * plan.joining)
         begin = time.monotonic() + _AHEAD_S
         moments = [_SETTLE_S + number * plan.gap_s for number in range(4)]
         end_s = moments[-1]
@@ -141,9 +140,9 @@ def measure_events(
         failed: set[str] = set()
         for processes, begun_s in ((running, 0.0), (joining, moments[2])):
             for process in processes:
-                for robot in process.read(end_s + _LATE_S):
-                    late += [begun_s + moment_s for moment_s, _ in robot["late"]]
-                    failed |= {robot["failed"]} - {""}
+                for figures in process.read(end_s + _LATE_S):
+                    late += [begun_s + moment_s for moment_s, _ in figures["late"]]
+                    failed |= {figures["failed"]} - {""}
 
     everyone = plan.robots + plan.joining
     happened = [
@@ -187,21 +186,6 @@ def summary(event: Event, until_s: float, late: Iterable[float], hz: float) -> d
         "worst_second": 1 - max(seconds) / each_second,
         "in_time_again_s": bad[-1] + 1 if bad else 0,
     }
-
-
-def _connect(
-    stack: contextlib.ExitStack, plan: EventPlan, url: str, robots: int
-) -> list[LineProcess]:
-    """Start the processes of robots, and return them connected."""
-    robot = asdict(Robot(url, plan.hz, plan.rows, way=plan.transport))
-    processes = []
-    for first in range(0, robots, _ROBOTS_A_PROCESS):
-        arguments = json.dumps([robot] * min(_ROBOTS_A_PROCESS, robots - first))
-        command = [sys.executable, "-m", "benchmarks.fleet_robots", arguments]
-        processes.append(stack.enter_context(LineProcess("robots", command, our_environment())))
-    for process in processes:
-        process.read(CONNECT_S)
-    return processes
 
 
 def _send(processes: Iterable[LineProcess], begin: float, end: float) -> None:

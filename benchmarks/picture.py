@@ -4,6 +4,7 @@ number of clients, and the robots that each system serves in time.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,16 +41,21 @@ def plot_league(results: Mapping[str, Any], file: Path) -> None:
         for index, part in enumerate(parts):
             _plot_throughput(axes[index + 1], part)
         if parts:
-            handles, labels = axes[1].get_legend_handles_labels()
-            figure.legend(
-                handles,
-                labels,
-                loc="outside right center",
-                fontsize=8,
-                frameon=False,
-                labelcolor=_TEXT,
-            )
+            _add_legend(figure, axes[1])
         figure.savefig(file, transparent=True, metadata={"Date": None})
+
+
+def _add_legend(figure: Any, axes: Any) -> None:
+    """Put the legend of one panel beside all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside right center",
+        fontsize=8,
+        frameon=False,
+        labelcolor=_TEXT,
+    )
 
 
 def _plot_round_trips(axes: Any, rtt: Mapping[str, Any]) -> None:
@@ -115,19 +121,12 @@ def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
             figsize=(3.6 * len(fleets) + 1.6, 3.2), layout="constrained"
         )
         panels = figure.subplots(1, len(fleets), sharey=True, squeeze=False)[0]
-        systems = list(dict.fromkeys(one["system"] for each in fleets for one in each["points"]))
+        points = itertools.chain.from_iterable(fleet["points"] for fleet in fleets)
+        systems = list(dict.fromkeys(point["system"] for point in points))
         for axes, fleet in zip(panels, fleets, strict=True):
             _plot_shares(axes, fleet, systems)
         panels[0].set_ylabel("ticks in time, %")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(
-            handles,
-            labels,
-            loc="outside right center",
-            fontsize=8,
-            frameon=False,
-            labelcolor=_TEXT,
-        )
+        _add_legend(figure, panels[0])
         figure.savefig(file, transparent=True, metadata={"Date": None})
 
 
