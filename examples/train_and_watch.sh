@@ -5,7 +5,7 @@
 #   bash examples/train_and_watch.sh                 # both in a checkout; EPISODES=20 STEPS=200 bash … is a short try
 #
 # An expert of the built-in tabletop demonstrates, and a small ACT learns from the state alone, in minutes and without a
-# GPU. docs/training.md explains the options, has the same with images, and what came of it; demonstrations of a robot
+# GPU. docs/training.md explains the options, docs/tutorials/fine_tune.md has the same with images; demonstrations of a robot
 # (`vlagents-ray robot URL --record demos/cups`) take the place of steps 1 and 2.
 set -euo pipefail
 out=${OUT:-runs/act-state} episodes=${EPISODES:-600} steps=${STEPS:-1000} every=${EVERY:-100} played=${PLAYED:-50}

@@ -49,12 +49,13 @@ TINY = [
 
 
 def documented(command: str) -> list[list[str]]:
-    """The words of each such command on the page about training, then in its example, without
+    """The words of each such command in the tutorial about training, then in the example, without
     the command itself.
     """
     root = Path(__file__).parents[5]
     text = "".join(
-        (root / name).read_text() for name in ("docs/training.md", "examples/train_and_watch.sh")
+        (root / name).read_text()
+        for name in ("docs/tutorials/fine_tune.md", "examples/train_and_watch.sh")
     )
     found = re.findall(rf"^{re.escape(command)} ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     return [shlex.split(re.sub(r" >.*", "", words.replace("\\\n", " "))) for words in found]
