@@ -13,6 +13,7 @@
 #   make extras [ONLY="record sim"]                                 resolve extras, into the table of docs/install.md
 #   make locks [ONLY=family-hf]                                     resolve the images' packages, into cluster/docker/locks
 #   make dist                                                       what a release publishes, checked, in dist
+#   make release [UPLOAD=1]                                         check, build and tag a version; the tag publishes it
 #   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
 #   make bench                                                      measure, and write the figures of docs/measured.md again
 #   make gpu [RUN=acts] [DRY=1] [GPU_PYTHON=python3] [STEPS="facts,tests"]     all that needs a GPU, in two runs of seven
@@ -26,7 +27,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo reference bench gpu gpu-pack check quick collected test played integrations environments families docs verified programs rays pythons extras locks dist sbom fmt lint type clean
+.PHONY: setup demo reference bench gpu gpu-pack check quick collected test played integrations environments families docs verified programs rays pythons extras locks dist release sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -201,6 +202,16 @@ dist:
 	for folder in plugins/*/; do build/publishing/bin/python -m build --outdir build/plugins "$$folder"; done
 	build/publishing/bin/twine check --strict dist/* build/plugins/*
 	for wheel in dist/*.whl build/plugins/*.whl; do build/publishing/bin/check-wheel-contents "$$wheel"; done
+
+# The pushed tag starts .github/workflows/release.yml. UPLOAD=1 uploads the files from here first: a package index accepts no
+# trusted publisher for twelve projects that do not exist yet.
+release:
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
+	'$(PYTHON)' tests/support/release.py
+	@$(MAKE) --no-print-directory dist
+	$(if $(UPLOAD),build/publishing/bin/twine upload dist/* build/plugins/*)
+	version=$$('$(PYTHON)' tests/support/release.py) && git tag --annotate --message "Version $$version" "v$$version" \
+	  && git push origin "v$$version"
 
 # CycloneDX, which its own schema has accepted, and a table. Whoever reads them installs nothing else of this folder.
 LOCK ?= server-sim

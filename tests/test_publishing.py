@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import release
 import resolved
 import tomllib
 import yaml
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
@@ -66,9 +68,34 @@ def test_the_flood_table_is_played_whole_each_night() -> None:
     assert float(step["env"]["VLAGENTS_FLOOD_SECONDS"]) >= 10
 
 
-def test_the_citation_names_this_version_and_licence() -> None:
+def test_the_citation_names_this_licence() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+    assert citation["license"] == PROJECT["license"]
+
+
+def test_files_that_repeat_the_version_have_that_of_the_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert release.other_versions() == []
+    monkeypatch.setattr(release, "VERSION", "9.9.9")
+    assert len(release.other_versions()) == len(release.REPEATED)
+
+
+def test_each_plugin_works_with_this_version_of_the_core() -> None:
+    for path in sorted((ROOT / "plugins").glob("*/pyproject.toml")):
+        plugin = tomllib.loads(path.read_text())["project"]
+        [core] = [
+            requirement
+            for requirement in map(Requirement, plugin["dependencies"])
+            if requirement.name == PROJECT["name"]
+        ]
+        assert core.specifier.contains(release.VERSION), path
+
+
+def test_a_version_is_released_once_its_changelog_has_a_date() -> None:
+    assert release.unfinished(f"# Changelog\n\n## [{release.VERSION}] - 2026-12-24\n") == []
+    [problem] = release.unfinished("# Changelog\n\n## [Unreleased]\n")
+    assert f"## [{release.VERSION}]" in problem
 
 
 def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requirements() -> None:
