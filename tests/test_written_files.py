@@ -42,11 +42,13 @@ def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
 
 
 def test_each_policy_and_environment_has_a_page_and_each_page_one_of_them() -> None:
-    for folder, registered in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
+    for folder, registered, further in (
+        ("policies", entries("policies"), tables.PLUGINS),
+        ("benchmarks", entries("envs"), ()),
+    ):
         named = {tables.page_of(name, entry) for name, entry in registered.items() if entry.about}
-        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {
-            "index"
-        } == named - {""}
+        pages = {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")}
+        assert pages - {"index"} == (named | set(further)) - {""}
 
 
 def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:

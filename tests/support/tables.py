@@ -17,7 +17,7 @@ from pathlib import Path
 
 import tomllib
 from programs import others, ran, settings
-from verified import RUN_WITH, marked, notes
+from verified import PLUGINS, RUN_WITH, marked, notes
 
 from vlagents_ray.cli.new import render
 from vlagents_ray.evaluate.results.statistics import wilson
@@ -228,12 +228,12 @@ def with_tables(file: str, text: str) -> str:
     policies and the environments.
     """
     if file == "mkdocs.yml":
-        for folder, registered in (
-            ("policies", entries("policies")),
-            ("benchmarks", entries("envs")),
+        for folder, registered, further in (
+            ("policies", entries("policies"), PLUGINS),
+            ("benchmarks", entries("envs"), ()),
         ):
             names = dict.fromkeys(page_of(name, entry) for name, entry in _listed(registered))
-            pages = "".join(f"      - {folder}/{page}.md\n" for page in names if page)
+            pages = "".join(f"      - {folder}/{page}.md\n" for page in (*names, *further) if page)
             index = f"      - {folder}/index.md\n"
             text = re.sub(
                 f"{index}(?:      - {folder}/.*\n)*", lambda _, new=index + pages: new, text

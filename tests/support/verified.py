@@ -40,8 +40,7 @@ WHAT = {
     "loading": "Invalid checkpoints are rejected.",
     "size": "The model has the published size.",
 }
-# Of packages in plugins/, with their place among the pages of the policies.
-PLUGINS = {"arro": "other#arro"}
+PLUGINS = ("arro",)  # wrappers of packages in plugins/, with a page among those of the policies
 # Of each family: the names of its requirements, and the packages and checkouts whose versions
 # matter.
 RUN_WITH = {
@@ -176,7 +175,7 @@ def with_table(page: str, family: str) -> str:
 def page_of(family: str) -> Path:
     """The page that has a family's table."""
     one = find_entry("policies", family)
-    name = (one.page if one else PLUGINS[family]) or family
+    name = (one.page if one else None) or family
     return PAGES / f"{name.partition('#')[0]}.md"
 
 

@@ -2,4 +2,4 @@
 
 from vlagents_ray.registry import RegistryEntry
 
-ARRO = RegistryEntry("vlagents_ray_arro:Arro", page="other#arro")
+ARRO = RegistryEntry("vlagents_ray_arro:Arro")

@@ -59,7 +59,6 @@ OCTO = RegistryEntry(
     needs=("octo", "jax", "flax", "transformers"),
     requirements=("octo",),
     checkouts=("OCTO_SRC",),
-    page="other#octo",
 )
 
 DIFFUSION_POLICY = RegistryEntry(
@@ -68,7 +67,6 @@ DIFFUSION_POLICY = RegistryEntry(
     needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
     requirements=("diffusion_policy",),
     checkouts=("DIFFUSION_POLICY_SRC",),
-    page="other#diffusion-policy",
 )
 
 VJEPA2_AC = RegistryEntry(
@@ -77,7 +75,6 @@ VJEPA2_AC = RegistryEntry(
     needs=("src", "transformers", "torch", "timm"),
     requirements=("hf",),
     checkouts=("VJEPA2_SRC",),
-    page="other#v-jepa-2-ac",
 )
 
 ONNX = RegistryEntry(
