@@ -1,3 +1,119 @@
 """The engine: it checks requests, puts them into the batch queue, runs batches, and builds
 replies.
+
+A field that several threads use has one writer or a lock. This list names the threads that write
+each field, and what protects it. ARCHITECTURE.md describes the threads.
+
+IncomingMessage.replies
+    writers: each thread that answers a request
+    protection: lock of the message; the first reply counts
+
+PendingRequest.over
+    writers: the thread that finishes or withdraws the request
+    protection: is only ever set; the message ignores a second reply
+
+PendingRequest.begun
+    writers: policy: FairQueue.take, BatchQueue.give_back
+    protection: lock of the queue
+
+PendingRequest.reserved, .sought
+    writers: the thread that reserves for the request
+    protection: a request reserves, is searched for or queued, one at a time
+
+PendingRequest.loaded
+    writers: checkpoints, before it queues the reset again
+    protection: lock of the queue, which passes the request on
+
+Origin.sessions: episodes
+    writers: each thread that reserves or undoes a reset, policy at a close
+    protection: lock of SessionTable; an act sets an episode only if there is none
+
+Origin.ended
+    writers: the thread that ends the connection
+    protection: is only ever set
+
+Session.agent, .prepares, .steps, .instruction, .resetting, .announced
+    writers: policy; before the session is in the table, the thread that creates it
+    protection: one writer
+
+Session.plan
+    writers: policy, at resets and answers; .is_admitted also each reader of the load
+    protection: single assignments; a reader takes the newest or the last value
+
+Session.first, .expected, .began, .last_reset, .moves, .over
+    writers: each thread that reserves, runs or undoes a reset
+    protection: lock of SessionTable
+
+LoadedModel.deferred
+    writers: checkpoints
+    protection: one writer
+
+Session.origin, .used, .moved_in
+    writers: each thread that reserves for a request of the session
+    protection: the last one counts: requests of two threads have no order
+
+Session.model, LoadedModel.sessions
+    writers: policy, checkpoints, each thread that ends a session
+    protection: lock of ModelCache; a reader copies the reference
+
+Session.weights, .follows
+    writers: policy at a reset, the push that commits a version
+    protection: lock of the ModelWeights of the session's model
+
+ModelWeights: versions
+    writers: pushes, policy
+    protection: its lock; the version in the agent: policy, with busy
+
+Health: reasons
+    writers: policy, event loop, the thread that starts or stops the engine
+    protection: its lock; requests read one reference
+
+PolicyCalls.under_way
+    writers: each thread that calls the policy, its own calls
+    protection: single operations of a set; overdue copies it
+
+PolicyCalls.failed_batches
+    writers: policy
+    protection: one writer
+
+DrainList.draining
+    writers: event loop
+    protection: is only ever set
+
+DrainList: connections
+    writers: event loop, each thread that answers
+    protection: its lock
+
+Runner: unsent answers
+    writers: policy
+    protection: one writer, which passes them on to policy-answers
+
+Poller: lent to policy-reader
+    writers: policy; periodic, while a batch runs
+    protection: lock of the queue, under which the batch ends
+
+BatchQueue, FairQueue, BatchWindow
+    writers: each thread that queues, policy
+    protection: lock of the queue
+
+PolledConnection: pauses
+    writers: the thread that polls it: policy or policy-reader, never both at once; websockets
+    protection: Poller
+
+PolledConnection: unsent bytes, unanswered messages, end
+    writers: each thread that answers, or ends the connection
+    protection: its lock
+
+Account, Charge
+    writers: the thread or the event loop that reads the connection; while a message is decoded
+        elsewhere, that thread
+    protection: the connection reads no further message meanwhile
+
+Sender: whether its client was requested to reconnect
+    writers: each thread that answers
+    protection: is only ever set
+
+MetricsBuffer
+    writers: each thread that answers, policy
+    protection: its lock
 """
