@@ -305,7 +305,7 @@ $(CONSTRAINTS): pyproject.toml | $(BIN)/python
 	  } >&2; \
 	fi
 	@$(PIP) freeze | grep '^torch==' >$@
-	@sed -n 's/.*"ray\[serve\]\(==[0-9.]*\)".*/ray\1/p' pyproject.toml >>$@
+	@sed -n 's/^ *"ray\[serve\]\([^"]*\)".*/ray\1/p' pyproject.toml >>$@
 	@cat $@
 
 $(BIN)/python:

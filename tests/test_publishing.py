@@ -19,8 +19,11 @@ import tomllib
 import yaml
 from packaging.requirements import Requirement
 
+from vlagents_ray.ray_tools.private import requirement
+
 ROOT = Path(__file__).parents[1]
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+MAKEFILE = (ROOT / "Makefile").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -47,7 +50,7 @@ def test_workflows_are_well_formed() -> None:
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
 def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
-    rules = re.findall(r"^([a-z][a-z ]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    rules = re.findall(r"^([a-z][a-z ]*):", MAKEFILE, re.MULTILINE)
     targets = {target for rule in rules for target in rule.split()}
     commands = [step["run"] for step in steps(workflow) if "run" in step]
     assert commands
@@ -55,6 +58,17 @@ def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
         assert set(re.findall(r"^make ([a-z]+)", command)) <= targets
         for path in re.findall(r"(?:\.ci|tests)/[\w/.]*", command):
             assert (ROOT / path).exists(), path
+
+
+def test_the_makefile_holds_ray_at_the_versions_of_a_server() -> None:
+    """Whatever is installed into `.venv` later must not replace Ray: clients share it."""
+    recipe = re.search(r"^\t@(sed .*) pyproject.toml >>\$@$", MAKEFILE, re.MULTILINE)
+    assert recipe is not None
+    command = ["bash", "-c", f"{recipe[1]} pyproject.toml"]
+    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    [held] = map(Requirement, done.stdout.splitlines())
+    assert held.name == "ray"
+    assert held.specifier == Requirement(requirement()).specifier
 
 
 def test_the_flood_table_is_played_whole_each_night() -> None:
