@@ -6,7 +6,7 @@
 #   make test [TEST_PROCESSES=3]                                    lint, types, layers, all tests but integrations
 #   make integrations [TEST_PROCESSES=3]                            families, and tests of other systems and of endurance
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero libero_pro …"]    tests of model families, in .venv-NAME each
-#   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
+#   make verified [FAMILIES="lerobot hf"]                           what they verify, into docs/policies/verification.md
 #   make rays, make pythons                                         serve, act and evaluate once with other versions of Ray and Python
 #   make programs                                                   those that others wrote, into the table of docs/programs.md
 #   make docs                                                       the site of docs/, in build/docs, for a browser

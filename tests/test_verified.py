@@ -1,9 +1,8 @@
-"""The pages of model families say what their tests verify, and no more."""
+"""docs/policies/verification.md says what the tests of model families verify, and no more."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from pathlib import Path
 from types import ModuleType
@@ -14,15 +13,10 @@ from tables import page_of
 
 from vlagents_ray.registry import entries
 
-VERIFIED = verified.BEGIN.format(r"(\w+)")
 
-
-@pytest.mark.parametrize("family", verified.RUN_WITH)
-def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(
-    family: str,
-) -> None:
-    page = verified.page_of(family).read_text()
-    assert verified.with_table(page, family) == page, "run `python tests/support/verified.py`"
+def test_the_page_has_the_tests_that_there_are_with_what_became_of_them() -> None:
+    page = verified.PAGE.read_text()
+    assert verified.with_table(page) == page, "run `python tests/support/verified.py`"
 
 
 @pytest.mark.parametrize("family", verified.RUN_WITH)
@@ -41,18 +35,16 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
         assert one.get("skipped", {}).keys() == skipped, "without a reason for each"
 
 
-def test_each_family_with_a_page_is_listed() -> None:
-    shown = [
-        name
-        for page in verified.PAGES.glob("*.md")
-        for name in re.findall(VERIFIED, page.read_text())
-    ]
-    assert sorted(shown) == sorted(verified.RUN_WITH)
-    no_families = {
-        page_of(name, one) for name, one in entries("policies").items() if not one.requirements
-    } | {"index"}
-    with_table = {verified.page_of(family).stem for family in shown}
-    assert with_table == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
+def test_each_page_of_a_family_links_to_what_is_verified_of_it() -> None:
+    of_families = {verified.page_of(family).partition("#")[0] for family in verified.RUN_WITH}
+    others = {
+        page_of(name, entry)
+        for name, entry in entries("policies").items()
+        if not entry.requirements
+    }
+    pages = {page.stem: page.read_text() for page in verified.PAGES.glob("*.md")}
+    assert of_families == set(pages) - others - {"index", verified.PAGE.stem}
+    assert all("](verification.md)" in pages[name] for name in of_families)
 
 
 def test_a_test_that_is_new_or_gone_changes_the_table(
@@ -60,6 +52,7 @@ def test_a_test_that_is_new_or_gone_changes_the_table(
 ) -> None:
     monkeypatch.setattr(verified, "ROOT", tmp_path.parent)
     monkeypatch.setattr(verified, "FOLDERS", [tmp_path.name])
+    monkeypatch.setattr(verified, "RUN_WITH", {"pi0": ("hf", ())})
     (tmp_path / "pi0").mkdir()
     file = tmp_path / "pi0" / "test_it.py"
     file.write_text(
@@ -81,15 +74,15 @@ def test_a_test_that_is_new_or_gone_changes_the_table(
     (file.parent / "test_more.py").write_text(
         '@pytest.mark.verifies("parity")\ndef test_more(): ...\n'
     )
-    said = verified.table("pi0")
+    table = verified.table()
     assert (
-        "| Actions equal those of upstream's own code. | `test_it.py` | 2 passed, 1 skipped: no GPU |"
-        in said
+        "| [`pi0`](pi0.md) | 2, 1 skipped |  |  |  |  | Python 3.11, torch 2, on a CPU |" in table
     )
-    assert "| `test_more.py` | not run: no simulator |" in said
-    assert "Python 3.11, torch 2, on a CPU." in said
+    assert "- `pi0`, Python 3.11, `test_it.py`: no GPU." in table
+    assert "- `pi0`, Python 3.11, `test_more.py`: no simulator." in table
     file.write_text(file.read_text().replace("acts_are_theirs", "acts_are_like_theirs"))
-    assert "| `test_it.py` | not run: it is newer than these results |" in verified.table("pi0")
+    newer = "- `pi0`, Python 3.11, `test_it.py`: tests that are newer than these results."
+    assert newer in verified.table()
 
 
 def test_outcomes_are_noted_by_family_and_test(

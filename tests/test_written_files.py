@@ -43,7 +43,7 @@ def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
 
 def test_each_policy_and_environment_has_a_page_and_each_page_one_of_them() -> None:
     for folder, registered, further in (
-        ("policies", entries("policies"), tables.PLUGINS),
+        ("policies", entries("policies"), tables.FURTHER_PAGES),
         ("benchmarks", entries("envs"), ()),
     ):
         named = {tables.page_of(name, entry) for name, entry in registered.items() if entry.about}

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import tomllib
 from programs import others, ran, settings
-from verified import PLUGINS, RUN_WITH, marked, notes
+from verified import FURTHER_PAGES, RUN_WITH, marked, notes
 
 from vlagents_ray.cli.new import render
 from vlagents_ray.evaluate.results.statistics import wilson
@@ -229,7 +229,7 @@ def with_tables(file: str, text: str) -> str:
     """
     if file == "mkdocs.yml":
         for folder, registered, further in (
-            ("policies", entries("policies"), PLUGINS),
+            ("policies", entries("policies"), FURTHER_PAGES),
             ("benchmarks", entries("envs"), ()),
         ):
             names = dict.fromkeys(page_of(name, entry) for name, entry in _listed(registered))

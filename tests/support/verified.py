@@ -1,5 +1,5 @@
-"""What the tests of a model family verify, for the family's page: `python
-tests/support/verified.py` writes all tables.
+"""What the tests of the model families verify, for docs/policies/verification.md: `python
+tests/support/verified.py` writes its table.
 
 A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified
 tests/families/FAMILY` notes what became of these tests in `verified.json` of that folder, and `make
@@ -17,7 +17,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -31,16 +31,12 @@ FOLDERS = tuple(
     str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))
 )
 PAGES = ROOT / "docs" / "policies"
+PAGE = PAGES / "verification.md"
 PYTHON = "3.11"  # of this project's own environment
-BEGIN, END = "<!-- verified: {} -->", "<!-- /verified -->"
-WHAT = {
-    "parity": "Actions equal those of upstream's own code.",
-    "batches": "Actions are the same alone and in any batch.",
-    "isolation": "Sessions in a batch do not affect each other.",
-    "loading": "Invalid checkpoints are rejected.",
-    "size": "The model has the published size.",
-}
+BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
+WHAT = ("parity", "batches", "isolation", "loading", "size")  # the columns that the page explains
 PLUGINS = ("arro",)  # wrappers of packages in plugins/, with a page among those of the policies
+FURTHER_PAGES = (*PLUGINS, PAGE.stem)  # of no policy
 # Of each family: the names of its requirements, and the packages and checkouts whose versions
 # matter.
 RUN_WITH = {
@@ -131,102 +127,94 @@ def marked(family: str) -> Iterator[tuple[str, str]]:
                     yield f"{file.name}::{node.name}", ast.literal_eval(mark.args[0])
 
 
-def table(family: str) -> str:
-    """The table of a family's page, in Markdown."""
-    requirements, _ = RUN_WITH[family]
-    noted = [one for one in notes(family) if one["tests"]]
-    ran = (
-        f"They ran with {'; and with '.join(map(_with, noted))}."
-        if noted
-        else "They have not run yet."
-    )
-    groups: dict[tuple[str, str], list[str]] = {}  # tests by what they verify and by their file
-    for name, what in sorted(marked(family), key=lambda one: list(WHAT).index(one[1])):
-        groups.setdefault((what, name.partition("::")[0]), []).append(name)
-    rows, seen = list[str](), set[str]()
-    for (what, file), names in groups.items():
-        cells = [_reason_once(_result(one, names), seen) for one in noted] or ["not run"]
-        rows.append(f"| {WHAT[what]} | `{file}` | {' | '.join(cells)} |")
-    cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
+def table() -> str:
+    """Return the table of all families, and the list of their tests that did not run, in
+    Markdown.
+    """
+    rows, not_run = list[str](), list[str]()
+    for family in RUN_WITH:
+        for results in [one for one in notes(family) if one["tests"]] or [None]:
+            rows.append(_row(family, results))
+            if results is not None:
+                not_run += _reasons(family, results)
     return "\n".join(
         [
-            (
-                f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small "
-                f"random checkpoints. {ran}"
-            ),
-            "",
-            f"| verified | `{folder_of(family).relative_to(ROOT)}` | {' | '.join(cases)} |",
-            f"|---|---{'|---' * len(cases)}|",
+            f"| policy | {' | '.join(WHAT)} | versions |",
+            f"|---|{'---|' * len(WHAT)}---|",
             *rows,
+            "",
+            "Tests that did not run:",
+            "",
+            *not_run,
         ]
     )
 
 
-def with_table(page: str, family: str) -> str:
-    """The text of a family's page with its table between the markers."""
-    begin = BEGIN.format(family)
-    if page.count(begin) != 1:
-        raise ValueError(f"{page_of(family).name}: want {begin} once, and {END} after its table")
-    return re.sub(
-        f"{begin}.*?{END}", lambda _: f"{begin}\n{table(family)}\n{END}", page, flags=re.DOTALL
-    )
+def with_table(page: str) -> str:
+    """Return the text of the page with the table between the markers."""
+    if page.count(BEGIN) != 1:
+        raise ValueError(f"{PAGE.name}: expected {BEGIN} once, and {END} after its table")
+    return re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", page, flags=re.DOTALL)
 
 
-def page_of(family: str) -> Path:
-    """The page that has a family's table."""
-    one = find_entry("policies", family)
-    name = (one.page if one else None) or family
-    return PAGES / f"{name.partition('#')[0]}.md"
+def page_of(family: str) -> str:
+    """Return the page of a family and the section, such as "pi0#openpi"."""
+    entry = find_entry("policies", family)
+    return (entry.page if entry else None) or family
 
 
 def main() -> None:
-    for family in RUN_WITH:
-        file = page_of(family)
-        file.write_text(with_table(file.read_text(), family))
+    PAGE.write_text(with_table(PAGE.read_text()))
 
 
-def _with(noted: dict[str, Any]) -> str:
-    versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
-    return f"Python {noted['python']}, {versions}, on {noted['device']}"
+def _row(family: str, results: dict[str, Any] | None) -> str:
+    """Return the row of a family in one Python; without results, its tests have not run."""
+    file, hash_sign, section = page_of(family).partition("#")
+    link = f"[`{family}`]({file}.md{hash_sign}{section})"
+    if results is None:
+        return f"| {link} | {' | ' * len(WHAT)}not run |"
+    cells = []
+    for verified in WHAT:
+        names = [name for name, what in marked(family) if what == verified]
+        outcomes = sum((Counter(results["tests"].get(name, {})) for name in names), Counter[str]())
+        passed = outcomes.pop("passed", 0)
+        others = [f"{number} {outcome}" for outcome, number in sorted(outcomes.items())]
+        cells.append(", ".join([str(passed)] * bool(passed) + others))
+    return f"| {link} | {' | '.join(cells)} | {_environment_of(results)} |"
 
 
-def _quoted(words: str) -> str:
-    return f'"{words}"' if " " in words else words
+def _environment_of(results: dict[str, Any]) -> str:
+    absent = ("not set", "not installed")
+    versions = [
+        f"{f'`{name}`' if name.isupper() else name} {number}"
+        for name, number in results["versions"].items()
+        if number not in absent
+    ]
+    return ", ".join([f"Python {results['python']}", *versions, "on " + results["device"]])
+
+
+def _reasons(family: str, results: dict[str, Any]) -> Iterator[str]:
+    """Yield a line for each reason why marked tests of a family were skipped or not run."""
+    files_by_reason: dict[str, list[str]] = {}
+    for name, _ in marked(family):
+        file = name.partition("::")[0]
+        if name not in results["tests"]:
+            reason = results.get("left_out", {}).get(
+                file, "tests that are newer than these results"
+            )
+        elif name in results.get("skipped", {}):
+            reason = results["skipped"][name]
+        else:
+            continue
+        files = files_by_reason.setdefault(reason, [])
+        if f"`{file}`" not in files:
+            files.append(f"`{file}`")
+    for reason, files in files_by_reason.items():
+        yield f"- `{family}`, Python {results['python']}, {', '.join(files)}: {reason}."
 
 
 def _python() -> str:
     return ".".join(platform.python_version_tuple()[:2])
-
-
-def _result(noted: dict[str, Any], names: list[str]) -> str:
-    """Return the summed outcomes of some tests, with the reasons why others were skipped or not
-    run.
-    """
-    ran = [name for name in names if name in noted["tests"]]
-    outcomes = sum((Counter(noted["tests"][name]) for name in ran), Counter[str]())
-    said = ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
-    if skipped := _once(
-        noted["skipped"][name] for name in ran if "skipped" in noted["tests"][name]
-    ):
-        said = f"{said}: {skipped}"
-    files = (name.partition("::")[0] for name in names if name not in ran)
-    not_run = _once(
-        noted.get("left_out", {}).get(file, "it is newer than these results") for file in files
-    )
-    return "; ".join(filter(None, (said, not_run and f"not run: {not_run}")))
-
-
-def _reason_once(result: str, seen: set[str]) -> str:
-    """Return a cell, without its reason if `seen`, to which it is added, has that."""
-    outcome, _, reason = result.partition(": ")
-    if reason in seen:
-        return outcome
-    seen.add(reason)
-    return result
-
-
-def _once(reasons: Iterable[str]) -> str:
-    return "; ".join(dict.fromkeys(reasons))
 
 
 def installed_version(name: str) -> str:
@@ -248,9 +236,7 @@ def _environment(family: str) -> dict[str, Any]:
     versions = {name: installed_version(name) for name in RUN_WITH[family][1]}
     torch = sys.modules.get("torch")
     device = (
-        torch.cuda.get_device_name()
-        if torch is not None and torch.cuda.is_available()
-        else "a CPU, not on a GPU"
+        torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU"
     )
     return {"python": _python(), "versions": versions, "device": device}
 

@@ -10,16 +10,17 @@ from typing import Any
 
 import pytest
 
-LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for the family's page
+LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for docs/policies/verification.md
 if importlib.util.find_spec("lerobot") is not None:
     from plugins.vlagents_ray_models.tests.families.lerobot.conftest import loaded, made
 
     __all__ = ["loaded", "made"]
     LEFT_OUT |= dict.fromkeys(
-        ("test_gr00t.py", "test_loading.py"), "it is the policy `gr00t`, tried without LeRobot"
+        ("test_gr00t.py", "test_loading.py"),
+        "it tests the policy `gr00t`, in an environment without LeRobot",
     )
 else:
-    LEFT_OUT |= {"test_groot.py": "it is the policy `lerobot`, tried with LeRobot 0.6"}
+    LEFT_OUT |= {"test_groot.py": "it tests the policy `lerobot`, with LeRobot 0.6"}
 collect_ignore = list(LEFT_OUT)
 
 MARKS = [

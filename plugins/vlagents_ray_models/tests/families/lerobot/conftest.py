@@ -23,19 +23,19 @@ torch.set_num_threads(1)  # the models are too small for more: threads would wai
 # LeRobot 0.4 runs pi0 and pi0.5 only with a transformers that has openpi's changes, such as this
 # module.
 PATCHED = tiny.NEW or importlib.util.find_spec("transformers.models.siglip.check") is not None
-LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for the family's page
+LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for docs/policies/verification.md
 if tiny.NEW:
     of_both = ("adapters", "hilserl", "learning", "pi_recipe", "plugins", "recipe")
     LEFT_OUT |= dict.fromkeys(
         (f"test_{name}.py" for name in of_both),
-        "the code is that of the other version, with which it is tried",
+        "it runs with LeRobot 0.4 only",
     )
 else:
     LEFT_OUT |= {"test_rollout.py": "LeRobot 0.4 has no lerobot-rollout"}
 if not PATCHED:
     LEFT_OUT |= dict.fromkeys(
         ("test_pi.py", "test_pi_calls.py", "test_pi_recipe.py"),
-        "transformers is without openpi's changes",
+        "this transformers lacks openpi's changes",
     )
 if not hasattr(PI05Config, LONGEST_PREFIX):
     LEFT_OUT["test_prefixes.py"] = "the newest release of LeRobot, 0.6.1, gives π0.5 no prefixes"
@@ -46,7 +46,7 @@ if importlib.util.find_spec("ray") is None:
         "test_hilserl.py",
         "test_training.py",
     )
-    LEFT_OUT |= dict.fromkeys(of_ray, "no Ray here, as its Python is another")
+    LEFT_OUT |= dict.fromkeys(of_ray, "this environment has no Ray")
 collect_ignore = list(LEFT_OUT)
 
 Load = Callable[..., LeRobot]

@@ -37,7 +37,7 @@ PATCHED = all(
 )
 patched = pytest.mark.skipif(
     not PATCHED,
-    reason="transformers is not patched by openpi's models_pytorch/transformers_replace",
+    reason="openpi's `transformers_replace` was not copied over transformers",
 )
 
 
