@@ -15,7 +15,7 @@
 #   make dist                                                       what a release publishes, checked, in dist
 #   make release [UPLOAD=1]                                         check, build and tag a version; the tag publishes it
 #   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
-#   make bench                                                      measure, and write the figures of docs/measured.md again
+#   make bench                                                      measure, and write docs/measured_tables.md again
 #   make gpu [RUN=acts] [DRY=1] [GPU_PYTHON=python3] [STEPS="facts,tests"]     all that needs a GPU, in two runs of seven
 #                                                                   minutes, acts and serving, into build/gpu
 #   make gpu-pack                                                   what `make gpu` needs where there is no network

@@ -24,6 +24,7 @@ import vlagents_ray
 from benchmarks.calls import CallCounter, CountedNoop, counted
 from benchmarks.console import Out, Transports, save, show_skipped
 from benchmarks.figures import measured_on
+from benchmarks.further_tables import replace_rows
 from benchmarks.own_clients import OwnClient, connect, observation
 from vlagents_ray.cli.console import errors, out, table
 from vlagents_ray.cli.options import parse_list
@@ -189,8 +190,9 @@ def trace_acts(clients: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
 def main(
     acts: Annotated[int, typer.Option(min=1, help="Acts that are counted.")] = 200,
     transports: Transports = "",
-    markdown: Annotated[
-        bool, typer.Option(help="Print the table of docs/measured_tables.md.")
+    table_of_page: Annotated[
+        bool,
+        typer.Option("--table", help="Write the table of docs/measured_tables.md again."),
     ] = False,
     out_file: Out = None,
 ) -> None:
@@ -211,26 +213,30 @@ def main(
         }
         if any("system" not in way["client"] for way in measured["ways"]):
             measured["skipped"]["system calls"] = "strace is not installed"
-        if markdown:
-            out.print(page_table(measured["ways"]), soft_wrap=True, markup=False)
+        if table_of_page:
+            head, rows = page_table(measured["ways"])
+            replace_rows("CPU cost of a call", head, rows, measured["date"])
+            out.print("wrote the table; python -m benchmarks.report --from-json writes the page")
         else:
             show(measured)
         save(measured, out_file)
 
 
-def page_table(ways: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of docs/measured_tables.md: a row for each way, with both sides."""
+def page_table(ways: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return the table of docs/measured_tables.md: its headings, and a row for each transport with
+    the numbers of both sides.
+    """
     numbers = ("files", "classes", *_COUNTS)
-    head = [""]
+    head = ["transport"]
     for side in ("client", "replica"):
         head += [f"{side}: {numbers[0]}", *numbers[1:]]
-    lines = [head, ["---"] * len(head)]
+    rows = []
     for way in ways:
         cells = [way["way"]]
         for side in SIDES:
             cells += _cells(way[side], decimals=0)
-        lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        rows.append(cells)
+    return head, rows
 
 
 def _cells(side: Mapping[str, Any], decimals: int) -> list[str]:

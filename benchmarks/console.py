@@ -55,7 +55,7 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
 USE_COLUMNS = (
     "client CPU ms",
     "server CPU ms",
-    "acts/s of a server's core",
+    "calls per second of a server's core",
     "server's programs, CPU ms",
     "client waits",
     "server waits",

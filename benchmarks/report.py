@@ -1,7 +1,8 @@
 """The figures of docs/measured_tables.md: measured in one run, compared with targets, and written
 as Markdown.
 
-Figures of `python -m benchmarks.evaluation --report FILE` in the same file are also compared.
+The page also has the tables of `further_tables.json`. Figures of `python -m benchmarks.evaluation
+--report FILE` in the same file are also compared.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rich.text import Text
 from benchmarks import link
 from benchmarks.console import USE_COLUMNS, Calls, use_cells
 from benchmarks.figures import measured_on
+from benchmarks.further_tables import FurtherTable, read_tables, table_markdown
 from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.picture import plot_league
 from benchmarks.rtt import measure_with_peers
@@ -29,13 +31,20 @@ from vlagents_ray.registry import require
 from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 COMMAND = "python -m benchmarks.report"
-BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
+_INTRODUCTION = """# All tables
+
+[The main results](measured.md) come from these tables; that page explains the method. `python -m
+benchmarks.report` writes this page.
+
+## Round trips and throughput
+"""
 PICTURE = Path("pictures", "league.svg")  # beside the page
 Results = Mapping[str, Any]  # of `collect`
 
 ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
 THROUGHPUTS = ("throughput", "without_gain")
+_WAIT = "wait of a robot, p50 / p99 ms"
 LIMIT_P99 = 3.0
 LIMIT_OF_IDEAL = 0.98
 LIMIT_WAIT_MS = 72.0  # two full batches of 20 ms + 16 x 1 ms
@@ -86,18 +95,15 @@ def collect(
 
 
 def write(results: Mapping[str, Any], page: Path, file: Path | None) -> None:
-    """Write the section into the page, its picture beside it, and the figures into `file` for
-    the next time.
-    """
+    """Write the page, its picture beside it, and the figures into `file` for the next time."""
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(results, indent=1) + "\n")
-    text = replaced(page.read_text(), section(results))
     if results.get("rtt"):
         picture = page.parent / PICTURE
         picture.parent.mkdir(exist_ok=True)
         plot_league(results, picture)
-    page.write_text(text)
+    page.write_text(page_text(results, read_tables()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,21 +240,14 @@ def unmeasured(what: str, wanted: str) -> Outcome:
     return Outcome(what, wanted, "not measured", None)
 
 
-def replaced(text: str, section: str) -> str:
-    """Put `section` between the two markers of `text`. Raises `ConfigError` unless it has both,
-    once.
-    """
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end or BEGIN in after or END in before + after:
-        raise ConfigError(
-            f"the page has no single pair {BEGIN} … {END}; put it where the figures belong"
-        )
-    return f"{before}{BEGIN}\n{section.strip()}\n{END}{after}"
+def page_text(results: Results, further: Sequence[FurtherTable]) -> str:
+    """Return the text of the page: the figures of `collect`, then the further tables."""
+    sections = [f"{_INTRODUCTION}\n{section(results)}", *(table.to_markdown() for table in further)]
+    return "\n\n".join(sections) + "\n"
 
 
 def section(results: Mapping[str, Any]) -> str:
-    """Return the text between the markers: round trips, the link, throughput, and their origin.
+    """Return the first section: round trips, the link, throughput, and their origin.
 
     The comparison with targets is printed, see `show_outcomes`.
     """
@@ -276,8 +275,8 @@ def _origin(results: Mapping[str, Any]) -> str:
         f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, "
         f"{machine['cores']} cores, {machine['memory_gb']} GB, Linux {machine['kernel']}, load "
         f"average {machine['load']:.1f} before it began. {versions}. Two 224x224 RGB cameras, a "
-        "policy that does nothing, all ways in turns of 100 calls in one run; in brackets 95 % "
-        "intervals. A turn begins cold, which is most of what the p99 column shows."
+        "policy that does nothing, all systems interleaved in rounds of 100 calls; brackets "
+        "contain 95 % intervals. Each round begins cold, which explains most of the column p99."
     )
 
 
@@ -301,18 +300,14 @@ def _league(results: Results) -> str:
         for one in found:
             row += [_rate(one[name]["curve"][-1]), _waits(one[name])] if name in one else ["", ""]
         rows.append(row)
-    head = ["", "median ms", "p99 ms", "of the fastest"]
+    head = ["system", "median ms", "p99 ms", "of the fastest"]
     for name in THROUGHPUTS:
         part = results.get(name) or {}
-        head += (
-            [f"actions/s of {part['clients']}, {policy_of(part)}", "a robot waits, p50 / p99 ms"]
-            if part
-            else ["", ""]
-        )
-    text = "Round trips of one `act` on one machine, and the actions a second of many clients"
+        head += [f"actions/s of {part['clients']}, {policy_of(part)}", _WAIT] if part else ["", ""]
+    text = "Round trips of one call on one machine, and actions per second of many clients"
     return (
-        f"![{text}]({PICTURE})\n\n{text}; *other systems* run their own servers and "
-        f"clients:\n\n{_table(head, rows)}"
+        f"![{text}]({PICTURE})\n\n{text}; *other systems* use their own servers and "
+        f"clients:\n\n{table_markdown(head, rows)}"
     )
 
 
@@ -359,8 +354,8 @@ def _round_trips(title: str, part: Mapping[str, Any]) -> str:
                 *(f"{ratios[peer]['ratio']:.2f}" if peer in ratios else "" for peer in theirs),
             )
         )
-    return f"{title}:\n\n" + _table(
-        ("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows
+    return f"{title}:\n\n" + table_markdown(
+        ("system", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows
     )
 
 
@@ -370,17 +365,17 @@ def _use(use: Results) -> str:
         for name, one in sorted(use.items(), key=lambda one: one[1]["server"]["cpu_ms"])
     ]
     text = (
-        "CPU time of the same acts, beyond that of the idle processes, and how often a thread of "
-        "client or server waited or was preempted:"
+        "CPU time of the same calls, without the CPU time of the idle processes, and how often a "
+        "thread of client or server waited or was preempted:"
     )
-    return f"{text}\n\n{_table(('', *USE_COLUMNS), rows)}"
+    return f"{text}\n\n{table_markdown(('system', *USE_COLUMNS), rows)}"
 
 
 def _throughput(part: Results) -> str:
     counts = list(
         dict.fromkeys(point["clients"] for row in rows_of(part) for point in row["curve"])
     )
-    head = ("", "of the ideal", *(f"K = {k}" for k in counts), "a robot waits, p50 / p99 ms")
+    head = ("system", "of the ideal", *(f"K = {k}" for k in counts), _WAIT)
     rows = []
     for row in rows_of(part):
         rates = {point["clients"]: _rate(point) for point in row["curve"]}
@@ -389,11 +384,11 @@ def _throughput(part: Results) -> str:
             (name, f"{row['of_ideal']:.3f}", *(rates.get(k, "") for k in counts), _waits(row))
         )
     text = (
-        f"Actions a second of one replica by K clients ({policy_of(part)}; ideal "
+        f"Actions per second of one replica with K clients ({policy_of(part)}; ideal "
         f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and how long a robot among "
         f"{part['clients'] - 1} simulations waits:"
     )
-    return f"{text}\n\n{_table(head, rows)}"
+    return f"{text}\n\n{table_markdown(head, rows)}"
 
 
 def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
@@ -404,11 +399,6 @@ def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
         found |= (results.get(part) or {}).get("skipped", {})
     for name, reason in found.items():
         yield f"{name} ({reason.partition(';')[0]})"  # without the cure
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def show_outcomes(lines: Sequence[Outcome]) -> None:
@@ -423,9 +413,9 @@ def show_outcomes(lines: Sequence[Outcome]) -> None:
 
 
 def main(
-    page: Annotated[
-        Path, typer.Option(help="Its text between the bench markers is replaced.")
-    ] = Path("docs/measured_tables.md"),
+    page: Annotated[Path, typer.Option(help="The page that is written.")] = Path(
+        "docs/measured_tables.md"
+    ),
     file: Annotated[Path, typer.Option("--out", help="Keep the figures here.")] = Path(
         "benchmarks/latest.json"
     ),
@@ -442,9 +432,8 @@ def main(
     docs/measured_tables.md again.
     """
     with errors():
-        if not page.is_file():
-            raise ConfigError(f"--page {page}: does not exist")
-        replaced(page.read_text(), "")  # raises without markers, before anything is measured
+        if not page.parent.is_dir():
+            raise ConfigError(f"--page {page}: expected an existing folder, got {page.parent}")
         require("matplotlib")
         if from_json:
             try:

@@ -288,7 +288,7 @@ _ALTERNATIVES = {
 
 
 def test_the_figures_of_the_alternatives_are_the_measured_ones() -> None:
-    table, _, _ = _read("measured_tables.md").partition("CPU time of the same acts")
+    table, _, _ = _read("measured_tables.md").partition("CPU time of the same calls")
     rows = [[cell.strip() for cell in line.split("|")[1:]] for line in table.splitlines()]
     measured = {row[0]: row for row in rows if len(row) > 4}
     quoted = re.findall(

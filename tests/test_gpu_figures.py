@@ -85,7 +85,7 @@ def test_the_pages_have_figures_of_a_gpu() -> None:
     measured = [
         passage for passage in gpu_passages() if has_figure(passage) and COMMIT.search(passage)
     ]
-    assert len(measured) >= 7
+    assert len(measured) >= 5
 
 
 TABLE = "π0 in CUDA graphs (NVIDIA H200, torch 2.11.0, 2026-11-26, commit 8a082135):\n\n| rows | act ms |\n| --- | --- |\n| 1 | 55.3 |"

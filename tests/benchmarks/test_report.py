@@ -1,16 +1,19 @@
-"""The section of docs/measured_tables.md follows from the figures alone."""
+"""docs/measured_tables.md follows from the figures alone."""
 
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks.further_tables import FILE, read_tables, replace_rows
 from benchmarks.picture import plot_league
-from benchmarks.report import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
-from vlagents_ray.errors import ConfigError
+from benchmarks.report import DEFAULT, JPEG, outcomes, page_text, section
+
+ROOT = Path(__file__).parents[2]
 
 
 def way(name: str, ms: float, psnr: float | None = None) -> dict[str, Any]:
@@ -189,16 +192,22 @@ def test_the_picture_has_all_systems(tmp_path: Path) -> None:
         assert name in text
 
 
-def test_only_what_is_between_the_markers_is_replaced() -> None:
-    text = f"# Title\n{BEGIN}\nold\n{END}\nrest\n"
-    assert replaced(text, "new") == f"# Title\n{BEGIN}\nnew\n{END}\nrest\n"
-    assert replaced(replaced(text, "new"), "new") == replaced(text, "new")
+def test_the_page_follows_from_the_figures() -> None:
+    results = json.loads((ROOT / "benchmarks" / "latest.json").read_text())
+    page = (ROOT / "docs" / "measured_tables.md").read_text()
+    assert page == page_text(results, read_tables()), "run python -m benchmarks.report --from-json"
 
 
-@pytest.mark.parametrize("text", ["", BEGIN, END + BEGIN, f"{BEGIN}{END}{BEGIN}{END}"])
-def test_a_page_without_a_pair_of_markers_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="bench"):
-        replaced(text, "new")
+def test_a_new_measurement_replaces_the_table_of_its_title(tmp_path: Path) -> None:
+    file = tmp_path / "tables.json"
+    file.write_text(FILE.read_text())
+    first, *others = read_tables(file)
+    replace_rows(first.title, ["robots", "ms"], [["1", "2.5"]], "2026-12-01", file)
+    changed, *unchanged = read_tables(file)
+    assert unchanged == others
+    assert f"(`{first.command}`, 2026-12-01):\n\n| robots | ms |" in changed.to_markdown()
+    with pytest.raises(KeyError, match="other"):
+        replace_rows("other", [], [], "2026-12-01", file)
 
 
 def test_evaluations_are_judged_where_they_were_measured() -> None:
