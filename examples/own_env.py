@@ -3,7 +3,7 @@
 `Crane` is the simulator, with other units, colours and conventions than this project. You write
 `CraneEnv`. `python own_env.py` checks it, in the folder of this file, and `vlagents-ray eval
 own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it; own_policy.py is one that
-works. `vlagents-ray new env NAME` writes a skeleton with its test.
+works. `vlagents-ray init env NAME` writes a skeleton with its test.
 """
 
 import numpy as np

@@ -8,7 +8,7 @@ towards the mark; your model replaces its 2 x 2 weights. In the folder of this f
     robots, simulators and evaluations vlagents-ray eval own_env:CraneEnv --policy
     http://localhost:8000 --out runs/crane
 
-`vlagents-ray new policy NAME` writes a skeleton with its test and its deployment file.
+`vlagents-ray init policy NAME` writes a skeleton with its test and its deployment file.
 """
 
 import time

@@ -306,10 +306,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["keys", "revoke", "arm1", "--keys", "k.json"],
         ["arm1", "'arm-1'", "did you mean"],
     ),
-    "new: kind": (["new", "polic", "x"], ["polic", "policy"]),
-    "new: name": (["new", "policy", "1 bad"], ["1 bad", "my_policy"]),
-    "new: installed": (["new", "policy", "numpy"], ["'numpy'", "hide"]),
-    "new: keyword": (["new", "policy", "class"], ["'class'", "module"]),
+    "new: kind": (["init", "polic", "x"], ["polic", "policy"]),
+    "init: name": (["init", "policy", "1 bad"], ["1 bad", "my_policy"]),
+    "init: installed": (["init", "policy", "numpy"], ["'numpy'", "hide"]),
+    "init: keyword": (["init", "policy", "class"], ["'class'", "module"]),
     "venv create": (["venv", "create", "nothing.txt"], ["nothing.txt", "requirements file"]),
     "venv create: misspelt": (["venv", "create", "lerobt"], ["'lerobt'", "did you mean 'lerobot'"]),
     "tune: no file": (["tune", "noop"], ["deployment file", ".yaml"]),
@@ -469,7 +469,7 @@ def test_a_mistake_on_the_command_line_is_answered_with_its_cure(
     "words",
     [
         ["keys", "create", "x", "--keys", "new.json"],
-        *(["new", kind, "mine"] for kind in ("policy", "env", "dialect", "plugin")),
+        *(["init", kind, "mine"] for kind in ("policy", "env", "dialect", "plugin")),
     ],
     ids=" ".join,
 )

@@ -1,7 +1,7 @@
 """The tables of README and docs/ about policies and environments: `python tests/support/tables.py`
 writes them.
 
-It also writes examples/plugin, by the skeleton of `vlagents-ray new plugin`, and published.json.
+It also writes examples/plugin, by the skeleton of `vlagents-ray init plugin`, and published.json.
 
 They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME
 -->` and `<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
@@ -19,7 +19,7 @@ import tomllib
 from programs import others, ran, settings
 from verified import FURTHER_PAGES, RUN_WITH, marked, notes
 
-from vlagents_ray.cli.new import render
+from vlagents_ray.cli.init import render
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import CORE, RegistryEntry, entries
 
@@ -73,7 +73,7 @@ def published() -> str:
 
 
 def example_plugin() -> dict[Path, str]:
-    """Return the text of each file of examples/plugin, which is what `vlagents-ray new plugin
+    """Return the text of each file of examples/plugin, which is what `vlagents-ray init plugin
     homing` writes.
     """
     return {
@@ -196,7 +196,7 @@ _RAPTOR = (
     "a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | "
     f"{verified('RAPTOR')}"
 )
-_OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME` | "
+_OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray init policy NAME` | "
 TABLES: dict[str, dict[str, list[str]]] = {
     "README.md": {
         "policies": [

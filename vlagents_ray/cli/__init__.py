@@ -25,6 +25,12 @@ def main() -> None:
     # This handler applies until a command has its own, see `cli.console.errors`.
     default = signal.signal(signal.SIGINT, _end_at_once)
 
+    if sys.argv[1:] == ["--version"]:  # also in the light install
+        from vlagents_ray.cli.help_page import version_line
+
+        sys.stdout.write(f"{version_line()}\n")
+        return
+
     # This command is in the light install, and Ctrl-C in it stops the robot.
     if sys.argv[1:2] == ["robot"]:
         from vlagents_ray.cli.robot import main as robot

@@ -6,11 +6,99 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
+from vlagents_ray.cli.help_page import (
+    HELP,
+    VERSION,
+    HelpPage,
+    HelpPanel,
+    HelpRow,
+    default_text,
+    row,
+    usage_error,
+    version_line,
+)
 from vlagents_ray.naming import did_you_mean
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose help and errors look like those of Typer's commands.
+
+    Its groups of arguments have a title and, as description, a note that follows the rows.
+    """
+
+    def __init__(self, command: str, description: str, examples: Sequence[str] = ()) -> None:
+        """Create a parser with the options --help and --version.
+
+        Args:
+            command: The command as it is typed.
+            description: The description, in paragraphs.
+            examples: Command lines without "vlagents-ray".
+        """
+        super().__init__(prog=command, add_help=False, allow_abbrev=False)
+        self._text = description
+        self._examples = tuple(f"vlagents-ray {example}" for example in examples)
+        self.general = self.add_argument_group("Options")
+        self.general.add_argument("--version", action=_Version, nargs=0, help=VERSION)
+        self.general.add_argument("-h", "--help", action="help", help=HELP)
+
+    def help_page(self) -> HelpPage:
+        """Return the help."""
+        panels: list[HelpPanel] = []
+        arguments = [action for action in self._actions if not action.option_strings]
+        if arguments:
+            rows = tuple(row(_term(action), action.help or "") for action in arguments)
+            panels.append(HelpPanel("Arguments", rows))
+        groups = [group for group in self._action_groups if group is not self.general]
+        for group in (*groups, self.general):
+            actions = [action for action in group._group_actions if action.option_strings]
+            actions.sort(key=lambda action: action.dest in ("version", "help"))  # these are last
+            if actions:
+                rows = tuple(_option_row(action) for action in actions)
+                panels.append(HelpPanel(group.title or "", rows, group.description or ""))
+        return HelpPage(self.format_usage(), self._text, tuple(panels), self._examples)
+
+    def format_usage(self) -> str:
+        """Return the usage on one line."""
+        words = [self.prog, "[OPTIONS]"]
+        for action in self._actions:
+            if not action.option_strings:
+                words.append(_term(action) if action.required else f"[{_term(action)}]")
+        return " ".join(words)
+
+    def format_help(self) -> str:
+        """Return the help as text."""
+        return self.help_page().text()
+
+    def error(self, message: str) -> NoReturn:
+        """Print an error, and end the process with status 2."""
+        self.exit(2, usage_error(self.format_usage(), self.prog, message))
+
+
+class _Version(argparse.Action):
+    """The option that prints the version, which is looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        sys.stdout.write(f"{version_line()}\n")
+        parser.exit()
+
+
+def _term(action: argparse.Action) -> str:
+    """Return an argument of the command line as the help shows it."""
+    metavar = str(action.metavar or action.dest.upper())
+    if not action.option_strings:
+        return metavar
+    names = ", ".join(action.option_strings)
+    return names if action.nargs == 0 else f"{names} {metavar}"
+
+
+def _option_row(action: argparse.Action) -> HelpRow:
+    default = "" if action.nargs == 0 else default_text(action.default)
+    return row(_term(action), action.help or "", default, required=action.required)
 
 
 def number(
@@ -63,7 +151,7 @@ def one_of(*names: str) -> dict[str, Any]:
             )
         return text
 
-    return {"type": read, "metavar": f"{{{','.join(names)}}}"}
+    return {"type": read, "metavar": "|".join(names)}
 
 
 def parse_all(

@@ -69,21 +69,27 @@ class EvalOptions:
     source: Annotated[
         str | None,
         typer.Option(
-            "--policy", help="The policy: a registered name, a deployment file, or a URL."
+            "--policy",
+            metavar="POLICY",
+            help="The policy: a registered name, a deployment file, or a URL.",
         ),
     ] = None
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="Folder of the results; default: the file's, or runs/NAME of the file; without a "
-            "file a new one, runs/ENV-TIME.",
+            metavar="FOLDER",
+            help="Folder of the results; default: runs/NAME for the file NAME.yaml, otherwise a "
+            "new folder runs/ENV-TIME.",
         ),
     ] = None
     episodes: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MOST_EPISODES, help="Number of episodes in each environment; default: 10."
+            min=1,
+            max=MOST_EPISODES,
+            metavar="N",
+            help="Number of episodes in each environment; default: 10.",
         ),
     ] = None
     workers: Annotated[
@@ -91,14 +97,16 @@ class EvalOptions:
         typer.Option(
             min=0,
             max=MOST_WORKERS,
-            help="Number of environments that run in parallel; 0 runs them in this process, "
-            "without Ray. Default: 0 for a short evaluation, else 1.",
+            metavar="N",
+            help="Number of environments that run in parallel. 0 runs them in this process, "
+            "without Ray; default: 0 for a short evaluation, otherwise 1.",
         ),
     ] = None
     cpus: Annotated[
         float | None,
         typer.Option(
             "--worker-cpus",
+            metavar="N",
             min=0,
             max=MOST_CPUS,
             callback=finite,
@@ -109,6 +117,7 @@ class EvalOptions:
         float | None,
         typer.Option(
             "--worker-gpus",
+            metavar="N",
             min=0,
             max=MOST_CPUS,
             callback=finite,
@@ -120,25 +129,37 @@ class EvalOptions:
         int | None,
         typer.Option(
             "--seed",
+            metavar="N",
             min=0,
             max=MOST_SEED,
-            help="Seed of the first episode; episode i uses seed + i; default: 0.",
+            help="Seed of the first episode. Episode i uses seed + i; default: 0.",
         ),
     ] = None
     video: Annotated[
         str | None,
-        typer.Option(help="Episodes whose video is written: none, failures (default) or all."),
+        typer.Option(
+            metavar="none|failures|all",
+            help="Episodes whose video is written; default: failures.",
+        ),
     ] = None
     record: Annotated[
         str | None,
-        typer.Option(help="Episodes whose trajectory is written: none (default), failures or all."),
+        typer.Option(
+            metavar="none|failures|all",
+            help="Episodes whose trajectory is written; default: none.",
+        ),
     ] = None
     record_images: Annotated[
         str | None,
-        typer.Option(help="Images of trajectories: small (H.264, default) or exact (each pixel)."),
+        typer.Option(
+            metavar="small|exact",
+            help="Images of the trajectories: compressed with H.264, or exact pixels; default: "
+            "small.",
+        ),
     ] = None
     track: Annotated[
-        str, typer.Option(help="Trackers such as wandb, with commas between them.")
+        str,
+        typer.Option(metavar="NAMES", help="Trackers, such as wandb, separated by commas."),
     ] = ""
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the evaluation in the folder --out.")
@@ -147,14 +168,17 @@ class EvalOptions:
         bool,
         typer.Option(
             "--accept-changes",
-            help="With --resume: continue even if files or weights have changed, which the report "
-            "records.",
+            help="With --resume: continue even if files or weights have changed. The report lists "
+            "the changes.",
         ),
     ] = False
     execute: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MOST_ROWS, help="Number of rows executed of each chunk; default: all."
+            min=1,
+            max=MOST_ROWS,
+            metavar="N",
+            help="Number of rows of each chunk that are executed; default: all.",
         ),
     ] = None
     retries: Annotated[
@@ -162,6 +186,7 @@ class EvalOptions:
         typer.Option(
             min=0,
             max=MOST_RETRIES,
+            metavar="N",
             help="Number of further attempts at an episode that infrastructure lost; default: 3.",
         ),
     ] = None
@@ -170,8 +195,8 @@ class EvalOptions:
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A setting of the policy; with a file of runs, of the file, such as "
-            "suites.0.episodes=5. +KEY=VALUE adds a new one, ~KEY removes one; may be repeated.",
+            help="Set a setting of the policy, or a key of the file of runs, such as "
+            "suites.0.episodes=5. +KEY=VALUE adds a key, and ~KEY removes one. May be repeated.",
         ),
     ] = field(default_factory=list)
     config_dir: ConfigDir = None
@@ -180,7 +205,7 @@ class EvalOptions:
         typer.Option(
             "--env-set",
             metavar="KEY=VALUE",
-            help="An option of the environments, such as width=256; may be repeated.",
+            help="An option of the environments, such as width=256. May be repeated.",
         ),
     ] = field(default_factory=list)
     options: Annotated[
@@ -188,7 +213,7 @@ class EvalOptions:
         typer.Option(
             "--reset-set",
             metavar="KEY=VALUE",
-            help="An option of the policy's reset, such as checkpoint_step=9; may be repeated.",
+            help="An option of the policy's reset, such as checkpoint_step=9. May be repeated.",
         ),
     ] = field(default_factory=list)
     watch: Annotated[
@@ -214,6 +239,7 @@ class EvalOptions:
             min=0,
             max=MOST_S,
             callback=finite,
+            metavar="S",
             help="With --watch: treat a checkpoint as complete after this number of seconds "
             "without changes; default: 10.",
         ),
@@ -360,9 +386,9 @@ def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: run episodes in parallel, and report success rates with confidence
     intervals and videos.
 
-    A file contains policies, their checkpoints, suites of environments and seeds. --set changes
-    it, and the options --out, --workers, --video, --record, --record-images, --track, --retries
-    and --resume override it.
+    A file of runs contains policies, their checkpoints, suites of environments and seeds. --set
+    changes its keys. --out, --workers, --video, --record, --record-images, --track, --retries and
+    --resume override them.
 
     Exit status: 0 if every episode has a result; 75 if episodes are left because of --end-at, 130
     if the evaluation was interrupted (continue both with --resume); 2 for invalid settings; 3 if an

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+PROMPT = "$ "
 # Command -> command lines, without "vlagents-ray". Those of plug-ins are in their registry.
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "serve": (
@@ -42,10 +43,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "keys list": ("keys list --keys keys.json",),
     "keys revoke": ("keys revoke arm-1 --keys keys.json",),
-    "new policy": ("new policy my_policy",),
-    "new env": ("new env my_env",),
-    "new dialect": ("new dialect my_dialect",),
-    "new plugin": ("new plugin my_plugin",),
+    "init policy": ("init policy my_policy",),
+    "init env": ("init env my_env",),
+    "init dialect": ("init dialect my_dialect",),
+    "init plugin": ("init plugin my_plugin",),
 }
 
 
@@ -55,6 +56,6 @@ def epilog(examples: Iterable[str]) -> str:
     Args:
         examples: Command lines without "vlagents-ray".
     """
-    lines = [f"$ vlagents-ray {example}" for example in examples]
+    lines = [f"{PROMPT}vlagents-ray {example}" for example in examples]
     # Typer joins lines that no empty line separates.
     return "\n\n".join(["Examples:", *lines])

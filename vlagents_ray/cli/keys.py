@@ -20,11 +20,16 @@ keys = typer.Typer(no_args_is_help=True, help="Create, list and revoke the API k
 File = Annotated[
     Path | None,
     typer.Option(
-        "--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder."
+        "--keys",
+        metavar="FILE",
+        help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.",
     ),
 ]
 Name = Annotated[
-    str, typer.Argument(help="Name of the robot or program that uses the key, such as arm-1.")
+    str,
+    typer.Argument(
+        metavar="NAME", help="Name of the robot or program that uses the key, such as arm-1."
+    ),
 ]
 
 
@@ -35,7 +40,8 @@ def create(
     app: Annotated[
         list[str],
         typer.Option(
-            help="An application for which the key is valid; may be repeated; default: all."
+            metavar="NAME",
+            help="An application for which the key is valid. May be repeated; default: all.",
         ),
     ] = [],  # noqa: B006
     rate: Annotated[
@@ -44,24 +50,32 @@ def create(
             min=0.001,
             max=1e6,
             callback=finite,
-            help="Most requests per second, at each replica.",
+            metavar="N",
+            help="Largest number of requests per second at each replica.",
         ),
     ] = None,
     sessions: Annotated[
         int | None,
-        typer.Option(min=1, max=1_000_000, help="Most sessions at the same time, at each replica."),
+        typer.Option(
+            min=1,
+            max=1_000_000,
+            metavar="N",
+            help="Largest number of sessions at the same time at each replica.",
+        ),
     ] = None,
     priority: Annotated[
         str | None,
         typer.Option(
-            help="Highest priority of its requests; with 'simulation', robots are served first."
+            metavar="PRIORITY",
+            help="Highest priority of its requests; with 'simulation', robots are served first.",
         ),
     ] = None,
     scope: Annotated[
         list[str],
         typer.Option(
-            help="A further permission: 'weights' to push weights, 'watch' to see all sessions, "
-            "'operate' to send commands to them; may be repeated."
+            metavar="weights|watch|operate",
+            help="A further permission: to push weights, to see all sessions, or to send commands "
+            "to them. May be repeated.",
         ),
     ] = [],  # noqa: B006
     days: Annotated[
@@ -70,6 +84,7 @@ def create(
             min=0.001,
             max=36_500,
             callback=finite,
+            metavar="N",
             help="Number of days after which the key expires.",
         ),
     ] = None,

@@ -4,7 +4,6 @@ import Ray.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,10 +16,12 @@ from vlagents_ray.cli import results
 from vlagents_ray.cli.console import errors, fail, fresh, out, print_json, progress, table
 from vlagents_ray.cli.evaluate import evaluate_command
 from vlagents_ray.cli.examples import EXAMPLES, epilog
+from vlagents_ray.cli.help_page import VERSION, version_line
+from vlagents_ray.cli.init import init
 from vlagents_ray.cli.keys import keys
-from vlagents_ray.cli.new import new
 from vlagents_ray.cli.options import AsJson, Commands
 from vlagents_ray.cli.serve import serve_command
+from vlagents_ray.cli.typer_help import use_help_pages
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import find_entry, names, not_installed, pip_install, registered_function
@@ -37,6 +38,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    # Errors are plain text, as those of `vlagents-ray robot`.
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 
@@ -44,7 +47,7 @@ app = typer.Typer(
 def _print_version(requested: bool) -> None:
     """Print the version, and end the command."""
     if requested:
-        out.print(f"vlagents-ray {importlib.metadata.version('vlagents-ray')}")
+        out.print(version_line())
         raise typer.Exit
 
 
@@ -52,9 +55,7 @@ def _print_version(requested: bool) -> None:
 def commands(
     version: Annotated[
         bool,
-        typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="Print the version."
-        ),
+        typer.Option("--version", is_eager=True, callback=_print_version, help=VERSION),
     ] = False,
 ) -> None:
     """Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation."""
@@ -83,15 +84,15 @@ def robot_command(context: typer.Context) -> None:
     raise typer.Exit(main(context.args))
 
 
-@app.command(short_help="Try it in a minute: serve a policy, evaluate it, record videos.")
+@app.command(short_help="Serve and evaluate a policy in a minute, with videos.")
 def demo(
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path(
-        "runs/demo"
-    ),
+    out_dir: Annotated[
+        Path, typer.Option("--out", metavar="FOLDER", help="Folder of the results.")
+    ] = Path("runs/demo"),
 ) -> None:
-    """Try it in a minute: serve a policy, evaluate it on the tabletop, record videos.
+    """Serve a policy, evaluate it on four tasks of the tabletop, and record videos, in a minute.
 
-    In a checkout this is the reference policy, which was trained; elsewhere it is the scripted
+    In a checkout this is the reference policy, which was trained. Elsewhere it is the scripted
     policy, which needs no weights.
     """
     from vlagents_ray.cli.evaluation import run_evaluation
@@ -124,21 +125,28 @@ def demo(
         run_evaluation(config)
 
 
-@app.command(short_help="Check this machine: Python, Ray, GPU, ports; each with the cure.")
+@app.command(short_help="Check this machine, and print the cure of each problem.")
 def doctor(
     port: Annotated[
-        int, typer.Option(min=1, max=65535, help="The port on which a server would listen.")
+        int,
+        typer.Option(
+            min=1, max=65535, metavar="PORT", help="The port on which a server would listen."
+        ),
     ] = 8000,
     python: Annotated[
         list[Path],
         typer.Option(
-            help="The Python of a policy's environment; may be repeated; default: those in .venv-*."
+            metavar="FILE",
+            help="The Python of a policy's environment. May be repeated; default: those in "
+            ".venv-*.",
         ),
     ] = [],  # noqa: B006
     as_json: AsJson = False,
 ) -> None:
-    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each
-    with the cure.
+    """Check this machine, and print the cure of each problem: Python, Ray, GPU, torch, JAX,
+    rendering, shared memory and ports.
+
+    Exit status: 0 if no check failed, 1 if one did.
     """
     from vlagents_ray.cli.doctor import run
 
@@ -151,13 +159,13 @@ def doctor(
 for _command, _name, _short_help in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
-    (results.replay_command, "replay", "Play an episode again, and compare actions."),
+    (results.replay_command, "replay", "Run an episode again, and compare the actions."),
 ):
     app.command(_name, short_help=_short_help, rich_help_panel=_MORE)(_command)
 for _commands, _name, _short_help in (
     (venv, "venv", "Create Python environments for policies."),
     (keys, "keys", "Create, list and revoke the API keys of a server."),
-    (new, "new", "Write a working skeleton, with its test."),
+    (init, "init", "Write a working skeleton, with its test."),
 ):
     app.add_typer(_commands, name=_name, short_help=_short_help, rich_help_panel=_MORE)
 
@@ -278,21 +286,29 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 def create(
     requirements: Annotated[
         Path,
-        typer.Argument(help="The name of a model family, such as lerobot, or a requirements file."),
+        typer.Argument(
+            metavar="REQUIREMENTS",
+            help="The name of a model family, such as lerobot, or a requirements file.",
+        ),
     ],
     out_dir: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder of the environment; default: .venv-NAME."),
+        typer.Option(
+            "--out", metavar="FOLDER", help="Folder of the environment; default: .venv-NAME."
+        ),
     ] = None,
     more: Annotated[
         list[Path],
-        typer.Option("--with", help="A further requirements file; may be repeated."),
+        typer.Option(
+            "--with", metavar="FILE", help="A further requirements file. May be repeated."
+        ),
     ] = [],  # noqa: B006
     python: Annotated[
         str | None,
         typer.Option(
+            metavar="PYTHON",
             help="Version or interpreter of Python; default: the version in the file, or the "
-            "version that runs this command."
+            "version that runs this command.",
         ),
     ] = None,
     light: Annotated[
@@ -334,3 +350,4 @@ def _add_examples(group: typer.Typer, prefix: str = "") -> None:
 
 
 _add_examples(app)
+use_help_pages(app)

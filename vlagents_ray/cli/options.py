@@ -16,8 +16,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import typer
 from pydantic import ValidationError
-from typer.core import TyperGroup
 
+from vlagents_ray.cli.typer_help import HelpGroup
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.overrides import (
     YAML_SUFFIXES,
@@ -36,8 +36,8 @@ Set = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="A setting of the policy, also one of its file: KEY=VALUE sets it, +KEY=VALUE adds a "
-        "new one, ~KEY removes it; may be repeated.",
+        help="A setting of the policy, also one in its deployment file: KEY=VALUE sets it, "
+        "+KEY=VALUE adds a new one, and ~KEY removes it. May be repeated.",
     ),
 ]
 SetInFile = Annotated[
@@ -45,8 +45,8 @@ SetInFile = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="A change of the file: KEY=VALUE sets a value, +KEY=VALUE adds a new one, ~KEY "
-        "removes one; may be repeated.",
+        help="A change of the file: KEY=VALUE sets a value, +KEY=VALUE adds a new one, and ~KEY "
+        "removes one. May be repeated.",
     ),
 ]
 ServeSet = Annotated[
@@ -54,8 +54,8 @@ ServeSet = Annotated[
     typer.Option(
         "--serve-set",
         metavar="KEY=VALUE",
-        help="A setting of the server, such as batch.max_size=8, +KEY=VALUE or ~KEY; may be "
-        "repeated.",
+        help="A setting of the server, such as batch.max_size=8: KEY=VALUE, +KEY=VALUE or ~KEY. "
+        "May be repeated.",
     ),
 ]
 ConfigDir = Annotated[
@@ -69,8 +69,10 @@ ConfigDir = Annotated[
 Address = Annotated[
     str | None,
     typer.Option(
-        help="A running Ray cluster, where 'auto' finds the one of `ray start`, or the URL of a "
-        "local server, to use its Ray cluster; default: a new cluster on this machine, for the run."
+        metavar="ADDRESS",
+        help="A running Ray cluster: its address, 'auto' for the cluster of `ray start`, or the "
+        "URL of a local server, to use its cluster; default: a new cluster on this machine, for "
+        "the run.",
     ),
 ]
 
@@ -86,7 +88,7 @@ LiveAt = Annotated[
     typer.Option(
         "--live-at",
         metavar="HOST:PORT",
-        help="Like --live, at this address; an address that other machines reach needs API keys.",
+        help="Like --live, at this address. An address that other machines reach needs API keys.",
     ),
 ]
 
@@ -158,7 +160,7 @@ def _in_panel(hint: Any, title: str) -> Any:
     return Annotated[(hinted_type, *in_panel)]
 
 
-class Commands(TyperGroup):
+class Commands(HelpGroup):
     """The group of all commands, whose errors name the value of an option that cannot be read."""
 
     def invoke(self, ctx: Any) -> Any:

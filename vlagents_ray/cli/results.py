@@ -34,6 +34,7 @@ def report_command(
         Path | None,
         typer.Option(
             "--out",
+            metavar="FILE",
             help="File of the report; default: report.html in FOLDER; with several folders: "
             "./report.html.",
         ),
@@ -46,7 +47,8 @@ def report_command(
         bool,
         typer.Option(
             "--accept-changes",
-            help="Compare even if files, weights or environments differ, which the report records.",
+            help="Compare even if files, weights or environments differ. The report lists the "
+            "differences.",
         ),
     ] = False,
     as_json: AsJson = False,
@@ -103,24 +105,30 @@ def export_command(
         typer.Argument(metavar="FOLDER", help="Folder of results, or a LeRobotDataset."),
     ],
     path: Annotated[
-        Path, typer.Option("--out", help="New file or folder, depending on the format.")
+        Path,
+        typer.Option("--out", metavar="PATH", help="New file or folder, depending on the format."),
     ],
-    to: Annotated[str, typer.Option(help="; ".join(_described_formats()) + ".")],
+    to: Annotated[
+        str,
+        typer.Option(metavar="FORMAT", help="The format. " + "; ".join(_described_formats()) + "."),
+    ],
     policy: Annotated[
         str | None,
         typer.Option(
-            help="Export only the episodes of this policy: NAME, or NAME@STEP of one checkpoint."
+            metavar="POLICY",
+            help="Export only the episodes of this policy: NAME, or NAME@STEP of one checkpoint.",
         ),
     ] = None,
     env: Annotated[
-        str | None, typer.Option(help="Export only the episodes in this environment.")
+        str | None,
+        typer.Option(metavar="ENV", help="Export only the episodes in this environment."),
     ] = None,
     settings: Annotated[
         list[str],
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A setting of the format, such as successes=true; may be repeated.",
+            help="A setting of the format, such as successes=true. May be repeated.",
         ),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
@@ -208,26 +216,32 @@ def replay_command(
     episode: Annotated[
         str | None,
         typer.Argument(
-            help="The episode: its key, or ENV#NUMBER such as 'tabletop#3'.", show_default=False
+            metavar="[EPISODE]",
+            help="The episode: its key, or ENV#NUMBER, such as 'tabletop#3'.",
+            show_default=False,
         ),
     ] = None,
     policy: Annotated[
         str | None,
         typer.Option(
+            metavar="POLICY",
             help="Another policy: a name, a deployment file, or a URL; default: the policy of the "
-            "evaluation."
+            "evaluation.",
         ),
     ] = None,
     settings: Set = [],  # noqa: B006
     config_dir: ConfigDir = None,
     out_dir: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder of the replay; default: a new one in FOLDER."),
+        typer.Option(
+            "--out", metavar="FOLDER", help="Folder of the replay; default: a new one in FOLDER."
+        ),
     ] = None,
     address: Address = None,
 ) -> None:
-    """Run an episode of an evaluation again, and compare both. The exit code is 0 if all is the
-    same.
+    """Run an episode of an evaluation again, and compare the actions and the outcome.
+
+    Exit status: 0 if both are the same, 1 if they differ.
     """
     with errors():
         from vlagents_ray.cli.evaluation import play_one

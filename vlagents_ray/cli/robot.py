@@ -1,8 +1,7 @@
-"""Drive a robot, with the light install: a served policy in the control loop, and a report at its
-end.
+"""Drive a robot with a served policy in the control loop, and print a report at the end.
 
-With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator
-corrects.
+With --env, drive a simulation instead: with a policy, with an operator, or with a policy that an
+operator corrects.
 
 The API key of the server is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own
 CA from SSL_CERT_FILE.
@@ -20,6 +19,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -27,8 +27,9 @@ from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import RobotControl
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.chunking.timeliness import in_words
-from vlagents_ray.cli.arguments import number, one_of, parse_all
+from vlagents_ray.cli.arguments import CommandParser, number, one_of, parse_all
 from vlagents_ray.cli.examples import EXAMPLES
+from vlagents_ray.cli.help_page import HelpPage, HelpPanel, HelpRow
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract
@@ -573,38 +574,71 @@ def _restarting(
         yield has_terminal
 
 
-def _names_of_plugins() -> str:
-    """Return the subcommands, robots and devices of plug-ins as lines, also of those that are
-    not installed.
+def _panels_of_plugins() -> Iterator[HelpPanel]:
+    """Yield the subcommands, robots and devices of plug-ins, also of those that are not
+    installed.
     """
-    lines: list[str] = []
     for title, group, prefix in (
-        ("subcommands", "commands", "robot."),
-        ("robots by name", "robots", ""),
-        ("leaders by name", "leaders", ""),
+        ("Subcommands", "commands", "robot."),
+        ("Robots (--robot)", "robots", ""),
+        ("Leaders (--teleop)", "leaders", ""),
     ):
-        lines.append(f"{title}:")
+        rows: list[HelpRow] = []
         for name, entry in entries(group).items():
             if name.startswith(prefix):
                 suffix = entry.tasks if group == "robots" else ""
-                typed_name = name.removeprefix(prefix) + suffix
-                lines.append(f"  {typed_name:<21} {entry.about}")
+                rows.append(HelpRow(name.removeprefix(prefix) + suffix, entry.about))
         for name, distribution in not_installed(group).items():
             if name.startswith(prefix):
                 cure = pip_install(distribution=distribution)
-                lines.append(f"  {name.removeprefix(prefix):<21} not installed: {cure}")
-        lines.append("")
-    return "\n".join(lines).replace("%", "%%")
+                rows.append(HelpRow(name.removeprefix(prefix), f"not installed: {cure}"))
+        if rows:
+            yield HelpPanel(title, tuple(rows))
 
 
-class _RobotParser(argparse.ArgumentParser):
-    """A parser whose help ends with examples and the names of plug-ins, which are read then."""
+class _RobotParser(CommandParser):
+    """A parser whose help has the names of plug-ins, which are read then."""
 
-    def format_help(self) -> str:
-        """Return the help, with examples and the names of plug-ins at its end."""
-        examples = "".join(f"  vlagents-ray {line}\n" for line in EXAMPLES["robot"])
-        self.epilog = f"examples:\n{examples}\n{_names_of_plugins()}"
-        return super().format_help()
+    def help_page(self) -> HelpPage:
+        """Return the help, with the names of plug-ins at its end."""
+        page = super().help_page()
+        return replace(page, panels=(*page.panels, *_panels_of_plugins()))
+
+
+class _Options:
+    """The options of the command, which are added to one parser in groups.
+
+    Attributes:
+        only_robot: The options that are rejected with --env.
+        only_env: The options that need --env.
+    """
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self.only_robot: list[argparse.Action] = []
+        self.only_env: list[argparse.Action] = []
+        self._parser = parser
+        self._group = parser.add_argument_group("Options")
+
+    def begin(self, title: str, note: str = "") -> None:
+        """Begin a group, to which further options belong.
+
+        Args:
+            title: The title of the group.
+            note: A sentence about it.
+        """
+        self._group = self._parser.add_argument_group(title, note)
+
+    def both(self, *names: str, **settings: Any) -> None:
+        """Add an option of a robot and of a simulation."""
+        self._group.add_argument(*names, **settings)
+
+    def robot(self, *names: str, **settings: Any) -> None:
+        """Add an option of a robot."""
+        self.only_robot.append(self._group.add_argument(*names, **settings))
+
+    def env(self, *names: str, **settings: Any) -> None:
+        """Add an option of a simulation."""
+        self.only_env.append(self._group.add_argument(*names, **settings))
 
 
 def command_parser() -> tuple[
@@ -615,254 +649,273 @@ def command_parser() -> tuple[
     Returns:
         The parser, the options that are rejected with --env, and the options that need --env.
     """
-    parser = _RobotParser(
-        prog="vlagents-ray robot",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = _RobotParser("vlagents-ray robot", __doc__ or "", EXAMPLES["robot"])
+    parser.add_argument(
+        "policy",
+        nargs="?",
+        metavar="POLICY",
+        help="URL of the policy's server. With --env, it may also be a registered policy, "
+        "'module:Class', or be left out.",
     )
-    # By default, each error would list all options.
-    parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"
-    robot_group = parser.add_argument_group("a robot")
-    env_group = parser.add_argument_group("a simulation")
-    robot_actions: list[argparse.Action] = []
-    env_actions: list[argparse.Action] = []
-    add = parser.add_argument
+    options = _Options(parser)
+    _add_robot_and_simulation(options)
+    _add_chunk_options(options)
+    _add_safety_options(options)
+    _add_server_options(options)
+    return parser, options.only_robot, options.only_env
+
+
+def _add_robot_and_simulation(options: _Options) -> None:
+    """Add the options of the robot, of the simulation, and of the operator."""
+    seconds = number(above=True)
+    settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
+
+    options.begin("Robot", "With --env, only --hz applies.")
+    options.robot(
+        "--robot",
+        metavar="ROBOT",
+        help="A name from the list below, or your MODULE:CLASS; default: a simulated robot.",
+    )
+    options.robot("--robot-set", **settings, help="An argument of the robot. May be repeated.")
+    options.robot("--instruction", metavar="TEXT", help="The task in words.")
+    options.robot(
+        "--seconds", type=seconds, default=60.0, metavar="S", help="Length of the run in seconds."
+    )
+    options.both(
+        "--hz",
+        type=number(above=True, maximum=_MOST_HZ),
+        metavar="HZ",
+        help=f"Control rate in Hz; default: {_HZ:g}, or the rate of the environment.",
+    )
+    options.robot(
+        "--real-time",
+        action="store_true",
+        help="Run the loop with SCHED_FIFO instead of a higher priority (nice).",
+    )
+
+    options.begin("Simulation")
+    options.both(
+        "--env",
+        metavar="ENV",
+        help="Drive this environment instead of a robot, such as tabletop or "
+        "maniskill/PickCube-v1.",
+    )
+    options.env(
+        "--env-set",
+        **settings,
+        help="An option of the environment, such as width=256. May be repeated.",
+    )
+    options.env("--set", **settings, help="A setting of the policy. May be repeated.")
+    options.env(
+        "--episodes",
+        type=number(int, minimum=1),
+        default=10,
+        metavar="N",
+        help="Number of episodes.",
+    )
+    options.env(
+        "--seed",
+        type=number(int),
+        default=0,
+        metavar="N",
+        help="Seed of the first episode. Each further episode has the next number.",
+    )
+
+    options.begin("Operator and recording")
+    options.both(
+        "--teleop",
+        metavar="LEADER",
+        help="Device with which an operator takes over: a name from the list below, or your "
+        "MODULE:CLASS.",
+    )
+    options.both(
+        "--step",
+        type=seconds,
+        metavar="N",
+        help="Increment of an action value per tick, for each pressed key or moved axis of the "
+        "leader.",
+    )
+    options.robot(
+        "--allow-remote-stop",
+        action="store_true",
+        help="Obey commands of the server's live page: pause, stop, success and failure. Not with "
+        "--env.",
+    )
+    options.both(
+        "--record",
+        metavar="FOLDER",
+        help="Record a LeRobotDataset v3.0 in this folder. Needs the extra 'record'.",
+    )
+    options.both(
+        "--rerun",
+        metavar="FOLDER",
+        help="Write a .rrd file for Rerun into this folder; 'live' shows the run in Rerun's "
+        "viewer.",
+    )
+
+
+def _add_chunk_options(options: _Options) -> None:
+    """Add the options of the chunk player."""
     seconds = number(above=True)
     rows = number(int, minimum=1)
 
-    def real(*names: str, **settings: Any) -> None:
-        """Add an option of a robot."""
-        robot_actions.append(robot_group.add_argument(*names, **settings))
-
-    def simulated(*names: str, **settings: Any) -> None:
-        """Add an option of a simulation."""
-        env_actions.append(env_group.add_argument(*names, **settings))
-
-    add(
-        "policy",
-        nargs="?",
-        help="URL of the policy's server; with --env also a registered policy, 'module:Class', or "
-        "nothing",
-    )
-    add(
-        "--hz",
-        type=number(above=True, maximum=_MOST_HZ),
-        help=f"control rate (default: {_HZ:g}, or the environment's)",
-    )
-    real(
-        "--seconds",
-        type=seconds,
-        default=60.0,
-        help="length of the run in seconds (default: %(default)s)",
-    )
-    real("--instruction", help="the task in words")
-    real(
-        "--robot",
-        metavar="ROBOT",
-        help="a name from the list below, or your MODULE:CLASS (default: a simulated robot)",
-    )
-    real(
-        "--robot-set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="an argument of the robot; may be repeated",
-    )
-    add(
-        "--teleop",
-        metavar="LEADER",
-        help="device with which an operator takes over: a name from the list below, or your "
-        "MODULE:CLASS",
-    )
-    add(
-        "--step",
-        type=seconds,
-        help="increment of the leader: what a key or an axis adds to a number of the action at "
-        "each tick",
-    )
-    add(
+    options.begin("Action chunks", "With --env, only --mode and --execute apply.")
+    options.both(
         "--mode",
         **one_of(*get_args(Mode)),
-        help="mode of the chunk player, see PlayerSettings (default: async; with --env: open_loop)",
+        help="When the next chunk is requested, and how it is executed, see docs/control_loop.md; "
+        "default: async, with --env open_loop.",
     )
-    add(
+    options.both(
         "--execute",
         type=rows,
         metavar="N",
-        help="number of rows of a chunk that are executed before the next request",
+        help="Number of rows of a chunk that are executed before the next request.",
     )
-    real(
+    options.robot(
         "--horizon",
         type=rows,
         metavar="N",
-        help="largest number of rows of a chunk that may be executed",
+        help="Largest number of rows of a chunk that may be executed.",
     )
-    real(
-        "--max-age-s",
-        type=seconds,
-        metavar="S",
-        help="largest age of the observation from which an executed action was computed, in "
-        "seconds",
-    )
-    real(
+    options.robot(
         "--merge",
         **one_of(*MERGES, ENSEMBLE),
         default="newest",
-        help="how overlapping chunks are merged (default: %(default)s)",
+        help="How overlapping chunks are merged.",
     )
-    real(
+    options.robot(
         "--rtc",
         action="store_true",
-        help="real-time chunking: send the leftover plan and the expected delay with each request",
+        help="Real-time chunking: send the leftover plan and the expected delay with each request.",
     )
-    real(
+    options.robot(
+        "--max-age-s",
+        type=seconds,
+        metavar="S",
+        help="Largest age, in seconds, of the observation from which an executed action was "
+        "computed.",
+    )
+    options.robot(
         "--deadline-ms",
         type=number(),
-        help="time for which a tick waits for an action, in ms (default: async 0, other modes "
-        f"{WAIT_S * 1e3:.0f})",
+        metavar="MS",
+        help="Time for which a tick waits for an action, in ms; default: 0 in mode async, "
+        f"{WAIT_S * 1e3:.0f} in other modes.",
     )
-    real(
+    options.robot(
         "--safe",
         **one_of("auto", "hold", "zero"),
         default="auto",
-        help="action at a tick for which the policy has none (default: %(default)s)",
+        help="Action at a tick for which the policy has none.",
     )
-    add(
+
+
+def _add_safety_options(options: _Options) -> None:
+    """Add the options of the guard and of the watchdog."""
+    options.begin("Safety", "With --env, only --max-step, --limits and --soft-start-s apply.")
+    options.both(
         "--max-step",
         type=number(),
-        help="largest change of a number of the action from one tick to the next",
+        metavar="N",
+        help="Largest change of an action value from one tick to the next.",
     )
-    real(
-        "--measure",
-        metavar="PART",
-        help="part of the state with the measured pose, such as joints; the first action is "
-        "compared with it",
-    )
-    add(
+    options.both(
         "--limits",
         metavar="PATH",
-        help="file with limits of motion: .yaml, .json, .urdf, or the folder of a dataset; see "
-        "docs/guard.md",
+        help="File with limits of motion: .yaml, .json, .urdf, or the folder of a dataset, see "
+        "docs/guard.md.",
     )
-    add(
+    options.both(
         "--soft-start-s",
         type=number(),
         default=SOFT_START_S,
-        help="time over which the limits of --limits rise from 50 %% to 100 %%, in seconds of "
-        "motion (default: %(default)s)",
+        metavar="S",
+        help="Time, in seconds of motion, over which the limits of --limits rise from half to "
+        "full.",
     )
-    real(
+    options.robot(
+        "--measure",
+        metavar="PART",
+        help="Part of the state with the measured pose, such as joints. The first action is "
+        "compared with it.",
+    )
+    options.robot(
         "--stats",
         metavar="FILE",
-        help="file with the statistics of the training, which the arm's pose and the first chunk "
-        "must fit (default: the server's statistics, if it has any)",
+        help="Statistics of the training, which the arm's pose and the first chunk must fit; "
+        "default: the server's statistics, if it has any.",
     )
-    real(
+    options.robot(
         "--ignore-mismatch",
         action="store_true",
-        help="move although they do not fit; the log records it",
+        help="Move even if the pose or the first chunk does not fit the statistics. The log "
+        "records it.",
     )
-    real(
+    options.robot(
+        "--silent-s",
+        type=number(above=True),
+        default=2.0,
+        metavar="S",
+        help="Stop the robot if the server is silent for this number of seconds.",
+    )
+    options.robot(
         "--restart",
         **one_of(*get_args(Restart)),
-        help="restart after a stop: manual by Enter, C or SIGUSR1, or auto when the server answers "
-        "again (default: manual; for a simulated robot: auto)",
+        help="How the robot restarts after a stop: with Enter, C or SIGUSR1 (manual), or when the "
+        "server answers again (auto); default: manual, for a simulated robot auto.",
     )
-    real(
+
+
+def _add_server_options(options: _Options) -> None:
+    """Add the options of the server and of the planner."""
+    seconds = number(above=True)
+
+    options.begin("Server (not with --env)")
+    options.robot(
+        "--transport",
+        **one_of("auto", "shm", "websocket", "http"),
+        default="auto",
+        help="Transport to the server.",
+    )
+    options.robot(
+        "--timeout-s",
+        type=seconds,
+        default=10.0,
+        metavar="S",
+        help="Timeout of a request in seconds.",
+    )
+    options.robot(
         "--slo-age-ms",
         type=seconds,
         metavar="MS",
-        help="age, in milliseconds, above which an executed action is of little use: the server "
-        "says before the first motion whether it can serve the robot so",
+        help="Largest useful age of an executed action, in ms. Before the first motion, the server "
+        "reports whether it can serve the robot within it.",
     )
-    real(
+    options.robot(
         "--slo-share",
         type=number(above=True, maximum=1),
         default=SHARE,
         metavar="SHARE",
-        help="share of the ticks that need an action in time (default: %(default)s)",
+        help="Share of the ticks that need an action within --slo-age-ms.",
     )
-    real(
+
+    options.begin("Planner (not with --env)")
+    options.robot(
         "--planner",
         metavar="URL",
-        help="URL of a planner, a second and slower model: its newest subtask is in each "
-        "observation of the policy, and the robot holds while that is too old",
+        help="URL of a planner, a second and slower model. Each observation of the policy contains "
+        "its newest subtask, and the robot holds while that is too old.",
     )
-    real(
+    options.robot(
         "--planner-hz",
         type=number(above=True, maximum=_MOST_HZ),
         metavar="HZ",
-        help=f"rate at which the planner is asked (default: {_PLANNER_HZ:g})",
+        help=f"Rate at which the planner is called; default: {_PLANNER_HZ:g}.",
     )
-    real(
+    options.robot(
         "--planner-max-age-s",
         type=seconds,
         metavar="S",
-        help=f"age in seconds above which a subtask is too old (default: {_PLANNER_MAX_AGE_S:g})",
+        help=f"Age, in seconds, above which a subtask is too old; default: {_PLANNER_MAX_AGE_S:g}.",
     )
-    real(
-        "--silent-s",
-        type=seconds,
-        default=2.0,
-        help="stop the robot if the server is silent for this number of seconds (default: "
-        "%(default)s)",
-    )
-    real(
-        "--timeout-s",
-        type=seconds,
-        default=10.0,
-        help="timeout of a request in seconds (default: %(default)s)",
-    )
-    real(
-        "--transport",
-        **one_of("auto", "shm", "websocket", "http"),
-        default="auto",
-        help="transport to the server (default: %(default)s)",
-    )
-    add(
-        "--record",
-        metavar="DIR",
-        help="record a LeRobotDataset v3.0 in this folder; needs the extra 'record'",
-    )
-    add(
-        "--rerun",
-        metavar="DIR",
-        help="folder in which a .rrd file for Rerun is written, or 'live' to show the run in "
-        "Rerun's viewer",
-    )
-    real(
-        "--allow-remote-stop",
-        action="store_true",
-        help="obey commands of the server's live page: pause, stop, success, failure",
-    )
-    real(
-        "--real-time",
-        action="store_true",
-        help="run the loop with SCHED_FIFO instead of a higher priority (nice)",
-    )
-
-    env_group.add_argument(
-        "--env", metavar="NAME", help="the environment, such as tabletop or maniskill/PickCube-v1"
-    )
-    settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
-    simulated(
-        "--env-set",
-        **settings,
-        help="an option of the environment, such as width=256; may be repeated",
-    )
-    simulated("--set", **settings, help="a setting of the policy; may be repeated")
-    simulated(
-        "--episodes",
-        type=rows,
-        default=10,
-        metavar="N",
-        help="number of episodes (default: %(default)s)",
-    )
-    simulated(
-        "--seed",
-        type=number(int),
-        default=0,
-        help="seed of the first episode; each further episode has the next number (default: "
-        "%(default)s)",
-    )
-    return parser, robot_actions, env_actions

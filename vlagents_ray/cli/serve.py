@@ -38,19 +38,26 @@ class ServeOptions:
 
     source: Annotated[
         str,
-        typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml)."),
+        typer.Argument(
+            metavar="POLICY",
+            help="A registered policy, 'module:Class', or a deployment file (.yaml).",
+        ),
     ]
     host: Annotated[
         str | None,
         typer.Option(
+            metavar="HOST",
             help="Address on which the server listens, such as 0.0.0.0; default: the file's, or "
-            "127.0.0.1."
+            "127.0.0.1.",
         ),
     ] = None
     port: Annotated[
         int | None,
         typer.Option(
-            min=1, max=65535, help="Port on which the server listens; default: the file's, or 8000."
+            min=1,
+            max=65535,
+            metavar="PORT",
+            help="Port on which the server listens; default: the file's, or 8000.",
         ),
     ] = None
     settings: Set = field(default_factory=list)
@@ -61,6 +68,7 @@ class ServeOptions:
         typer.Option(
             min=1,
             max=65535,
+            metavar="PORT",
             help="A further port, which accepts clients of the package vlagents.",
         ),
     ] = None
@@ -68,8 +76,9 @@ class ServeOptions:
     keys: Annotated[
         Path | None,
         typer.Option(
+            metavar="FILE",
             help="File of the API keys; default: the variable VLAGENTS_RAY_KEYS_FILE or "
-            "VLAGENTS_RAY_KEYS."
+            "VLAGENTS_RAY_KEYS.",
         ),
     ] = None
     insecure: Annotated[
@@ -80,15 +89,18 @@ class ServeOptions:
     ] = False
     tls_cert: Annotated[
         Path | None,
-        typer.Option(help="Certificate in PEM, with which https:// and wss:// are served."),
+        typer.Option(
+            metavar="FILE", help="Certificate in PEM, with which https:// and wss:// are served."
+        ),
     ] = None
     tls_key: Annotated[
-        Path | None, typer.Option(help="Private key of the certificate, in PEM.")
+        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate, in PEM.")
     ] = None
     tls_client_ca: Annotated[
         Path | None,
         typer.Option(
-            help="CA in PEM; only clients with a certificate that it has signed are accepted."
+            metavar="FILE",
+            help="CA in PEM; only clients with a certificate that it has signed are accepted.",
         ),
     ] = None
 
@@ -127,7 +139,10 @@ _PANELS = {
 
 @command_of(ServeOptions, _PANELS)
 def serve_command(options: ServeOptions) -> None:
-    """Serve a policy until Ctrl-C."""
+    """Serve a policy until Ctrl-C.
+
+    Exit status: 0 after Ctrl-C or SIGTERM, 2 for invalid settings, 1 for any other failure.
+    """
     from vlagents_ray.serve.launch.deployment_file import with_dialect, with_gateways_at
     from vlagents_ray.serve.launch.server import running_server
 

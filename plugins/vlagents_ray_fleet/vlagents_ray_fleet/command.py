@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def plan_command(
-    file: Annotated[Path, typer.Argument(help="The file of the fleet (.yaml).")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file of the fleet (.yaml).")],
     out_file: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write the plan as a deployment file."),
@@ -28,14 +28,27 @@ def plan_command(
     ] = False,
     seconds: Annotated[
         float,
-        typer.Option(min=1, max=86_400, callback=finite, help="Of the simulation, virtual time."),
+        typer.Option(
+            min=1,
+            max=86_400,
+            callback=finite,
+            metavar="S",
+            help="With --check: simulated time in seconds.",
+        ),
     ] = 60.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of the simulation.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, max=2**32 - 1, metavar="N", help="With --check: seed of the simulation."
+        ),
+    ] = 0,
     settings: SetInFile = [],  # noqa: B006
     config_dir: ConfigDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute the replicas, batch sizes and GPUs with which all robots of a fleet are in time."""
+    """Compute the replicas, batch sizes and GPUs with which all robots of a fleet receive their
+    actions in time.
+    """
     # Imported late, so that the help of the command line is fast.
     from vlagents_ray_fleet.check import check as run_check
     from vlagents_ray_fleet.deployment import deployment_document, write_deployment

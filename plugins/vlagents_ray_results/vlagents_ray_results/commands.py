@@ -16,20 +16,22 @@ from vlagents_ray.cli.results import Folder
 
 def merge_command(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results, which stay.")
+        list[Path],
+        typer.Argument(metavar="FOLDER...", help="Folders of results, which are not changed."),
     ],
-    into: Annotated[Path, typer.Option("--out", help="New folder.")],
+    into: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="New folder.")],
     keep_first: Annotated[
         bool,
         typer.Option(
             "--keep-first",
-            help="Of different outcomes of an episode keep that of the first folder.",
+            help="If folders have different outcomes of an episode, keep the first one's.",
         ),
     ] = False,
     accept_changes: Annotated[
         bool,
         typer.Option(
-            "--accept-changes", help="Although files or weights differ; the report says so."
+            "--accept-changes",
+            help="Merge even if files or weights differ. The report lists the differences.",
         ),
     ] = False,
 ) -> None:
@@ -46,14 +48,15 @@ def merge_command(
 def bundle_command(
     folder: Folder,
     file: Annotated[
-        Path | None, typer.Option("--out", help="The file; default: FOLDER.bundle.zip.")
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="The bundle; default: FOLDER.bundle.zip."),
     ] = None,
     videos: Annotated[
-        bool, typer.Option("--videos", help="With its videos, which may be large.")
+        bool, typer.Option("--videos", help="Include the videos, which may be large.")
     ] = False,
 ) -> None:
-    """Write an evaluation as one file: database, differences from commits, trajectories,
-    digests.
+    """Write an evaluation as one file that others can verify: its database, the changes of the
+    code since its commit, the trajectories, and digests of all files.
     """
     from vlagents_ray.evaluate.artifacts.storage import require_folder_of
     from vlagents_ray_results.bundle import write_bundle
@@ -72,7 +75,10 @@ def verify_command(
     replay: Annotated[
         int,
         typer.Option(
-            min=0, max=MOST_EPISODES, help="Episodes whose recorded actions are played again."
+            min=0,
+            max=MOST_EPISODES,
+            metavar="N",
+            help="Number of episodes whose recorded actions are executed again.",
         ),
     ] = 3,
     seed: Annotated[
@@ -80,25 +86,36 @@ def verify_command(
         typer.Option(
             min=0,
             max=2**32 - 1,
-            help="Draw those episodes by this seed; default: a new one, which is printed.",
+            metavar="N",
+            help="Seed with which these episodes are drawn; default: a new one, which is printed.",
         ),
     ] = None,
     into: Annotated[
-        Path | None, typer.Option("--out", help="Keep its results in this new folder.")
+        Path | None,
+        typer.Option("--out", metavar="FOLDER", help="Keep the results in this new folder."),
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Also make environments that name code or files.")
+        bool, typer.Option("--trust", help="Also create environments that name code or files.")
     ] = False,
     max_gb: Annotated[
         float,
-        typer.Option(min=0, max=1e6, callback=finite, help="Refuse a bundle that unpacks to more."),
+        typer.Option(
+            min=0,
+            max=1e6,
+            callback=finite,
+            metavar="GB",
+            help="Reject a bundle whose content is larger than this, in GB.",
+        ),
     ] = 16.0,
     as_json: AsJson = False,
 ) -> None:
-    """Check a bundle, also a stranger's, and print what is equal, differs, or could not be checked.
+    """Check a bundle, and print which parts are equal, differ, or could not be checked.
 
-    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the table, a recording, an
-    outcome of a replay. Other versions of software here are only listed.
+    The bundle may come from a stranger. Different versions of software on this machine are listed,
+    and are no contradiction.
+
+    Exit status: 0 if nothing contradicts the bundle, 1 if a digest, the table of results, a
+    recording or the outcome of a replay does.
     """
     from vlagents_ray_results.verification import verify
 

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
-from vlagents_ray.cli.arguments import number, parse_all
+from vlagents_ray.cli.arguments import CommandParser, number, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.loop import opened, robot_factory
@@ -27,6 +27,10 @@ from vlagents_ray_robot.check import Operator, RobotReport, examine
 from vlagents_ray_robot.mujoco_arm import SimulatedClock
 
 UNDECLARED = 3  # exit status
+EXAMPLES = (
+    "robot check mujoco:so101",
+    "robot check my_arm:MyArm --robot-set port=/dev/ttyACM0 --move --out check.html",
+)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -86,50 +90,48 @@ def _examine(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
     )
 
 
-def command_parser() -> argparse.ArgumentParser:
+def command_parser() -> CommandParser:
     """Return the parser of the command's arguments."""
-    parser = argparse.ArgumentParser(
-        prog="vlagents-ray robot check",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = CommandParser("vlagents-ray robot check", __doc__ or "", EXAMPLES)
+    parser.add_argument(
+        "robot",
+        metavar="ROBOT",
+        help="The robot, such as my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH "
+        "with an MJCF or URDF file, or ros:FILE.",
     )
-    add = parser.add_argument
 
-    names = (
-        "the robot: my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or "
-        "URDF file, or ros:FILE"
-    )
-    add("robot", help=names)
-
+    add = parser.general.add_argument
     add(
         "--robot-set",
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="an argument of the robot; may be repeated",
+        help="An argument of the robot. May be repeated.",
     )
     add(
         "--move",
         action="store_true",
-        help="make small moves, each after a question at the terminal",
+        help="Make small moves, each after a question at the terminal.",
     )
     add(
         "--policy",
         metavar="URL",
-        help="check against the contract of the policy of this server, not against the robot's own",
+        help="Check against the contract of this server's policy instead of the robot's own "
+        "contract.",
     )
     add(
         "--hz",
         type=number(above=True, maximum=10_000.0),
-        help="control rate in Hz (default: the contract's, or 50)",
+        metavar="HZ",
+        help="Control rate in Hz; default: the contract's, or 50.",
     )
     add(
         "--latency-ms",
         type=number(maximum=60_000.0),
         default=400.0,
-        help="longest time from a command to its motion, in ms (default: %(default)s)",
+        metavar="MS",
+        help="Longest time from a command to its motion, in ms.",
     )
-
-    add("--out", metavar="FILE", help="write the report with pictures as an HTML page")
-    add("--json", action="store_true", help="print the report as JSON, for programs")
+    add("--out", metavar="FILE", help="Write the report, with pictures, as an HTML page.")
+    add("--json", action="store_true", help="Print the report as JSON, for programs.")
     return parser

@@ -25,28 +25,29 @@ if TYPE_CHECKING:
 
 slurm = typer.Typer(
     no_args_is_help=True,
-    help="Evaluations and servers as Slurm jobs. Options that are not this command's are sbatch's: "
-    "--nodes, --time, …",
+    help="Submit evaluations and servers as Slurm jobs. Options that are not listed here, such as "
+    "--nodes and --time, are passed to sbatch.",
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
 _FOUND_OUT = "it finds that out for itself"  # why an option does not fit a job
 _TASK = "%a"  # is replaced by the number of a task of --array, as in sbatch's file names
 DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Print the script; write and submit nothing.")
+    bool, typer.Option("--dry-run", help="Print the script, without writing or submitting it.")
 ]
-Parsable = Annotated[
-    bool, typer.Option("--parsable", help="Print the job's number and nothing else.")
-]
+Parsable = Annotated[bool, typer.Option("--parsable", help="Print only the number of the job.")]
 Setup = Annotated[
     Path | None,
-    typer.Option(help="File of shell lines that the job begins with: module load, export."),
+    typer.Option(
+        metavar="FILE",
+        help="File of shell commands that the job runs first, such as module load and export.",
+    ),
 ]
 
 
 @slurm.command(
     "eval",
     context_settings=_BOTH,
-    options_metavar="{FILE | ENV...} [OPTIONS]",
+    options_metavar="[OPTIONS] FILE | ENV...",
     epilog=epilog(
         (
             "slurm eval runs.yaml --nodes 2 --gpus-per-node 4 --time 4:00:00 --resubmit 5",
@@ -59,24 +60,31 @@ def eval_(
     resubmit: Annotated[
         int,
         typer.Option(
-            min=0, max=MOST_RETRIES, help="Times that the job, out of time, queues itself again."
+            min=0,
+            max=MOST_RETRIES,
+            metavar="N",
+            help="How often the job submits itself again when its time is over.",
         ),
     ] = 0,
     closing_s: Annotated[
         float,
         typer.Option(
-            min=0, max=MOST_S, callback=finite, help="End so long before the job's time does."
+            min=0,
+            max=MOST_S,
+            callback=finite,
+            metavar="S",
+            help="Stop this many seconds before the job's time limit.",
         ),
     ] = 60.0,
     setup: Setup = None,
     dry_run: DryRun = False,
     parsable: Parsable = False,
 ) -> None:
-    """Evaluate in a job, with the options of `vlagents-ray eval` (see its --help) and sbatch's.
+    """Evaluate in a job, with the options of `vlagents-ray eval` and of sbatch.
 
-    Existing results are continued, so the same command after `scancel` or a failure finishes the
-    rest. Without --workers there is one for each CPU but one, and a policy has a replica on each
-    GPU.
+    The job continues existing results, so the same command after `scancel` or a failure runs the
+    remaining episodes. Without --workers, the job has a worker for each CPU except one, and a
+    replica of the policy on each GPU.
     """
     from vlagents_ray.evaluate import most_cpus, most_gpus
 
@@ -114,7 +122,7 @@ def eval_(
 @slurm.command(
     "serve",
     context_settings=_BOTH,
-    options_metavar="POLICY [OPTIONS]",
+    options_metavar="[OPTIONS] POLICY",
     epilog=epilog(("slurm serve deployments/pi0.yaml --gpus-per-node 1 --time 8:00:00",)),
 )
 def serve(
@@ -122,17 +130,19 @@ def serve(
     out_dir: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY."
+            "--out",
+            metavar="FOLDER",
+            help="Folder of the script, the logs and server.json; default: runs/serve/POLICY.",
         ),
     ] = None,
     setup: Setup = None,
     dry_run: DryRun = False,
     parsable: Parsable = False,
 ) -> None:
-    """Serve a policy in a job, with the options of `vlagents-ray serve` (see its --help) and
-    sbatch's.
+    """Serve a policy in a job, with the options of `vlagents-ray serve` and of sbatch.
 
-    Once it answers, OUT/JOB/server.json and the job's log have URL, key and the line for ssh.
+    When the server is ready, OUT/JOB/server.json and the job's log contain the URL, the key and
+    the ssh command.
     """
     with errors():
         words, options = split(context.args, _options(serve_command))

@@ -37,43 +37,86 @@ class Goal(str, Enum):
 
 
 def tune_command(
-    file: Annotated[Path, typer.Argument(help="A deployment file.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A deployment file.")],
     goal: Annotated[
         Goal,
         typer.Option(
-            "--for", help="The most actions a second, or the most robots within --p99-ms."
+            "--for",
+            metavar="throughput|robots",
+            help="The goal: most actions per second, or most robots within --p99-ms.",
         ),
     ] = Goal.throughput,
     p99_ms: Annotated[
         float | None,
         typer.Option(
-            "--p99-ms", min=0, max=1e6, callback=finite, help="Of robots: the longest p99, ms."
+            "--p99-ms",
+            min=0,
+            max=1e6,
+            callback=finite,
+            metavar="MS",
+            help="With --for robots: the largest 99th percentile of the latency, in ms.",
         ),
     ] = None,
     minutes: Annotated[
-        float, typer.Option(min=0.1, max=10_000, callback=finite, help="That all of it may take.")
+        float,
+        typer.Option(
+            min=0.1,
+            max=10_000,
+            callback=finite,
+            metavar="N",
+            help="Longest time of the search, in minutes.",
+        ),
     ] = 5.0,
     max_batch: Annotated[
-        int, typer.Option(min=1, max=10_000, help="The largest batch to try.")
+        int, typer.Option(min=1, max=10_000, metavar="N", help="Largest batch that is tried.")
     ] = 32,
     seconds: Annotated[
-        float, typer.Option(min=0.1, max=3600, callback=finite, help="Of each measurement.")
+        float,
+        typer.Option(
+            min=0.1,
+            max=3600,
+            callback=finite,
+            metavar="S",
+            help="Length of each measurement, in seconds.",
+        ),
     ] = 2.0,
     dtypes: Annotated[
-        str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Types of numbers that are tried, such as bfloat16,int8; default: those of the "
+            "accelerator.",
+        ),
     ] = None,
     tolerance: Annotated[
         float,
         typer.Option(
-            min=0, max=1, callback=finite, help="Largest error of actions, share of their range."
+            min=0,
+            max=1,
+            callback=finite,
+            metavar="SHARE",
+            help="Largest deviation of an action, as a share of its range.",
         ),
     ] = 0.01,
     frames: Annotated[
-        Path | None, typer.Option(help="Recorded trajectories; default: random observations.")
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="Recorded trajectories whose observations are used; default: random observations.",
+        ),
     ] = None,
-    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    app: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Application of the file, if it contains several."),
+    ] = None,
     image: Annotated[
-        int, typer.Option(min=1, max=8192, help="Pixels a side, where the policy takes any image.")
+        int,
+        typer.Option(
+            min=1,
+            max=8192,
+            metavar="N",
+            help="Width and height of random images in pixels, if the policy accepts any size.",
+        ),
     ] = 224,
     state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006

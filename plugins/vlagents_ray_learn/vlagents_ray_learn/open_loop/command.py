@@ -25,33 +25,60 @@ def open_loop_command(
     folder: Annotated[
         Path, typer.Argument(metavar="DATASET", help="A LeRobotDataset, or a folder of them.")
     ],
-    policy: Annotated[str, typer.Option(help="Name, deployment file, or URL.")],
+    policy: Annotated[
+        str,
+        typer.Option(metavar="POLICY", help="The policy: a name, a deployment file, or a URL."),
+    ],
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the errors; default: a new one.")
+        Path | None,
+        typer.Option("--out", metavar="FOLDER", help="Folder of the errors; default: a new one."),
     ] = None,
     episodes: Annotated[
-        str | None, typer.Option(help="Numbers of the episodes, such as 0-9,12; default: all.")
+        str | None,
+        typer.Option(
+            metavar="NUMBERS", help="Numbers of the episodes, such as 0-9,12; default: all."
+        ),
     ] = None,
     horizon: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_ROWS, help="Rows of a chunk that are compared. Default: all."),
+        typer.Option(
+            min=1,
+            max=MOST_ROWS,
+            metavar="N",
+            help="Number of rows of a chunk that are compared; default: all.",
+        ),
     ] = None,
     stride: Annotated[
         int,
         typer.Option(
             min=1,
             max=MOST_EPISODES,
-            help="Distance between the compared frames of a dataset without recorded answers: 10 "
-            "compares every tenth.",
+            metavar="N",
+            help="Compare every Nth frame of a dataset without recorded answers.",
         ),
     ] = 1,
     batch_size: Annotated[
-        int, typer.Option(min=1, max=MOST_ROWS, help="Number of sessions that share a batch.")
+        int,
+        typer.Option(
+            min=1, max=MOST_ROWS, metavar="N", help="Number of sessions that share a batch."
+        ),
     ] = 8,
     camera_map: Annotated[
-        str | None, typer.Option(help="POLICY=DATASET, as base=top,wrist=left.")
+        str | None,
+        typer.Option(
+            metavar="PAIRS",
+            help="Cameras of the policy and of the dataset, such as base=top,wrist=left; default: "
+            "equal names.",
+        ),
     ] = None,
-    state: Annotated[str | None, typer.Option(help="Parts of observation.state in order.")] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PARTS",
+            help="Parts of observation.state in their order, separated by commas, such as "
+            "joints,gripper.",
+        ),
+    ] = None,
     settings: Set = [],  # noqa: B006
     serve_settings: ServeSet = [],  # noqa: B006
     config_dir: ConfigDir = None,

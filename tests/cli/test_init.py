@@ -1,4 +1,4 @@
-"""`vlagents-ray new`: what it writes works at once, and what was there stays."""
+"""`vlagents-ray init`: what it writes works at once, and what was there stays."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from readme_blocks import ENV, Block, run
 from typer.testing import CliRunner
 
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.cli.init import as_typed
 from vlagents_ray.cli.main import app
-from vlagents_ray.cli.new import as_typed
 from vlagents_ray.policies.noop import Noop
 
 KINDS = ["policy", "env", "dialect"]
 
 
 def new(kind: str, name: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["new", kind, name])
+    done = CliRunner().invoke(app, ["init", kind, name])
     return done.exit_code, done.output
 
 

@@ -25,7 +25,7 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import names
 
-new = typer.Typer(
+init = typer.Typer(
     no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder."
 )
 # By kind of skeleton: the files that are written, in whose paths $name is the name of the module,
@@ -53,7 +53,7 @@ Name = Annotated[
 ]
 
 
-@new.command()
+@init.command()
 def policy(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new policy, its test, and its deployment
     file.
@@ -67,7 +67,7 @@ def policy(name: Name) -> None:
         )
 
 
-@new.command("env")
+@init.command("env")
 def environment(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of
     runs.
@@ -77,7 +77,7 @@ def environment(name: Name) -> None:
         _print_steps((f"{as_typed('vlagents-ray')} eval {name}.yaml", "runs ten episodes in it"))
 
 
-@new.command()
+@init.command()
 def dialect(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new protocol, its test, and a deployment
     file.
@@ -93,7 +93,7 @@ def dialect(name: Name) -> None:
         )
 
 
-@new.command()
+@init.command()
 def plugin(name: Name, context: typer.Context) -> None:
     """Write the folder NAME: a package with a policy, a part of the server and a command, and
     their test.
