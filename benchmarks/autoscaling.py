@@ -12,6 +12,7 @@ import contextlib
 import json
 import sys
 import tempfile
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,7 @@ import typer
 
 from benchmarks.console import Out, save
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
+from benchmarks.picture import OURS, RULE, SERIES, SOFT, new_figure, save_figure
 from benchmarks.robots import RobotBurst
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.client.transports.serve_handle import call_replica
@@ -37,7 +39,7 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
 from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 _SUFFIXES = (".png", ".svg", ".pdf")
-_SESSIONS, _BLUE, _GREY = "#e0a030", "#1f6f8b", "#b0b0b0"  # colours
+_SESSIONS, _P95 = SERIES[4], SERIES[1]  # colours
 _APP = "noop"
 _EVERY_S = 0.5  # between two samples of the replicas
 _ANSWER_S = 0.3  # time limit for a replica to state its number of sessions
@@ -337,50 +339,64 @@ def check_plot_file(file: Path | None) -> None:
 
 
 def plot_autoscaling(measured: Mapping[str, Any], file: Path) -> None:
-    """Draw replicas and sessions over time, and below them the duration of acts."""
-    figure = require("matplotlib.figure").Figure(figsize=(9, 5), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    times = [one["at"] for one in measured["samples"]]
-    for name, colour, style in (("requested", _GREY, "--"), ("running", _BLUE, "-")):
-        numbers = [one[name] for one in measured["samples"]]
-        above.step(times, numbers, style, where="post", color=colour, label=f"replicas {name}")
-    above.set_ylabel("replicas")
-    sessions = above.twinx()
-    sessions.fill_between(
-        times,
-        [one["sessions"] for one in measured["samples"]],
-        step="post",
-        color=_SESSIONS,
-        alpha=0.25,
-        lw=0,
-    )
-    sessions.set_ylabel("sessions (shaded)")
-    above.legend(loc="upper left", fontsize=8, frameon=False)
-    for phase in measured["phases"]:
-        at = [one["at"] for one in phase["seconds"]]
-        below.plot(
-            at, [one["median_ms"] for one in phase["seconds"]], ".-", color=_BLUE, markersize=3
+    """Draw replicas and sessions over time, and below them the latency of calls."""
+    with new_figure(6.0) as figure:
+        sessions, replicas, latency = figure.subplots(
+            3, 1, sharex=True, height_ratios=[1.4, 1.5, 2]
         )
-        below.plot(at, [one["p95_ms"] for one in phase["seconds"]], ".", color=_GREY, markersize=3)
-        waited = (
-            ""
-            if phase["first_reset_s"] is None
-            else f"\nfirst reset {phase['first_reset_s']:.1f} s"
+        times = [sample["at"] for sample in measured["samples"]]
+        sessions.fill_between(
+            times,
+            [sample["sessions"] for sample in measured["samples"]],
+            step="post",
+            color=_SESSIONS,
+            alpha=0.6,
+            lw=0,
         )
-        text = f"{phase['name']}\n{len(phase['failed'])} failed{waited}"
-        below.annotate(
-            text, (phase["begun"], 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=7
+        sessions.set_title("Sessions")
+        for name, colour, style, label in (
+            ("requested", SOFT, "--", "target"),
+            ("running", OURS, "-", "running"),
+        ):
+            numbers = [sample[name] for sample in measured["samples"]]
+            replicas.step(times, numbers, style, where="post", color=colour, label=label)
+        replicas.set_title("Replicas")
+        replicas.legend(loc="upper left", frameon=False, labelcolor="linecolor")
+        for phase in measured["phases"]:
+            at = [second["at"] for second in phase["seconds"]]
+            medians = [second["median_ms"] for second in phase["seconds"]]
+            latency.plot(at, medians, "-", color=OURS, lw=2)
+            p95 = [second["p95_ms"] for second in phase["seconds"]]
+            latency.plot(at, p95, ".", color=_P95, ms=4)
+            for axes in (sessions, replicas, latency):
+                axes.axvspan(phase["begun"], phase["ended"], color=RULE, alpha=0.35, lw=0)
+            sessions.annotate(
+                _phase_text(phase),
+                (phase["begun"], 1.0),
+                xytext=(2, -2),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                va="top",
+            )
+        highest = max(
+            second["p95_ms"] for phase in measured["phases"] for second in phase["seconds"]
         )
-        for axes in (above, below):
-            axes.axvspan(phase["begun"], phase["ended"], color="#000000", alpha=0.04, lw=0)
-    below.set_ylim(
-        0, 1.6 * max(one["p95_ms"] for phase in measured["phases"] for one in phase["seconds"])
-    )
-    below.set_ylabel("an act, ms (grey: 95 %)")
-    below.set_xlabel("s since the first robot came")
-    for axes in (above, below, sessions):
-        axes.spines[["top"]].set_visible(False)
-    figure.savefig(file, dpi=100)
+        latency.set_ylim(0, 1.1 * highest)
+        latency.set_title("Latency per call, ms (line: median, dots: 95th percentile)")
+        latency.set_xlabel("time since the first robot connected, s")
+        most = max(sample["sessions"] for sample in measured["samples"])
+        sessions.set_ylim(0, 2.4 * max(1, most))  # room for the names of the phases
+        for axes in (sessions, replicas):
+            axes.yaxis.get_major_locator().set_params(integer=True)
+        save_figure(figure, file)
+
+
+def _phase_text(phase: Mapping[str, Any]) -> str:
+    """Return the name of a phase, in lines that are as short as its shade may be narrow."""
+    text = textwrap.fill(str(phase["name"]), 10)
+    if phase["failed"]:
+        text += f"\n{len(phase['failed'])} failed"
+    return text
 
 
 def show_autoscaling(measured: Mapping[str, Any]) -> None:

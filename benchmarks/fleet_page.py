@@ -1,7 +1,8 @@
 """The picture and the table of several measurements of `benchmarks.fleet`.
 
 `python -m benchmarks.fleet_page FILE... --picture docs/pictures/fleet.svg` prints the table as
-Markdown. Files that measured the same robots, such as other systems, share a panel.
+Markdown. Files that measured the same robots, such as other systems, share a panel. The
+points of the picture are stored beside it, in a file .json.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ def merge_fleets(files: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def title(plan: Mapping[str, Any]) -> str:
     """Return the heading of a panel."""
-    robots = " and ".join(f"{kind['rows']} rows at {kind['hz']:g} Hz" for kind in plan["kinds"])
+    kinds = [f"{kind['rows']} actions at {kind['hz']:g} Hz" for kind in plan["kinds"]]
+    robots = f"chunks of {' and of '.join(kinds)}"
     way = plan["transport"]
     if plan["real_time_chunking"]:
         way += ", RTC"
@@ -52,7 +54,7 @@ def title(plan: Mapping[str, Any]) -> str:
         way += f", link of {plan['link']}"
     if plan["delay"] is not None:
         way += f" and {plan['delay']}"
-    curve = f"{plan['base_ms']:g} + {plan['row_ms']:g} ms a row"
+    curve = f"{plan['base_ms']:g} ms + {plan['row_ms']:g} ms per row"
     return f"{robots}\n{way}, {curve}"
 
 
@@ -105,6 +107,8 @@ def main(
         fleets = merge_fleets([json.loads(file.read_text()) for file in files])
         out.print(markdown(fleets), soft_wrap=True, markup=False)
         if picture is not None:
+            # `python -m benchmarks.picture` draws the stored points again.
+            picture.with_suffix(".json").write_text(json.dumps(fleets, indent=1) + "\n")
             plot_fleets(fleets, picture)
 
 

@@ -1,118 +1,236 @@
-"""The pictures of the measurements: the league's round trips of all systems and actions a second by
-number of clients, the robots that each system serves in time, and what learners cost.
+"""The pictures of the measurements, drawn from stored results.
+
+`python -m benchmarks.picture` draws all of them again: the round trips and the throughput of all
+systems, the robots that each system serves in time, the success of learners, and autoscaling.
+
+The colours of an SVG follow the reader's light or dark scheme, background included.
 """
 
 from __future__ import annotations
 
+import io
 import itertools
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from vlagents_ray.cli.console import errors, out
 from vlagents_ray.registry import require
 
-# The text is readable on a light page and on a dark one.
-_OURS, _PEERS, _TEXT = "#3f6fd8", "#9a9a9a", "#808080"
-_LEARNERS = (
-    "#3f6fd8",
-    "#d07a2d",
-    "#b0508f",
-    "#3d9a57",
-    "#8f6fd0",
-)  # on a light page and a dark one
-_DASHES = ("-", "--", ":", "-.")
-_COLUMNS = 3  # panels in a row of `plot_fleets`
+ROOT = Path(__file__).parents[1]
+# Name, colour on a light background, colour on a dark one: those of the report.
+_COLOURS = {
+    "paper": ("#ffffff", "#12161b"),
+    "ink": ("#1b1f24", "#e8ebef"),
+    "soft": ("#59636e", "#9aa5b1"),
+    "rule": ("#d5dae0", "#343c46"),
+    "c0": ("#0072b2", "#56b4e9"),
+    "c1": ("#d55e00", "#ff9d5c"),
+    "c2": ("#00855f", "#3ecfa3"),
+    "c3": ("#b0508f", "#e79bc9"),
+    "c4": ("#8a6d00", "#e3c34a"),
+}
+PAPER, INK, SOFT, RULE, *SERIES = (light for light, _ in _COLOURS.values())
+OURS = SERIES[0]
+_FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
+_MATPLOTLIB_FONTS = re.compile(r"'DejaVu Sans', 'Bitstream[^;\"]*sans-serif")
+WIDTH = 6.8  # inches: 653 px, about the width of a page's text, so that text keeps its size
 _SETTINGS = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "league",
-    "font.size": 9,
-    "text.color": _TEXT,
-    "axes.edgecolor": _TEXT,
-    "axes.labelcolor": _TEXT,
-    "xtick.color": _TEXT,
-    "ytick.color": _TEXT,
+    "svg.hashsalt": "vlagents_ray",
+    "font.size": 9.5,  # 12.7 px
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "text.color": INK,
+    "axes.edgecolor": SOFT,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.facecolor": PAPER,
+    "figure.facecolor": PAPER,
+    "grid.color": RULE,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+_ROUND_TRIPS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)  # ticks
+_NAMES = {
+    "shm": "shared memory",
+    "websocket": "WebSocket",
+    "http": "HTTP",
+    "handle": "Serve handle",
+    "raw": "raw pixels",
+    "jpeg": "JPEG",
+    "Ray actor": "from a Ray actor",
+    "vlagents shm": "vlagents, shared memory",
+    "vlagents JPEG": "vlagents, JPEG",
+    "ray serve": "plain Ray Serve",
+}
+
+
+@contextmanager
+def new_figure(height: float) -> Iterator[Any]:
+    """Yield a figure of the common width and style.
+
+    Args:
+        height: Its height in inches.
+    """
+    matplotlib = require("matplotlib")
+    with matplotlib.rc_context(_SETTINGS):
+        yield require("matplotlib.figure").Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def save_figure(figure: Any, file: Path) -> None:
+    """Write a figure; one in SVG has its colours by the reader's scheme."""
+    if file.suffix != ".svg":
+        figure.savefig(file, dpi=150)
+        return
+    drawn = io.StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
+    text = drawn.getvalue()
+    schemes = ["", ""]
+    for name, colours in _COLOURS.items():
+        text = text.replace(colours[0], f"var(--{name})")
+        for index, colour in enumerate(colours):
+            schemes[index] += f"--{name}:{colour};"
+    style = f":root{{{schemes[0]}}}@media(prefers-color-scheme:dark){{:root{{{schemes[1]}}}}}"
+    text = text.replace('<style type="text/css">', f'<style type="text/css">{style}', 1)
+    text = _MATPLOTLIB_FONTS.sub(_FONTS, text)
+    lines = [line.rstrip() for line in text.splitlines()]
+    file.write_text("\n".join(lines) + "\n")
+
+
+def name_of(way: str) -> str:
+    """Return the name of a transport or of another system as readers know it."""
+    return ", ".join(_NAMES.get(part, part) for part in way.split(", "))
 
 
 def plot_league(results: Mapping[str, Any], file: Path) -> None:
-    """Draw the medians of `rtt`, and the curves of `throughput` and `without_gain`, as far as
-    they were measured.
+    """Draw a dot for the median round trip of each transport and of each other system."""
+    rtt = results["rtt"]
+    ways = [*rtt["ways"], *rtt["peers"]]
+    ways.sort(key=lambda way: float(way["median_ms"]), reverse=True)
+    peers = {peer["way"] for peer in rtt["peers"]}
+    with new_figure(0.24 * len(ways) + 0.9) as figure:
+        axes = figure.subplots()
+        for row, way in enumerate(ways):
+            median_ms = way["median_ms"]
+            colour = SOFT if way["way"] in peers else OURS
+            axes.plot(median_ms, row, "o", ms=6, color=colour)
+            _label(axes, f"{median_ms:.3g}", (median_ms, row), (8, 0), colour)
+        _name_rows(axes, [way["way"] for way in ways], peers)
+        axes.set_xscale("log")
+        axes.set_xticks(_ROUND_TRIPS_MS, [f"{ms:g}" for ms in _ROUND_TRIPS_MS])
+        axes.minorticks_off()
+        axes.set_xlim(0.1, 45)
+        axes.set_xlabel("median round trip of one call on one machine, ms (log scale)")
+        _explain_colours(axes)
+        save_figure(figure, file)
+
+
+def plot_throughput(results: Mapping[str, Any], file: Path) -> None:
+    """Draw a dot for the actions per second of each system with the largest number of clients, and
+    its 95 % interval; a panel for each of `throughput` and `without_gain` that was measured.
     """
-    matplotlib = require("matplotlib")
     parts = [results[name] for name in ("throughput", "without_gain") if results.get(name)]
-    with matplotlib.rc_context(_SETTINGS):
-        figure = require("matplotlib.figure").Figure(figsize=(11, 6), layout="constrained")
-        axes = figure.subplot_mosaic([[0, index + 1] for index in range(len(parts))] or [[0]])
-        _plot_round_trips(axes[0], results["rtt"])
-        for index, part in enumerate(parts):
-            _plot_throughput(axes[index + 1], part)
-        if parts:
-            _add_legend(figure, axes[1])
-        figure.savefig(file, transparent=True, metadata={"Date": None})
+    rows = [{**part["transports"], **part.get("peers", {})} for part in parts]
+    systems = sorted(rows[0], key=lambda name: float(_last(rows[0][name])["actions_per_s"]))
+    peers = set(rows[0]) - set(parts[0]["transports"])
+    with new_figure(0.26 * len(systems) + 1.3) as figure:
+        panels = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+        for axes, part, of_system in zip(panels, parts, rows, strict=True):
+            for row, name in enumerate(systems):
+                if name in of_system:
+                    colour = SOFT if name in peers else OURS
+                    _plot_rate(axes, _last(of_system[name]), row, colour)
+            ideal = part["ideal_actions_per_s"]
+            axes.axvline(ideal, color=SOFT, lw=1, ls=":")
+            axes.annotate(
+                f"{ideal:.0f} possible ",
+                (ideal, -0.6),
+                ha="right",
+                va="center",
+                color=SOFT,
+            )
+            axes.set_xlim(0, 1.22 * ideal)
+            axes.set_title(_workload(part))
+            axes.set_xlabel(f"actions/s, {part['clients']} clients")
+        _name_rows(panels[0], systems, peers)
+        panels[0].set_ylim(-1.1, len(systems) - 0.4)
+        save_figure(figure, file)
 
 
-def _add_legend(figure: Any, axes: Any) -> None:
-    """Put the legend of one panel beside all of them."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside right center",
-        fontsize=8,
-        frameon=False,
-        labelcolor=_TEXT,
-    )
+def _last(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the point of the most clients."""
+    point: Mapping[str, Any] = row["curve"][-1]
+    return point
 
 
-def _plot_round_trips(axes: Any, rtt: Mapping[str, Any]) -> None:
-    ways = sorted(
-        [*rtt["ways"], *rtt["peers"]], key=lambda one: float(one["median_ms"]), reverse=True
-    )
-    theirs = [peer["way"] for peer in rtt["peers"]]
-    medians = [way["median_ms"] for way in ways]
-    bars = axes.barh(
-        [way["way"] for way in ways],
-        medians,
-        color=[_PEERS if way["way"] in theirs else _OURS for way in ways],
-    )
-    axes.bar_label(bars, [f"{ms:.3g}" for ms in medians], padding=3, color=_TEXT)
-    axes.set_xscale("log")
-    axes.margins(x=0.15)
-    axes.set_xlabel("median round trip of one act, ms")
+def _plot_rate(axes: Any, point: Mapping[str, Any], row: int, colour: str) -> None:
+    rate = point["actions_per_s"]
+    interval = point.get("ci95")
+    if interval is not None:
+        axes.plot(interval, [row, row], color=colour, lw=1.2, alpha=0.6)
+    axes.plot(rate, row, "o", ms=6, color=colour)
+    right = rate if interval is None else max(interval)
+    _label(axes, f"{rate:.0f}", (right, row), (8, 0), colour)
 
 
-def _plot_throughput(axes: Any, part: Mapping[str, Any]) -> None:
-    for number, (name, row) in enumerate(
-        [*part["transports"].items(), *part.get("peers", {}).items()]
-    ):
-        ours = name in part["transports"]
-        points = row["curve"]
-        rates = [point["actions_per_s"] for point in points]
-        spread = [
-            0.0 if point.get("ci95") is None else point["actions_per_s"] - point["ci95"][0]
-            for point in points
-        ]
-        axes.errorbar(
-            [point["clients"] for point in points],
-            rates,
-            spread,
-            label=name,
-            capsize=2,
-            lw=2 if ours else 1,
-            ls=_DASHES[number % len(_DASHES)],
-            color=_OURS if ours else f"C{number % 10}",
+def _workload(part: Mapping[str, Any]) -> str:
+    """Return the title of a panel of throughput: how long a batch takes."""
+    base_ms, row_ms = part["config"].get("base_ms", 0), part["config"].get("per_item_ms", 0)
+    base = f"{base_ms:g} ms + " if base_ms else ""
+    largest = f"batches of {part['batch']}" if part["batch"] > 1 else "no batching"
+    return f"{base}{row_ms:g} ms per row,\n{largest}"
+
+
+def _name_rows(axes: Any, ways: Sequence[str], peers: set[str]) -> None:
+    """Name the rows of a dot plot, those of this project in its colour."""
+    axes.set_yticks(range(len(ways)), [name_of(way) for way in ways])
+    for way, label in zip(ways, axes.get_yticklabels(), strict=True):
+        label.set_color(INK if way in peers else OURS)
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(-0.6, len(ways) - 0.4)
+    axes.grid(axis="y", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _explain_colours(axes: Any) -> None:
+    """Say in the empty corner of a dot plot whose dots have which colour."""
+    for height, (text, colour) in enumerate((("other systems", SOFT), ("vlagents_ray", OURS))):
+        axes.annotate(
+            f"● {text}",
+            (0.02, 0.05 + 0.06 * height),
+            xycoords="axes fraction",
+            color=colour,
+            backgroundcolor=PAPER,
         )
-    axes.axhline(part["ideal_actions_per_s"], color=_TEXT, lw=0.8)
-    axes.set_xscale("log", base=2)
-    counts = [point["clients"] for point in points]  # those of all
-    axes.set_xticks(counts, map(str, counts))
-    axes.set_ylim(0, 1.15 * part["ideal_actions_per_s"])
-    settings = "".join(f", {key} {value}" for key, value in part["config"].items())
-    axes.set_title(f"{part['policy']}{settings}, batches of {part['batch']} at most", fontsize=8)
-    axes.set_xlabel("clients")
-    axes.set_ylabel("actions/s")
+
+
+def _label(
+    axes: Any,
+    text: str,
+    point: tuple[float, float],
+    offset: tuple[float, float],
+    colour: str,
+    **options: Any,
+) -> None:
+    axes.annotate(
+        text,
+        point,
+        bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 0.5},
+        xytext=offset,
+        textcoords="offset points",
+        color=colour,
+        annotation_clip=False,
+        **{"va": "center", **options},
+    )
 
 
 def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
@@ -123,121 +241,122 @@ def plot_fleets(fleets: Sequence[Mapping[str, Any]], file: Path) -> None:
             the largest number of robots by arithmetic, or None.
         file: The picture.
     """
-    matplotlib = require("matplotlib")
-    with matplotlib.rc_context({**_SETTINGS, "svg.hashsalt": "fleets"}):
-        columns = min(_COLUMNS, len(fleets))
-        rows = -(-len(fleets) // columns)
-        figure = require("matplotlib.figure").Figure(
-            figsize=(3.6 * columns + 1.6, 3.2 * rows), layout="constrained"
-        )
-        grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-        panels, unused = grid.flat[: len(fleets)], grid.flat[len(fleets) :]
-        for axes in unused:
-            axes.remove()
-        points = itertools.chain.from_iterable(fleet["points"] for fleet in fleets)
-        systems = list(dict.fromkeys(point["system"] for point in points))
+    points = itertools.chain.from_iterable(fleet["points"] for fleet in fleets)
+    systems = list(dict.fromkeys(point["system"] for point in points))
+    colours = dict(zip(systems, itertools.cycle(SERIES), strict=False))
+    servers = {fleet["title"].partition("\n")[2] for fleet in fleets}
+    with new_figure(2.6 * len(fleets)) as figure:
+        panels = figure.subplots(len(fleets), 1, squeeze=False)[:, 0]
         for axes, fleet in zip(panels, fleets, strict=True):
-            _plot_shares(axes, fleet, systems)
-        for first_of_row in grid[:, 0]:
-            first_of_row.set_ylabel("ticks in time, %")
-        _add_legend(figure, panels[0])
-        figure.savefig(file, transparent=True, metadata={"Date": None})
+            _plot_shares(axes, fleet, colours)
+            robots, _, server = fleet["title"].partition("\n")
+            # What all panels have in common is below them.
+            axes.set_title(robots if len(servers) == 1 else f"{robots}\n{server}")
+            axes.set_ylabel("ticks in time, %")
+        common = f" ({servers.pop()})" if len(servers) == 1 else ""
+        panels[-1].set_xlabel(f"robots on one accelerator{common}")
+        save_figure(figure, file)
 
 
-def _plot_shares(axes: Any, fleet: Mapping[str, Any], systems: Sequence[str]) -> None:
-    for number, system in enumerate(systems):
+def _plot_shares(axes: Any, fleet: Mapping[str, Any], colours: Mapping[str, str]) -> None:
+    ends = []
+    for system, colour in colours.items():
         points = sorted(
             (point for point in fleet["points"] if point["system"] == system),
             key=lambda point: int(point["robots"]),
         )
-        ours = system == "vlagents_ray"
-        axes.plot(
-            [point["robots"] for point in points],
-            [100 * point["share"] for point in points],
-            label=system,
-            marker="o",
-            ms=4 if ours else 3,
-            lw=2 if ours else 1,
-            ls=_DASHES[number % len(_DASHES)],
-            color=_OURS if ours else f"C{number % 10}",
-        )
-    if fleet["most"] is not None:
-        axes.axvline(fleet["most"], color=_TEXT, lw=0.8, ls=":")
-    axes.set_title(fleet["title"], fontsize=8)
-    axes.set_xlabel("robots on one accelerator")
-    axes.set_ylim(0, 105)
+        if not points:
+            continue
+        robots = [point["robots"] for point in points]
+        shares = [100 * point["share"] for point in points]
+        axes.plot(robots, shares, "o-", ms=4.5, lw=1.2, color=colour)
+        ends.append((robots[-1], shares[-1], system, colour))
+    axes.set_ylim(0, 108)
+    axes.set_xlim(0, 1.42 * max(end[0] for end in ends))
+    axes.grid(axis="y", lw=0.6)
+    most = fleet["most"]
+    if most is not None:
+        axes.axvline(most, color=SOFT, lw=1, ls=":")
+        text = f"possible by arithmetic: {most}"
+        axes.annotate(text, (0.03, 0.08), xycoords="axes fraction", color=SOFT)
+    heights = _spread([share for _, share, _, _ in ends], least=13)
+    for (robots, share, system, colour), height in zip(ends, heights, strict=True):
+        # A percent of this axis is about 1.2 points of the text high.
+        _label(axes, name_of(system), (robots, share), (8, 1.2 * (height - share)), colour)
+
+
+def _spread(values: Sequence[float], least: float) -> list[float]:
+    """Return heights for labels of values, at least `least` apart, the highest unchanged."""
+    heights = list(values)
+    order = sorted(range(len(values)), key=lambda index: -values[index])
+    for above, below in itertools.pairwise(order):
+        heights[below] = min(heights[below], heights[above] - least)
+    return heights
 
 
 def plot_learners(points: Sequence[Mapping[str, Any]], before: float, file: Path) -> None:
-    """Draw the success of each run of a learner against its episodes and, if it is known of
-    all learners, against its CPU time.
+    """Draw a dot for the success of each run, a row for each learner.
 
     Args:
         points: For each run its "learner", "success" in [0, 1], "episodes", and "cpu_s" or None.
         before: The success of the policy that all learners begin with.
         file: The picture.
     """
-    matplotlib = require("matplotlib")
-    best_first = sorted(points, key=lambda point: -float(point["success"]))
-    learners = list(dict.fromkeys(point["learner"] for point in best_first))
-    colours = dict(zip(learners, itertools.cycle(_LEARNERS), strict=False))
-    with matplotlib.rc_context({**_SETTINGS, "svg.hashsalt": "learners"}):
-        timed = {point["learner"] for point in points if point["cpu_s"] is not None}
-        columns = 2 if timed == set(learners) else 1
-        figure = require("matplotlib.figure").Figure(
-            figsize=(4.5 * columns, 3.6), layout="constrained"
-        )
-        panels = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
-        by_episodes = panels[0]
-        _plot_costs(by_episodes, points, "episodes", colours, 1.0)
-        if columns == 2:
-            _plot_costs(panels[1], points, "cpu_s", colours, 1 / 60)
-            panels[1].set_xlabel("CPU time of a run, minutes")
-        for axes in panels:
-            axes.axhline(100 * before, color=_TEXT, lw=0.8, ls=":")
-            axes.set_xscale("log")
-            axes.margins(x=0.25, y=0.15)
-        by_episodes.set_xlabel("episodes of a run")
-        by_episodes.set_ylabel("success, %")
-        by_episodes.annotate(
-            "before",
-            (0.01, 100 * before),
-            xycoords=("axes fraction", "data"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            fontsize=8,
-        )
-        figure.savefig(file, transparent=True, metadata={"Date": None})
+    worst_first = sorted(points, key=lambda point: float(point["success"]))
+    learners = list(dict.fromkeys(point["learner"] for point in worst_first))
+    with new_figure(0.5 * len(learners) + 1.1) as figure:
+        axes = figure.subplots()
+        for row, learner in enumerate(learners):
+            runs = [point for point in points if point["learner"] == learner]
+            rates = [100 * point["success"] for point in runs]
+            axes.plot(rates, [row] * len(rates), "o", ms=7, alpha=0.75, color=OURS, mec=PAPER)
+        names = []
+        for learner in learners:
+            names.append(_with_costs(learner, [p for p in points if p["learner"] == learner]))
+        axes.set_yticks(range(len(learners)), names)
+        axes.tick_params(axis="y", length=0)
+        axes.set_ylim(-0.6, len(learners) - 0.3)
+        axes.grid(axis="y", lw=0.6)
+        axes.axvline(100 * before, color=SOFT, lw=1, ls=":")
+        text = f"before: {100 * before:.1f} %"
+        _label(axes, text, (100 * before, len(learners) - 0.5), (6, 0), SOFT)
+        axes.margins(x=0.06)
+        axes.set_xlabel("success of a run (dot) on held-out episodes, %")
+        save_figure(figure, file)
 
 
-def _plot_costs(
-    axes: Any,
-    points: Sequence[Mapping[str, Any]],
-    cost: str,
-    colours: Mapping[str, str],
-    unit: float,
-) -> None:
-    """Draw a dot for each run whose cost is known.
+def _with_costs(learner: str, runs: Sequence[Mapping[str, Any]]) -> str:
+    """Return the name of a learner above the mean costs of its runs."""
+    episodes = sum(run["episodes"] for run in runs) / len(runs)
+    costs = f"{episodes:,.0f} episodes"
+    measured = [run["cpu_s"] for run in runs if run["cpu_s"] is not None]
+    if measured:
+        costs += f", {sum(measured) / len(measured) / 60:.0f} min CPU time"
+    return f"{learner}\n{costs}"
 
-    The names of learners are above and below their dots in turn, as two learners may have the same
-    costs.
-    """
-    for number, (learner, colour) in enumerate(colours.items()):
-        runs = [
-            point for point in points if point["learner"] == learner and point[cost] is not None
-        ]
-        if not runs:
-            continue
-        costs = [unit * point[cost] for point in runs]
-        rates = [100 * point["success"] for point in runs]
-        axes.plot(costs, rates, "o", ms=5, alpha=0.7, color=colour, mec="none")
-        axes.annotate(
-            learner,
-            (sum(costs) / len(costs), min(rates) if number % 2 else max(rates)),
-            xytext=(0, -6 if number % 2 else 6),
-            textcoords="offset points",
-            ha="center",
-            va="top" if number % 2 else "bottom",
-            fontsize=8,
-            color=colour,
-        )
+
+def main() -> None:
+    """Draw all pictures of the docs from the results in the repository."""
+    # These modules draw their own results with this one.
+    from benchmarks.autoscaling import plot_autoscaling
+    from benchmarks.learners_page import points_of, rate_of
+
+    def read(path: str) -> Any:
+        return json.loads((ROOT / path).read_text())
+
+    folder = ROOT / "docs/pictures"
+    with errors():
+        league = read("benchmarks/latest.json")
+        plot_league(league, folder / "league.svg")
+        plot_throughput(league, folder / "throughput.svg")
+        plot_fleets(read("docs/pictures/fleet.json"), folder / "fleet.svg")
+        learners = read("examples/reference/learners.json")
+        solved, episodes = rate_of(learners["before"]["tabletop"])
+        plot_learners(points_of(learners), solved / episodes, folder / "learners.svg")
+        timeline = read("docs/cluster/autoscaling.json")
+        plot_autoscaling(timeline, ROOT / "docs/cluster/autoscaling.svg")
+        out.print("wrote docs/pictures and docs/cluster/autoscaling.svg")
+
+
+if __name__ == "__main__":
+    main()

@@ -22,7 +22,7 @@ from benchmarks.console import USE_COLUMNS, Calls, use_cells
 from benchmarks.figures import measured_on
 from benchmarks.further_tables import FurtherTable, read_tables, table_markdown
 from benchmarks.peers import PYTHON, PeersPython
-from benchmarks.picture import plot_league
+from benchmarks.picture import plot_league, plot_throughput
 from benchmarks.rtt import measure_with_peers
 from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughput
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -38,7 +38,9 @@ benchmarks.report` writes this page.
 
 ## Round trips and throughput
 """
-PICTURE = Path("pictures", "league.svg")  # beside the page
+# Beside the page.
+PICTURE = Path("pictures", "league.svg")
+THROUGHPUT_PICTURE = Path("pictures", "throughput.svg")
 Results = Mapping[str, Any]  # of `collect`
 
 ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
@@ -103,6 +105,8 @@ def write(results: Mapping[str, Any], page: Path, file: Path | None) -> None:
         picture = page.parent / PICTURE
         picture.parent.mkdir(exist_ok=True)
         plot_league(results, picture)
+        if any(results.get(name) for name in THROUGHPUTS):
+            plot_throughput(results, page.parent / THROUGHPUT_PICTURE)
     page.write_text(page_text(results, read_tables()))
 
 
@@ -305,8 +309,11 @@ def _league(results: Results) -> str:
         part = results.get(name) or {}
         head += [f"actions/s of {part['clients']}, {policy_of(part)}", _WAIT] if part else ["", ""]
     text = "Round trips of one call on one machine, and actions per second of many clients"
+    pictures = f"![Median round trips of one call on one machine]({PICTURE})"
+    if any(found):
+        pictures += f"\n\n![Actions per second of many clients, by system]({THROUGHPUT_PICTURE})"
     return (
-        f"![{text}]({PICTURE})\n\n{text}; *other systems* use their own servers and "
+        f"{pictures}\n\n{text}; *other systems* use their own servers and "
         f"clients:\n\n{table_markdown(head, rows)}"
     )
 

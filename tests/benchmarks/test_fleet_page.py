@@ -53,6 +53,7 @@ def test_files_of_the_same_robots_share_a_panel(tmp_path: Path) -> None:
     picture = tmp_path / "fleet.svg"
     plot_fleets(fleets, picture)
     assert "openpi" in picture.read_text()
+    assert "chunks of 50 actions at 10 Hz" in picture.read_text()
 
 
 def test_another_rate_is_another_fleet() -> None:
@@ -65,7 +66,7 @@ def test_another_rate_is_another_fleet() -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"transport": "http"}, "http, 29.3"),
+        ({"transport": "http"}, "http, 29.3 ms"),
         ({"real_time_chunking": True}, "websocket, RTC, 29.3"),
         ({"link": "1gbit"}, "websocket, link of 1gbit, 29.3"),
         ({"link": "1gbit", "delay": "2ms"}, "websocket, link of 1gbit and 2ms, 29.3"),
@@ -87,4 +88,4 @@ def test_many_fleets_have_several_rows_of_panels(tmp_path: Path) -> None:
     ]
     picture = tmp_path / "fleets.svg"
     plot_fleets(merge_fleets(files), picture)
-    assert picture.read_text().count("robots on one accelerator") == 4
+    assert picture.read_text().count("ticks in time") == 4

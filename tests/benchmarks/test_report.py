@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.further_tables import FILE, read_tables, replace_rows
-from benchmarks.picture import plot_league
+from benchmarks.picture import plot_league, plot_throughput
 from benchmarks.report import DEFAULT, JPEG, outcomes, page_text, section
 
 ROOT = Path(__file__).parents[2]
@@ -188,8 +189,21 @@ def test_the_picture_has_all_systems(tmp_path: Path) -> None:
         plot_league(results, file)
     text = (tmp_path / "one.svg").read_text()
     assert text == (tmp_path / "two.svg").read_text()
-    for name in ("openpi", "vlagents JPEG", "plasma, Ray actor", "actions/s", "batches of 16"):
+    for name in ("openpi", "vlagents, JPEG", "plasma, from a Ray actor"):
         assert name in text
+    plot_throughput(results, tmp_path / "throughput.svg")
+    text = (tmp_path / "throughput.svg").read_text()
+    for name in ("openpi", "actions/s", "batches of 16", "possible"):
+        assert name in text
+
+
+def test_the_colours_of_a_picture_follow_the_scheme_of_the_reader(tmp_path: Path) -> None:
+    plot_league(RESULTS, tmp_path / "league.svg")
+    text = (tmp_path / "league.svg").read_text()
+    style, _, drawing = text.partition("</style>")
+    assert "prefers-color-scheme:dark" in style
+    assert re.findall(r"(?:fill|stroke): #\w+", drawing) == []
+    assert "Bitstream" not in drawing
 
 
 def test_the_page_follows_from_the_figures() -> None:
