@@ -25,22 +25,21 @@ tags: [robotics, vision-language-action, flow-matching]
 
 # The reference policy of vlagents-ray
 
-A small vision-language-action policy, to see what a way of serving does to the success of a learned policy. It drives
-simulated grippers only; it knows no other scene, and is not for a real robot.
+This small vision-language-action policy shows how serving changes the success of a learned policy. It drives simulated
+grippers only and is not for a real robot.
 
 ## Success
 
-On seeds of which no demonstration was recorded, with 95 % intervals (Wilson). *Misled* is the control: its instruction
-names other colours, or another deed, so that a policy that reads it must fail.
+No demonstration was recorded with these seeds. The brackets contain 95 % intervals (Wilson). *Misled* is a control: the
+instruction names other colours or another task, so that a policy that reads it must fail.
 
 {rates}
 
-`vlagents-ray verify NAME.bundle.zip` checks the results behind these rates.
+`vlagents-ray verify NAME.bundle.zip` checks these results.
 
 ## Data
 
-Demonstrations by scripted experts, recorded and exported by this project (`examples/reference/demonstrations/`). Episodes that
-failed were left out.
+Scripted experts recorded the demonstrations (`examples/reference/demonstrations/`). Failed episodes were left out.
 
 | robot | episodes | frames | cameras |
 |---|---|---|---|
@@ -51,14 +50,13 @@ failed were left out.
 - {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, {processor}, torch {torch}.
 - {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are in `config.json`.
 - Code: commit {commit}.
-- `make reference` does all of it again. A second run from nothing, on the same kind of processor, gave the same weights
-  to the bit, and the same rates.
+- `make reference` repeats all steps. On the same kind of processor, a second run gave bit-identical weights.
 
 ## Limits
 
-- It knows {known} words, and refuses others: {words}.
-- Images of 64 px from the named cameras of these simulators as they render them here; Meta-World's without shadows.
-- A chunk has eight actions; four of them were executed.
+- It knows {known} words, and rejects others: {words}.
+- Images have 64 px and come from the named cameras; Meta-World renders them without shadows.
+- A chunk has eight actions, of which four were executed.
 """
 MADE = "training.json"
 
