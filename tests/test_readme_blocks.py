@@ -113,3 +113,30 @@ def test_an_option_that_the_command_lacks_fails() -> None:
     check_commands(shell("vlagents-ray serve scripted --port 8000"))
     with pytest.raises(AssertionError, match="--prot"):
         check_commands(shell("vlagents-ray serve scripted --prot 8000"))
+
+
+PRINTS = "```bash\necho 'loading'; printf 'pick   9/10 90.0%%\\nsaved: runs/x\\n'\n```\n\n"
+
+
+def output(text: str) -> str:
+    return f"{PRINTS}It prints:\n\n<!-- output -->\n```text\n{text}\n```\n"
+
+
+@pytest.mark.parametrize(
+    "text", ["pick 2/4 50%", " pick   9/10 90.0%\n\nsaved: runs/x", "saved: …", "loading"]
+)
+def test_output_on_a_page_is_compared_without_its_numbers_and_spaces(
+    text: str, tmp_path: Path
+) -> None:
+    run(one(output(text)), tmp_path)
+
+
+@pytest.mark.parametrize("text", ["place 9/10 90%", "saved: runs/x\npick 9/10 90%", "saved"])
+def test_output_that_a_block_does_not_print_in_this_order_fails(text: str, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="does not print"):
+        run(one(output(text)), tmp_path)
+
+
+def test_output_without_a_block_before_it_is_an_error() -> None:
+    with pytest.raises(ValueError, match="a block before it"):
+        blocks("<!-- output -->\n```text\nx\n```\n")

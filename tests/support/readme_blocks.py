@@ -10,6 +10,9 @@ Further lines of such a comment are code that is run before the block:
     <!-- test: serve scripted
     obs = Obs(gripper=1.0) -->
 
+`<!-- output -->` above a block of text says that the block before it prints these lines, in this
+order and perhaps among others. Numbers are not compared, and `…` matches any text.
+
 `<!-- file: NAME -->` says that the reader saves the block, of whatever language, under that name;
 the blocks after it on the page find the file.
 
@@ -27,7 +30,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +77,7 @@ class Block:
     peers: bool = False  # it is for the peers' Python
     ray: bool = False  # it starts Ray
     file: str | None = None  # under which name it is saved, in place of being run
+    output: str = ""  # what the page shows of what it prints
 
     def __str__(self) -> str:
         return f"line-{self.line}"
@@ -95,6 +99,11 @@ def blocks(text: str) -> list[Block]:
                     above and above[0][1].lstrip().startswith("<!-- file:")
                 ):
                     found.append(_block(fence["language"], above, code))
+                elif above and above[0][1].strip() == "<!-- output -->":
+                    if not found:
+                        raise ValueError(f"line {above[0][0]}: output needs a block before it")
+                    shown = "\n".join(line for _, line in code)
+                    found[-1] = replace(found[-1], output=shown)
                 fence, above, code = None, [], []
             else:
                 code.append((number, line.removeprefix(fence["indent"])))
@@ -179,6 +188,28 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
     assert done.returncode == 0, (
         f"{page} {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
     )
+    missing = not_printed(block.output, done.stdout)
+    assert missing is None, f"{page} {block} does not print {missing!r}:\n{done.stdout}"
+
+
+def not_printed(shown: str, printed: str) -> str | None:
+    """Return the first line of `shown` that `printed` does not have after the lines before it.
+
+    Spaces are not compared, and of numbers only their places: a page shows one run, and another has
+    other times.
+    """
+    remaining = iter(_without_numbers(printed))
+    for line in _without_numbers(shown):
+        pattern = re.escape(line).replace("…", ".*")
+        if not any(re.fullmatch(pattern, candidate) for candidate in remaining):
+            return line
+    return None
+
+
+def _without_numbers(text: str) -> list[str]:
+    """Return the lines of a text that are not empty, with 0 for each number."""
+    lines = [re.sub("─+", "─", " ".join(line.split())) for line in text.splitlines()]
+    return [re.sub(r"\d[\d.,]*(e[-+]\d+)?", "0", line) for line in lines if line]
 
 
 def check_commands(block: Block) -> None:
