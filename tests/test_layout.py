@@ -140,10 +140,11 @@ def test_architecture_names_each_module_and_folder_of_the_package_and_each_plugi
 
 
 @pytest.mark.parametrize("name", PLUGINS)
-def test_a_plugins_readme_names_pages_that_exist(name: str) -> None:
-    readme = (ROOT / "plugins" / name / "README.md").read_text()
-    pages = re.findall(r"`(docs/[\w/]+\.md)", readme)
-    assert [page for page in pages if not (ROOT / page).exists()] == []
+def test_a_plugins_readme_links_to_pages_that_exist(name: str) -> None:
+    folder = ROOT / "plugins" / name
+    pages = re.findall(r"\]\((\.\./[^)#]+)", (folder / "README.md").read_text())
+    assert "../../README.md" in pages
+    assert [page for page in pages if not (folder / page).exists()] == []
 
 
 # Files and folders of tests/ that import plug-ins, with the reason. All others need the core alone.
