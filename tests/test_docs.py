@@ -90,7 +90,6 @@ EXPLAINED = {
     "measured.md": ["serve"],
     "other_clients.md": ["serve"],
     "own_policy.md": ["eval"],
-    "pi0.md": ["tune"],
     "programs.md": ["robot"],
     "run_file.md": ["robot"],
     "slurm.md": ["serve"],
