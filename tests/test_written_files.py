@@ -8,8 +8,10 @@ down changes only where a review sees it.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
+import reference
 import surface
 import tables
 
@@ -85,3 +87,24 @@ def test_a_change_is_seen() -> None:
             f"- {before}",
             f"+ {after}",
         ]
+
+
+@pytest.mark.parametrize("page", reference.pages().items(), ids=lambda page: page[0].name)
+def test_a_page_of_the_reference_is_that_of_the_commands_and_settings(
+    page: tuple[Path, str],
+) -> None:
+    file, text = page
+    assert file.read_text() == text, "run `python tests/support/reference.py`"
+
+
+@pytest.mark.parametrize("name", ["run_file", "deployment", "policies"])
+def test_each_setting_has_a_description(name: str) -> None:
+    rows = re.findall(r"^\| `.*$", (reference.FOLDER / f"{name}.md").read_text(), re.MULTILINE)
+    assert rows
+    assert [row for row in rows if row.endswith("|  |")] == []
+
+
+def test_each_command_with_options_has_its_section() -> None:
+    page = (reference.FOLDER / "cli.md").read_text()
+    for path in reference.help_pages():
+        assert path == "vlagents-ray" or f"\n## `{path}`\n" in page

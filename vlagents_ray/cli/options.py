@@ -120,8 +120,13 @@ def command_of(
     for title, names_of_fields in panels.items():
         for name in names_of_fields:
             hints[name] = _in_panel(hints[name], title)
+    in_order = [name for names_of_fields in panels.values() for name in names_of_fields]
+    fields = sorted(  # arguments, and options that are in no panel, are first
+        dataclasses.fields(options),  # type: ignore[arg-type]
+        key=lambda field: in_order.index(field.name) if field.name in in_order else -1,
+    )
     parameters = []
-    for field in dataclasses.fields(options):  # type: ignore[arg-type]
+    for field in fields:
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
         elif field.default is not dataclasses.MISSING:

@@ -16,12 +16,12 @@ from vlagents_ray.interface import Act, Agent, Obs
 class NoopConfig(BaseModel, extra="forbid"):
     """Size of the zero action, and latency of the simulated model."""
 
-    action_dim: int = Field(default=7, ge=1)
+    action_dim: int = Field(default=7, ge=1, description="number of action values, D")
     delta: bool | None = Field(
         default=None, description="whether the contract declares relative actions"
     )
     chunk: int = Field(
-        default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)"
+        default=1, ge=1, description="rows of a chunk; 1 returns a single action, (D,)"
     )
     base_ms: float = Field(default=0.0, ge=0, description="duration of a batch of any size")
     per_item_ms: float = Field(default=0.0, ge=0, description="time that each item of a batch adds")

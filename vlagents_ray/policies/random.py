@@ -17,13 +17,13 @@ from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act, Agent, Obs
 class RandomConfig(BaseModel, extra="forbid"):
     """Bounds and size of the actions; `seed` is mixed with the seed of each episode."""
 
-    action_dim: int = Field(default=7, ge=1)
+    action_dim: int = Field(default=7, ge=1, description="number of action values, D")
     chunk: int = Field(
-        default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)"
+        default=1, ge=1, description="rows of a chunk; 1 returns a single action, (D,)"
     )
-    low: float = Field(default=-1.0, allow_inf_nan=False)
-    high: float = Field(default=1.0, allow_inf_nan=False)
-    seed: int = Field(default=0, ge=0)
+    low: float = Field(default=-1.0, allow_inf_nan=False, description="smallest action value")
+    high: float = Field(default=1.0, allow_inf_nan=False, description="largest action value")
+    seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -188,7 +188,7 @@ class PretrainedConfig(BaseModel, extra="forbid"):
         default="auto",
         description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'",
     )
-    dtype: DType = Field(default="float32", description="of the weights")
+    dtype: DType = Field(default="float32", description="dtype of the weights")
 
 
 class Pretrained:

@@ -154,7 +154,9 @@ class ArroConfig(BaseModel, extra="forbid"):
     tracker: Part = Field(
         default="sam2", description="'sam2', 'iou' or 'module:Class', or {name: settings}"
     )
-    background: BackgroundConfig = BackgroundConfig()
+    background: BackgroundConfig = Field(
+        default=BackgroundConfig(), description="what replaces the pixels that are not shown"
+    )
     grow: int = Field(
         default=0, ge=0, le=64, description="pixels by which segments are widened on each side"
     )

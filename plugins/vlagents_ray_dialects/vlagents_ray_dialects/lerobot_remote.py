@@ -80,11 +80,11 @@ _ACTION_DEADLINE_S, _LANGUAGE_DEADLINE_S = 5.0, 60.0
 class Feature(BaseModel, extra="forbid"):
     """One named value of an observation, or the action, as the client's robot describes it."""
 
-    name: str
-    shape: list[int]
-    dtype: str = "float32"
+    name: str = Field(description="name of the value")
+    shape: list[int] = Field(description="its shape")
+    dtype: str = Field(default="float32", description="its dtype")
     kind: str = Field(default="tensor", description="tensor, or rgb for an image (H, W, 3) uint8")
-    names: list[str] = Field(default_factory=list, description="of the numbers of a vector")
+    names: list[str] = Field(default_factory=list, description="names of the numbers of a vector")
     semantics: str = Field(description="convention in words, which the client must state alike")
 
     def to_wire(self) -> dict[str, Any]:
@@ -106,9 +106,12 @@ class LeRobotRemoteDialectConfig(KeylessPortConfig):
 
     mapping: MappingSetting = "lerobot"
     port: int = Field(default=7447, ge=1, le=65535)
-    deployment: str = Field(default="vlagents_ray", description="`--inference.deployment`")
+    deployment: str = Field(
+        default="vlagents_ray",
+        description="name of the deployment, which clients give as `--inference.deployment`",
+    )
     semantics: str = Field(description="convention of the deployment in words")
-    features: list[Feature] = Field(min_length=1, description="of an observation, in order")
+    features: list[Feature] = Field(min_length=1, description="values of an observation, in order")
     action: Feature = Field(description="the action of one step, a float32 vector")
     fps: float | None = Field(
         default=None, gt=0, description="rate of the actions, Hz; default: the contract's"

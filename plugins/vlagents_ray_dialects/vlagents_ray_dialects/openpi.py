@@ -188,13 +188,21 @@ class RoboArenaDialectConfig(DialectConfig):
     image_resolution: tuple[int, int] | None = Field(
         default=(224, 224), description="height, width; null: any"
     )
-    needs_wrist_camera: bool = True
-    n_external_cameras: int = Field(default=1, ge=0, le=2)
-    needs_stereo_camera: bool = False
-    needs_session_id: bool = False
+    needs_wrist_camera: bool = Field(
+        default=True, description="whether the client sends the wrist camera"
+    )
+    n_external_cameras: int = Field(
+        default=1, ge=0, le=2, description="number of external cameras that the client sends"
+    )
+    needs_stereo_camera: bool = Field(
+        default=False, description="whether the client sends both images of stereo cameras"
+    )
+    needs_session_id: bool = Field(
+        default=False, description="whether the client sends the name of its session"
+    )
     action_space: Literal[
         "joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"
-    ] = "joint_position"
+    ] = Field(default="joint_position", description="meaning of the actions, for the client")
     bare: bool = Field(
         default=False,
         description="whether the answer is the array itself, as older clients need it",

@@ -430,8 +430,10 @@ class GripperArgs(BaseModel, extra="forbid"):
 class RobotArgs(BaseModel, extra="forbid"):
     """The columns of one robot in a row."""
 
-    start: int | None = None
-    stop: int | None = None
+    start: int | None = Field(default=None, description="first column; default: 0")
+    stop: int | None = Field(
+        default=None, description="column after the last one; default: the end of the row"
+    )
     gripper: GripperArgs | None = Field(
         default=None, description="the column that becomes SingleAct.gripper; default: none"
     )

@@ -18,7 +18,7 @@ class AttentionConfig(ModelConfig):
 
     attention: Attention = Field(
         default="sdpa",
-        description="of the steps of the flow of π0 and π0.5 in PyTorch: torch's "
+        description="attention of the flow's steps of π0 and π0.5 in PyTorch: torch's "
         "scaled_dot_product_attention, or flex_attention, whose kernel torch.compile makes: it "
         "needs `compile` true, max or require",
     )

@@ -77,13 +77,22 @@ class VJepa2AcConfig(ModelConfig):
     topk: int = Field(
         default=10, ge=2, description="number of best plans that determine the next distribution"
     )
-    iterations: int = Field(default=10, ge=1)
+    iterations: int = Field(default=10, ge=1, description="iterations of the search for a plan")
     momentum_mean: float = Field(
         default=0.15, ge=0, lt=1, description="share of the last iteration's mean position"
     )
-    momentum_std: float = Field(default=0.15, ge=0, lt=1)
-    momentum_mean_gripper: float = Field(default=0.15, ge=0, lt=1)
-    momentum_std_gripper: float = Field(default=0.15, ge=0, lt=1)
+    momentum_std: float = Field(
+        default=0.15, ge=0, lt=1, description="share of the last iteration's deviation of positions"
+    )
+    momentum_mean_gripper: float = Field(
+        default=0.15, ge=0, lt=1, description="share of the last iteration's mean of the gripper"
+    )
+    momentum_std_gripper: float = Field(
+        default=0.15,
+        ge=0,
+        lt=1,
+        description="share of the last iteration's deviation of the gripper",
+    )
     maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
     close_gripper: int | None = Field(
         default=None, ge=0, description="step of a plan from which on the gripper closes"

@@ -55,42 +55,81 @@ class _PlanModel(BaseModel):
 class StepRange(_PlanModel):
     """Training steps at equal distances, the last one included."""
 
-    first: Step
-    last: Step
-    every: Annotated[int, Field(ge=1, le=MOST_STEP)]
+    first: Step = Field(
+        description="The first step.",
+    )
+    last: Step = Field(
+        description="The last step, which is included.",
+    )
+    every: Annotated[int, Field(ge=1, le=MOST_STEP)] = Field(
+        description="The distance between two steps.",
+    )
 
 
 class PushedWeights(_PlanModel):
     """Weights that a learner pushed, as `act.info["policy"]` names them."""
 
-    version: Step
-    fingerprint: str
+    version: Step = Field(
+        description="The version of the weights.",
+    )
+    fingerprint: str = Field(
+        description="The fingerprint of the weights.",
+    )
 
 
 class PolicyConfig(_PlanModel):
     """A policy, its source or address, and the checkpoints to evaluate."""
 
-    name: Name = "policy"  # in the results; two policies of one evaluation have different names
-    # A registered policy or a deployment file; `vlagents-ray eval` serves it for the length of the
-    # run.
-    source: str | None = None
-    # The URL of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster.
-    url: str | None = None
-    config: dict[str, JsonValue] = {}  # settings of the policy, over a deployment file's own
-    options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
-    checkpoint: str | None = None  # that the server loads; each episode's result names its own
-    # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option
-    # `checkpoint_step`.
-    steps: list[Step] = Field(default=[], max_length=MOST_STEPS_NAMED)
-    # The policy's present weights; their version replaces the checkpoint. Episodes of other weights
-    # are refused.
-    pushed_weights: PushedWeights | None = None
-    execute: Rows | None = None  # rows executed of each action chunk; None = all
-    # The codec of images over a network. JPEG changes them a little, so it must be set explicitly;
-    # the others do not, and "exact" takes the faster of raw and lossless, so that results never
-    # depend on the link.
-    codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
-    transport: TransportName = "auto"
+    name: Name = Field(
+        default="policy",
+        description="The name in the results. Two policies of one run have different names.",
+    )
+    source: str | None = Field(
+        default=None,
+        description="A registered policy or a deployment file, which `vlagents-ray eval` serves "
+        "during the run.",
+    )
+    url: str | None = Field(
+        default=None,
+        description="The URL of a running server instead of `source`: `http://gpu-box:8000`, or "
+        "`serve://NAME` in this cluster.",
+    )
+    config: dict[str, JsonValue] = Field(
+        default={},
+        description="Settings of the policy, which override those of a deployment file.",
+    )
+    options: dict[str, JsonValue] = Field(
+        default={},
+        description="Options that are passed to every `reset` of the policy.",
+    )
+    checkpoint: str | None = Field(
+        default=None,
+        description="The checkpoint to record if the server does not report one.",
+    )
+    steps: list[Step] = Field(
+        default=[],
+        max_length=MOST_STEPS_NAMED,
+        description="Checkpoints to compare: a list of training steps, or `{first, last, every}`. "
+        "Each is chosen with the reset option `checkpoint_step`.",
+    )
+    pushed_weights: PushedWeights | None = Field(
+        default=None,
+        description="The weights that the policy must have. They replace the checkpoint in the "
+        "results, as `NAME@VERSION`. The run stops if an episode uses other weights.",
+    )
+    execute: Rows | None = Field(
+        default=None,
+        description="Number of rows of each action chunk that are executed. null: all.",
+    )
+    codec: Literal["exact", "raw", "lossless", "jpeg"] = Field(
+        default="exact",
+        description="Codec of images over a network. `exact` chooses the faster of `raw` and "
+        "`lossless`. `jpeg` changes the images slightly.",
+    )
+    transport: TransportName = Field(
+        default="auto",
+        description="Transport to the server. `auto`: the fastest that works.",
+    )
 
     @field_validator("steps", mode="before")
     @classmethod
@@ -138,13 +177,25 @@ class PolicyConfig(_PlanModel):
 class WorkerConfig(_PlanModel):
     """The resources of a worker, and its runtime environment."""
 
-    cpus: Resources = 0.5  # low, so that workers and policy fit on a small machine
-    gpus: Resources = 0.0
-    threads: Annotated[int, Field(ge=1, le=MOST_CPUS)] = 1  # of OpenMP, MKL, llvmpipe and the like
-    # Ray's runtime environment; its env_vars override the thread settings. For a simulator with
-    # other packages, give their Python, in which Ray is installed:
-    # {"py_executable": "/envs/rcs/bin/python"}.
-    runtime_env: dict[str, JsonValue] = {}
+    cpus: Resources = Field(
+        default=0.5,
+        description="Number of CPUs that Ray reserves for each worker.",
+    )
+    gpus: Resources = Field(
+        default=0.0,
+        description="Number of GPUs that Ray reserves for each worker. 0: images are rendered in "
+        "software.",
+    )
+    threads: Annotated[int, Field(ge=1, le=MOST_CPUS)] = Field(
+        default=1,
+        description="Number of threads of OpenMP, MKL, llvmpipe and similar libraries.",
+    )
+    runtime_env: dict[str, JsonValue] = Field(
+        default={},
+        description="Ray's runtime environment, such as `{py_executable: /envs/rcs/bin/python}` "
+        "for a simulator with other packages. Its `env_vars` override the thread "
+        "settings, and must contain no secrets, as Ray logs them.",
+    )
 
     @field_validator("runtime_env")
     @classmethod
@@ -158,19 +209,36 @@ class ClockConfig(_PlanModel):
     `vlagents_ray.evaluate.episode.latency`).
     """
 
-    # The seconds that each answer takes: "measured", transport included, or an injected number,
-    # with which an episode repeats exactly.
-    latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = "measured"
-    # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of
-    # the robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no
-    # motion, the gripper as it was commanded.
-    meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
-    hz: Hertz | None = None  # ticks per second; None: the env's control_hz
-    align: bool = True  # drop the rows for ticks at which others were executed before the answer
-    # Send the policy the rest of the last chunk, and its number of ticks (`interface.DELAY`).
-    real_time_chunking: bool = False
-    # The action before the first answer, and of "zero"; None: zeros, and the gripper open at first.
-    neutral: list[FiniteFloat] | None = None
+    latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = Field(
+        default="measured",
+        description="Latency of each answer: `measured`, with the transport, or a number of "
+        "seconds, with which an episode is reproducible.",
+    )
+    meanwhile: Literal["chunk", "hold", "zero"] = Field(
+        default="chunk",
+        description="Action until the answer arrives. `chunk`: the remaining rows of the last "
+        "chunk, then a stop of the robot. `hold`: the last action again. `zero`: no "
+        "motion, and the gripper as commanded.",
+    )
+    hz: Hertz | None = Field(
+        default=None,
+        description="Number of ticks per second. null: the environment's `control_hz`.",
+    )
+    align: bool = Field(
+        default=True,
+        description="Drop the rows for ticks at which other actions were executed before the "
+        "answer arrived.",
+    )
+    real_time_chunking: bool = Field(
+        default=False,
+        description="Send the policy the remaining rows of the last chunk, and the number of "
+        "ticks of the delay.",
+    )
+    neutral: list[FiniteFloat] | None = Field(
+        default=None,
+        description="Action before the first answer, and of `zero`. null: zeros, with the gripper "
+        "open at first.",
+    )
 
 
 class StopConfig(_PlanModel):
@@ -178,12 +246,28 @@ class StopConfig(_PlanModel):
     whichever comes first.
     """
 
-    # The error rate of each case's confidence sequence, over all looks together.
-    error_rate: float = Field(default=0.05, gt=0, lt=1)
-    # Stop when this success rate is excluded.
-    target: float | None = Field(default=None, ge=0, le=1)
-    width: float | None = Field(default=None, gt=0, lt=1)  # stop when the interval is narrower
-    at_least: Count = 1  # episodes
+    error_rate: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        description="Error rate of the confidence sequence of each case, over all looks together.",
+    )
+    target: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Stop when this success rate is excluded.",
+    )
+    width: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="Stop when the interval is narrower than this.",
+    )
+    at_least: Count = Field(
+        default=1,
+        description="Smallest number of episodes of a case.",
+    )
 
     @model_validator(mode="after")
     def _some_end(self) -> Self:
@@ -198,18 +282,46 @@ class StopConfig(_PlanModel):
 class SuiteConfig(_PlanModel):
     """Environments that are evaluated with the same settings."""
 
-    name: str = ""  # in the results; an env may be in two suites of different names and settings
-    # Registered names, "maniskill/PushCube-v1", or patterns, "libero/*".
-    envs: list[Name] = Field(min_length=1)
-    env_options: dict[str, JsonValue] = {}  # passed to the constructor
-    reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
-    episodes: Count = 10  # of each env and seed
-    seeds: list[Seed] = Field(default=[0], min_length=1)  # episode i uses seed + i
-    # The environments that one worker steps together, in one simulator where that is possible
-    # (ManiSkill on a GPU).
-    num_envs: Rows = 1
-    worker: WorkerConfig | None = None  # None: `EvalConfig.worker`
-    clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
+    name: str = Field(
+        default="",
+        description="The name in the results. An environment may be in two suites of different "
+        "names and settings.",
+    )
+    envs: list[Name] = Field(
+        min_length=1,
+        description="Names of environments, such as `maniskill/PushCube-v1`, or patterns, such as "
+        "`libero/libero_spatial/*`.",
+    )
+    env_options: dict[str, JsonValue] = Field(
+        default={},
+        description="Options that are passed to the constructor of the environment.",
+    )
+    reset_options: dict[str, JsonValue] = Field(
+        default={},
+        description="Options that are passed to every `reset` of the environment.",
+    )
+    episodes: Count = Field(
+        default=10,
+        description="Number of episodes of each environment and seed.",
+    )
+    seeds: list[Seed] = Field(
+        default=[0],
+        min_length=1,
+        description="Seeds of the first episodes. Episode i uses seed + i.",
+    )
+    num_envs: Rows = Field(
+        default=1,
+        description="Number of environments that one worker steps together, with one request for "
+        "all. ManiSkill runs them in one simulator on a GPU.",
+    )
+    worker: WorkerConfig | None = Field(
+        default=None,
+        description="Resources of the workers of this suite, which replace the run's `worker`.",
+    )
+    clock: ClockConfig | None = Field(
+        default=None,
+        description="Settings of the real-time mode. null: the environment waits for the policy.",
+    )
 
     @field_validator("envs")
     @classmethod
@@ -238,20 +350,38 @@ class SuiteConfig(_PlanModel):
 class TrackingConfig(_PlanModel):
     """The names under which trackers show an evaluation."""
 
-    project: Name = "vlagents-ray"
-    group: str | None = None  # of runs; default: the name of the folder of results
-    # The number of videos of each case that are uploaded, failures first.
-    videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4
+    project: Name = Field(
+        default="vlagents-ray",
+        description="Name of the project.",
+    )
+    group: str | None = Field(
+        default=None,
+        description="Group of runs. null: the name of the folder of results.",
+    )
+    videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = Field(
+        default=4,
+        description="Number of videos of each case that are uploaded, failures first.",
+    )
 
 
 class RobotTask(_PlanModel):
     """A task of a real robot, which suites name in their `envs`."""
 
-    instruction: Name  # to the policy, and to the operator
-    setup: str = ""  # instructions for setting the scene
-    max_steps: Count = 600  # control ticks after which a trial ends
-    # The points of each part of the task, for a partial success.
-    rubric: dict[Name, Annotated[float, Field(gt=0, le=1e6)]] = {}
+    instruction: Name = Field(
+        description="The task in words, for the policy and the operator.",
+    )
+    setup: str = Field(
+        default="",
+        description="How the operator sets the scene.",
+    )
+    max_steps: Count = Field(
+        default=600,
+        description="Number of control ticks after which a trial ends.",
+    )
+    rubric: dict[Name, Annotated[float, Field(gt=0, le=1e6)]] = Field(
+        default={},
+        description="Points for each part of the task, for a partial success.",
+    )
 
 
 class RobotConfig(_PlanModel):
@@ -259,58 +389,159 @@ class RobotConfig(_PlanModel):
     `vlagents_ray.evaluate.robot`).
     """
 
-    # "module:Class" of the robot, or an arm by name; None: the plan is played in simulation.
-    arm: str | None = None
-    tasks: dict[Name, RobotTask] = Field(min_length=1)
-    # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
-    key: Annotated[str, Field(min_length=8)] | None = None
-    hz: Hertz = 10.0  # control rate
-    # These settings are those of `ChunkPlayer` and `Guard`.
-    mode: Literal["open_loop", "ensemble", "async"] = "async"
-    deadline_s: Annotated[float, Field(ge=0, le=3600)] | None = None  # None: 0 in "async", else 1
-    max_age_s: Seconds | None = None
-    safe: Literal["auto", "hold", "zero"] = "auto"
-    max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    measure: str | None = None  # the part of the state that is the measured pose
-    limits: str | None = None  # a file of `MotionLimits.read`, without the soft start
-    # Play even if the training's statistics do not fit the arm; the log shows it.
-    ignore_mismatch: bool = False
-    silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated
+    arm: str | None = Field(
+        default=None,
+        description="`module:Class` of the robot, or an arm by name. `--robot` sets it. null: the "
+        "file runs in simulation.",
+    )
+    tasks: dict[Name, RobotTask] = Field(
+        min_length=1,
+        description="The tasks, by the names that suites have in `envs`.",
+    )
+    key: Annotated[str, Field(min_length=8)] | None = Field(
+        default=None,
+        description="Key from which the order of the policies is drawn. null: a new key, which is "
+        "kept in `trials.key` in the folder of results.",
+    )
+    hz: Hertz = Field(
+        default=10.0,
+        description="Control rate.",
+    )
+    mode: Literal["open_loop", "ensemble", "async"] = Field(
+        default="async",
+        description="Mode of the chunk player.",
+    )
+    deadline_s: Annotated[float, Field(ge=0, le=3600)] | None = Field(
+        default=None,
+        description="Time for which a tick waits for an action, in seconds. null: 0 in mode "
+        "`async`, otherwise 1.",
+    )
+    max_age_s: Seconds | None = Field(
+        default=None,
+        description="Largest age, in seconds, of the observation from which an executed action "
+        "was computed.",
+    )
+    safe: Literal["auto", "hold", "zero"] = Field(
+        default="auto",
+        description="Action at a tick for which the policy has none.",
+    )
+    max_step: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        default=None,
+        description="Largest change of an action value from one tick to the next.",
+    )
+    measure: str | None = Field(
+        default=None,
+        description="Part of the state with the measured pose, such as `joints`.",
+    )
+    limits: str | None = Field(
+        default=None,
+        description="File with limits of motion, without the soft start.",
+    )
+    ignore_mismatch: bool = Field(
+        default=False,
+        description="Move even if the statistics of the training do not fit the arm. The log "
+        "records it.",
+    )
+    silent_s: Seconds = Field(
+        default=2.0,
+        description="Silence of the server, in seconds, after which the trial ends. It is "
+        "repeated.",
+    )
 
 
 class EvalConfig(_PlanModel):
     """The settings of an evaluation: the policies, the envs, and the folder of results."""
 
-    policies: list[PolicyConfig] = Field(min_length=1)
-    suites: list[SuiteConfig] = Field(min_length=1)
-    out: Path
-    # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this
-    # process, without Ray. None: 0 for a short evaluation, else 1 (see `chosen_workers`).
-    workers: Workers | None = None
-    video: EpisodeChoice = "failures"  # of which episodes there are videos
-    # The episodes of which there are trajectories: numbers and the policy's images.
-    record: EpisodeChoice = "none"
-    # The policy's images in trajectories: lossy H.264, as in videos for people, or each pixel.
-    record_images: RecordedImages = "small"
-    resume: bool = False
-    # Resume even if files of the policy or the environment changed; the report shows it.
-    accept_changes: bool = False
-    worker: WorkerConfig = WorkerConfig()
-    stop: StopConfig | None = None  # early stopping; None: every episode is played
-    # Trackers that show rates and videos beside `out`, against the training step.
-    track: list[Name] = []
-    tracking: TrackingConfig = TrackingConfig()
-    robot: RobotConfig | None = None  # a real robot and its tasks
-
-    # These settings apply when something breaks.
-    retries: Retries = 3  # further attempts after an infrastructure failure
-    # Stop after so many lost episodes, or errors of policies, in a row; 0 = never.
-    abort_after: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 10
-    make_timeout_s: Seconds = 300.0  # making an env, imports and shaders included
-    env_timeout_s: Seconds = 60.0  # one reset or step
-    policy_timeout_s: Seconds = 60.0  # one reset or act of the policy
-    connect_timeout_s: Seconds = 120.0  # reaching the policy, a restart of its server included
-    place_timeout_s: Seconds = 120.0  # until the cluster has resources for a worker
+    policies: list[PolicyConfig] = Field(
+        min_length=1,
+        description="The policies.",
+    )
+    suites: list[SuiteConfig] = Field(
+        min_length=1,
+        description="The suites of environments. Every policy runs in every suite.",
+    )
+    out: Path = Field(
+        description="Folder of the results. A run file NAME.yaml without it uses `runs/NAME`.",
+    )
+    workers: Workers | None = Field(
+        default=None,
+        description="Number of environments that run in parallel, each in a Ray actor. 0: one "
+        "after another in this process, without Ray. null: 0 for a short evaluation, "
+        "otherwise 1.",
+    )
+    video: EpisodeChoice = Field(
+        default="failures",
+        description="Episodes whose video is written.",
+    )
+    record: EpisodeChoice = Field(
+        default="none",
+        description="Episodes whose trajectory is written.",
+    )
+    record_images: RecordedImages = Field(
+        default="small",
+        description="Images of trajectories: `small`, lossy H.264 as in videos, or `exact`, each "
+        "pixel, which browsers cannot show.",
+    )
+    resume: bool = Field(
+        default=False,
+        description="Continue the results in `out`.",
+    )
+    accept_changes: bool = Field(
+        default=False,
+        description="Continue even if files of the policy or the environment have changed. The "
+        "report lists the changes.",
+    )
+    worker: WorkerConfig = Field(
+        default=WorkerConfig(),
+        description="Resources of each worker.",
+    )
+    stop: StopConfig | None = Field(
+        default=None,
+        description="Rule by which a case stops early. null: every episode runs.",
+    )
+    track: list[Name] = Field(
+        default=[],
+        description="Trackers that show rates and videos: `wandb`, `trackio`, `tensorboard`, or "
+        "those of a plug-in.",
+    )
+    tracking: TrackingConfig = Field(
+        default=TrackingConfig(),
+        description="Names under which trackers show the evaluation.",
+    )
+    robot: RobotConfig | None = Field(
+        default=None,
+        description="A real robot and its tasks.",
+    )
+    retries: Retries = Field(
+        default=3,
+        description="Number of further attempts at an episode that infrastructure lost.",
+    )
+    abort_after: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = Field(
+        default=10,
+        description="Stop after this number of lost episodes, or of errors of policies, in a row. "
+        "0: never.",
+    )
+    make_timeout_s: Seconds = Field(
+        default=300.0,
+        description="Time limit for creating an environment, with imports and shaders, in seconds.",
+    )
+    env_timeout_s: Seconds = Field(
+        default=60.0,
+        description="Time limit of one reset or step of the environment, in seconds.",
+    )
+    policy_timeout_s: Seconds = Field(
+        default=60.0,
+        description="Time limit of one call of the policy, in seconds.",
+    )
+    connect_timeout_s: Seconds = Field(
+        default=120.0,
+        description="Time limit for connecting to the policy, with a restart of its server, in "
+        "seconds.",
+    )
+    place_timeout_s: Seconds = Field(
+        default=120.0,
+        description="Time limit until the cluster has resources for a worker, in seconds.",
+    )
 
     @field_validator("policies")
     @classmethod

@@ -17,7 +17,7 @@ NoiseLevel = Annotated[
     float,
     Field(
         ge=0,
-        description="randomness of the flow's steps in acts whose log-probability a learner "
+        description="randomness of the flow's steps in calls whose log-probability a learner "
         "requests, usually 0.5; 0: none is offered",
     ),
 ]

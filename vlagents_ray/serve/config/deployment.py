@@ -46,18 +46,19 @@ class EnvironmentArgs(_DeploymentModel):
 
     python: AbsolutePath | None = Field(
         default=None,
-        description="interpreter of a virtual environment, on every node the same; a relative path "
-        "is one from the "
-        "working directory",
+        description="Interpreter of a virtual environment, at the same path on every node. A "
+        "relative path starts at the working directory.",
     )
     process: Literal["auto", "replica", "child"] = Field(
         default="auto",
-        description="with `python`: is the replica itself to run there (same Python minor and Ray "
-        "as the cluster's), "
-        "or a child process behind it? auto: the replica where it can",
+        description="With `python`: where the policy runs. `replica`: in the replica itself, "
+        "which needs the cluster's minor version of Python and its version of Ray. "
+        "`child`: in a child process of the replica. `auto`: in the replica if "
+        "possible.",
     )
     env_vars: dict[str, str] = Field(
-        default_factory=dict, description="variables of the policy's process"
+        default_factory=dict,
+        description="Environment variables of the policy's process, without secrets.",
     )
 
     @model_validator(mode="after")
@@ -86,24 +87,23 @@ class BatchArgs(_DeploymentModel):
     """The settings of the batch queue of one replica."""
 
     max_size: int = Field(
-        default=16, ge=1, le=MOST_ROWS, description="observations in one forward pass, at most"
+        default=16,
+        ge=1,
+        le=MOST_ROWS,
+        description="Largest number of observations in one forward pass.",
     )
     sizes: list[Annotated[int, Field(le=MOST_ROWS)]] | None = Field(
         default=None,
-        description=(
-            "for compiled models: the only batch sizes to run, ascending; smaller batches are "
-            "padded to the next size. The largest is max_size, which may then be omitted"
-        ),
+        description="For compiled models: the only batch sizes to run, ascending. Smaller batches "
+        "are padded to the next size. The largest is `max_size`, which may then be "
+        "omitted.",
     )
     patience: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="how long a batch may wait for simulations that were in the batch before and "
-        "are coming back, as "
-        "a share of that batch's duration; robots that act again at once wait for one another "
-        "while that saves time. 0 "
-        "never waits, nor does a lone session",
+        description="How long a batch may wait for the simulations of the previous batch, as a "
+        "share of that batch's duration. 0 never waits.",
     )
 
     @model_validator(mode="after")
@@ -131,20 +131,20 @@ class CheckpointArgs(_DeploymentModel):
 
     choices: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description=(
-            "for each name, settings that replace those in `config`; or only `adapter`, a PEFT "
-            "folder or hub id (org/name, org/name@COMMIT) of a LoRA adapter for the checkpoint in "
-            "`config`"
-        ),
+        description="Checkpoints by name: settings that replace those in `config`, or only "
+        "`adapter`, a PEFT folder or hub id (org/name, org/name@COMMIT) of a LoRA "
+        "adapter for the checkpoint in `config`.",
     )
     steps: bool = Field(
-        default=False, description="any step of a checkpoint whose path holds {step}"
+        default=False,
+        description="Sessions may choose any training step of a checkpoint whose path contains "
+        "`{step}`.",
     )
     loaded: int = Field(
         default=2,
         ge=1,
         le=1_000_000,
-        description="checkpoints in the memory of one replica at once, at most",
+        description="Largest number of checkpoints in the memory of one replica.",
     )
 
     @field_validator("choices")
@@ -180,30 +180,37 @@ class SessionArgs(_DeploymentModel):
         default=1000,
         ge=1,
         le=1_000_000,
-        description="sessions held at once; the next reset gets 503",
+        description="Largest number of sessions at the same time. The next reset returns 503.",
     )
     idle_s: float = Field(
         default=600.0,
         gt=0,
         le=MOST_S,
-        description="a session that sends nothing for so long is forgotten",
+        description="Time without a request after which a session ends, in seconds.",
     )
 
 
 class SloArgs(_DeploymentModel):
     """What a robot needs whose reset states no SLO, see `vlagents_ray.slo.Slo`."""
 
-    hz: float = Field(le=MOST, description="ticks of its control loop a second")
+    hz: float = Field(
+        le=MOST,
+        description="Number of ticks of the robot's control loop per second.",
+    )
     age_ms: float | None = Field(
-        default=None, le=MOST, description="largest age of an executed action; unset: any"
+        default=None,
+        le=MOST,
+        description="Largest age of an executed action, in ms. null: any.",
     )
     share: float = Field(
-        default=SHARE, le=1, description="least share of its ticks with an action in time"
+        default=SHARE,
+        le=1,
+        description="Smallest share of its ticks with an action in time.",
     )
     rows: int | None = Field(
         default=None,
         le=int(MOST),
-        description="rows of a chunk that it executes at most; unset: all of them",
+        description="Largest number of rows of a chunk that the robot executes. null: all.",
     )
 
     @model_validator(mode="before")
@@ -229,12 +236,14 @@ class StreamArgs(_DeploymentModel):
     use the proxy.
     """
 
-    enabled: bool = True
+    enabled: bool = Field(
+        default=True,
+        description="Whether replicas have a port of their own.",
+    )
     ports: tuple[Port, Port] | None = Field(
         default=None,
-        description=(
-            "first and last port to choose from; unset: any. Each replica of a node uses one"
-        ),
+        description="First and last port to choose from, one for each replica of a node. null: "
+        "any.",
     )
 
     @model_validator(mode="after")
@@ -256,76 +265,92 @@ class LimitArgs(_DeploymentModel):
         default=30.0,
         gt=0,
         le=MOST_S,
-        description="a request's body has to be here, a WebSocket's reply to be taken in this "
-        "time; else its "
-        "connection is cut",
+        description="Time in which a client has to send the body of a request, or to receive a "
+        "message of a WebSocket, in seconds. Then its connection is closed.",
     )
     act_s: float = Field(
         default=CallLimits().act_s,
         gt=0,
         le=MOST_S,
-        description=(
-            "a batch of acts, or a reset, that takes longer than this, and than ten times the "
-            "longest so far, makes the replica unhealthy: Serve replaces it, and its sessions "
-            "continue in other replicas"
-        ),
+        description="Time limit of a batch or a reset, in seconds. If one exceeds it, and ten "
+        "times the longest duration so far, the replica is unhealthy: Serve replaces "
+        "it, and its sessions continue in other replicas.",
     )
     warm_up_s: float = Field(
         default=CallLimits().warm_up_s,
         gt=0,
         le=MOST_S,
-        description="the same for the first two resets and batches, of each of `batch.sizes`, "
-        "which may compile",
+        description="The same for the first two resets, and the first two batches of each of "
+        "`batch.sizes`, which may compile.",
     )
     load_s: float = Field(
         default=CallLimits().load_s,
         gt=0,
         le=MOST_S,
-        description="time limit for loading a checkpoint",
+        description="Time limit for loading a checkpoint, in seconds.",
     )
-    body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024, le=MOST_BYTES)
+    body_bytes: int = Field(
+        default=DEFAULT_LIMITS.body_bytes,
+        ge=1024,
+        le=MOST_BYTES,
+        description="Largest body of a request, in bytes.",
+    )
     reply_bytes: int = Field(
         default=DEFAULT_LIMITS.reply_bytes,
         ge=1024,
         le=DEFAULT_LIMITS.body_bytes,  # no client reads a longer reply
-        description="of the action and the info of one reply; a policy that returns more has "
-        "failed (500)",
+        description="Largest reply: the action and its info, in bytes. A policy that returns more "
+        "has failed (500).",
     )
     decoded_bytes: int = Field(
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description=(
-            "decoded size of the images and bytes of one request, each as often as it is named; "
-            "with the rate of a key it limits the bytes that are decoded for the key in a second"
-        ),
+        description="Largest decoded size of the images and bytes of one request, each as often "
+        "as it is named.",
     )
     in_flight_bytes: int = Field(
         default=DEFAULT_LIMITS.in_flight_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description="of all messages that a replica works on, encoded and decoded; over it the "
-        "next ones get 503. A "
-        "quarter is kept for robots",
+        description="Largest size of all messages in a replica, encoded and decoded, in bytes. "
+        "Above it, requests return 503. A quarter is reserved for robots.",
     )
     pixels: int = Field(
-        default=DEFAULT_LIMITS.pixels, ge=1, le=MOST_BYTES, description="of one image"
+        default=DEFAULT_LIMITS.pixels,
+        ge=1,
+        le=MOST_BYTES,
+        description="Largest number of pixels of one image.",
     )
-    cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0, le=1_000_000)
+    cameras: int = Field(
+        default=DEFAULT_LIMITS.cameras,
+        ge=0,
+        le=1_000_000,
+        description="Largest number of cameras of an observation.",
+    )
     state_values: int = Field(
         default=DEFAULT_LIMITS.state_values,
         ge=0,
         le=1_000_000,
-        description="of one part of the proprioception",
+        description="Largest number of values in one part of the state.",
     )
     depth: int = Field(
-        default=DEFAULT_LIMITS.depth, ge=1, le=1_000_000, description="nesting of info and kwargs"
+        default=DEFAULT_LIMITS.depth,
+        ge=1,
+        le=1_000_000,
+        description="Largest nesting depth of info and kwargs.",
     )
     items: int = Field(
-        default=DEFAULT_LIMITS.items, ge=1, le=1_000_000, description="values in info and kwargs"
+        default=DEFAULT_LIMITS.items,
+        ge=1,
+        le=1_000_000,
+        description="Largest number of values in info and kwargs.",
     )
     text: int = Field(
-        default=DEFAULT_LIMITS.text, ge=1, le=1_000_000, description="characters of an instruction"
+        default=DEFAULT_LIMITS.text,
+        ge=1,
+        le=1_000_000,
+        description="Largest number of characters of an instruction.",
     )
 
     def limits(self) -> MessageLimits:
@@ -344,21 +369,23 @@ class AccessArgs(_DeploymentModel):
 
     keys_file: str | None = Field(
         default=None,
-        description="path of the API keys, the same on every node; unset: the value of "
-        "VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS where the replica runs",
+        description="Path of the API keys, the same on every node. null: the value of "
+        "VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS of the replica.",
     )
     insecure: bool = Field(
-        default=False, description="accept clients on other machines without keys"
+        default=False,
+        description="Accept clients on other machines without keys.",
     )
     plain_http: bool = Field(
         default=False,
-        description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, "
-        "a VPN)",
+        description="Do not warn that keys are sent unencrypted, because TLS ends elsewhere or "
+        "the network is a VPN.",
     )
     hosts: list[Annotated[str, AfterValidator(str.lower)]] = Field(
         default_factory=list,
-        description="without keys: names in the public DNS by which clients reach the server; its "
-        "addresses, names without a dot and names of private networks need not be listed",
+        description="Without keys: names in the public DNS with which clients reach the server. "
+        "Its addresses, names without a dot, and names of private networks are always "
+        "accepted.",
     )
 
     @model_validator(mode="after")
@@ -384,38 +411,69 @@ class AutoscalingArgs(_DeploymentModel):
     transports, see `vlagents_ray.serve.scaling.autoscaling`.
     """
 
-    min_replicas: int = Field(default=1, ge=0, le=MOST_WORKERS)
-    max_replicas: int = Field(default=1, ge=1, le=MOST_WORKERS)
-    initial_replicas: int | None = Field(default=None, ge=0, le=MOST_WORKERS)
+    min_replicas: int = Field(
+        default=1,
+        ge=0,
+        le=MOST_WORKERS,
+        description="Smallest number of replicas.",
+    )
+    max_replicas: int = Field(
+        default=1,
+        ge=1,
+        le=MOST_WORKERS,
+        description="Largest number of replicas.",
+    )
+    initial_replicas: int | None = Field(
+        default=None,
+        ge=0,
+        le=MOST_WORKERS,
+        description="Number of replicas at the start. null: `min_replicas`.",
+    )
     target_utilisation: float = Field(
-        default=0.7, gt=0, le=1, description="share of the time in which a replica's policy is busy"
+        default=0.7,
+        gt=0,
+        le=1,
+        description="Share of the time in which a replica's policy is busy.",
     )
     target_waiting: float = Field(
         default=1.0,
         gt=0,
         le=1_000_000,
-        description="mean number of requests in a replica's queue, in batches of the largest size",
+        description="Mean number of requests in a replica's queue, in batches of the largest size.",
     )
     target_sessions: float | None = Field(
-        default=None, gt=0, le=1_000_000, description="sessions of a replica; unset: any number"
+        default=None,
+        gt=0,
+        le=1_000_000,
+        description="Number of sessions of a replica. null: any.",
     )
     target_slo_load: float = Field(
         default=0.8,
         gt=0,
         le=1,
-        description="share of a replica that its robots need to be in time, by their SLOs",
+        description="Share of a replica that its robots need to be in time, according to their "
+        "SLOs.",
     )
     look_back_s: float = Field(
-        default=15.0, gt=0, le=MOST_S, description="load is averaged over this time"
+        default=15.0,
+        gt=0,
+        le=MOST_S,
+        description="Time over which the load is averaged, in seconds.",
     )
     upscale_delay_s: float = Field(
         default=10.0,
         ge=0,
         le=MOST_S,
-        description="more must be needed for this long, or 3 s by sessions, 1 s by their SLOs",
+        description="Time for which more replicas must be needed before they are added, in "
+        "seconds. The need from sessions is obeyed after at most 3 s, the need from "
+        "SLOs after at most 1 s.",
     )
     downscale_delay_s: float = Field(
-        default=300.0, ge=0, le=MOST_S, description="less must be wanted for this long"
+        default=300.0,
+        ge=0,
+        le=MOST_S,
+        description="Time for which fewer replicas must be needed before some are removed, in "
+        "seconds.",
     )
 
     @model_validator(mode="after")
@@ -461,50 +519,99 @@ class ResourceArgs(_DeploymentModel):
     """The resources that Ray reserves for each replica."""
 
     num_cpus: float = Field(
-        default=0.0, ge=0, le=MOST_CPUS, description="0 never competes with the rollouts for a slot"
+        default=0.0,
+        ge=0,
+        le=MOST_CPUS,
+        description="Number of CPUs that Ray reserves for each replica. With 0, a replica never "
+        "competes with rollout workers for a slot.",
     )
-    num_gpus: float = Field(default=0.0, ge=0, le=MOST_CPUS)
-    memory: float | None = Field(default=None, gt=0, le=MOST_BYTES, description="bytes")
+    num_gpus: float = Field(
+        default=0.0,
+        ge=0,
+        le=MOST_CPUS,
+        description="Number of GPUs that Ray reserves for each replica, which may be a fraction.",
+    )
+    memory: float | None = Field(
+        default=None,
+        gt=0,
+        le=MOST_BYTES,
+        description="Memory that Ray reserves for each replica, in bytes.",
+    )
     custom: dict[str, Annotated[float, Field(ge=0, le=1e12)]] = Field(
-        default_factory=dict, description="custom resources of the cluster, by name"
+        default_factory=dict,
+        description="Custom resources of the cluster, by name.",
     )
 
 
 class ServerArgs(_DeploymentModel):
     """The settings of a server for one policy."""
 
-    policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
-    config: dict[str, Any] = Field(default_factory=dict, description="settings of the policy")
+    policy: str = Field(
+        description="A registered name (`vlagents-ray policies` lists them) or `module:Class`.",
+    )
+    config: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Settings of the policy.",
+    )
     wrappers: list[str | dict[str, dict[str, Any]]] = Field(
         default=[],
-        description="wrappers of the policy, the one nearest to the robot first: names, or {name: "
-        "settings}",
+        description="Wrappers of the policy, the one nearest to the robot first: names, or "
+        "`{name: settings}`.",
     )
-    checkpoints: CheckpointArgs = CheckpointArgs()
+    checkpoints: CheckpointArgs = Field(
+        default=CheckpointArgs(),
+        description="Checkpoints from which sessions choose.",
+    )
     replicas: int | None = Field(
-        default=None, ge=1, le=MOST_WORKERS, description="a fixed number; excludes `autoscaling`"
+        default=None,
+        ge=1,
+        le=MOST_WORKERS,
+        description="Number of replicas, instead of `autoscaling`. null: 1.",
     )
-    autoscaling: AutoscalingArgs | None = None
-    batch: BatchArgs = BatchArgs()
-    sessions: SessionArgs = SessionArgs()
+    autoscaling: AutoscalingArgs | None = Field(
+        default=None,
+        description="Number of replicas according to the load, instead of `replicas`.",
+    )
+    batch: BatchArgs = Field(
+        default=BatchArgs(),
+        description="Batches of one replica.",
+    )
+    sessions: SessionArgs = Field(
+        default=SessionArgs(),
+        description="Sessions of one replica.",
+    )
     slo: SloArgs | None = Field(
-        default=None, description="what each robot needs whose reset states no SLO"
+        default=None,
+        description="Needs of robots that declare none at their reset.",
     )
-    limits: LimitArgs = LimitArgs()
-    access: AccessArgs = AccessArgs()
-    stream: StreamArgs = StreamArgs()
-    resources: ResourceArgs = ResourceArgs()
+    limits: LimitArgs = Field(
+        default=LimitArgs(),
+        description="Limits of requests, and time limits of the policy.",
+    )
+    access: AccessArgs = Field(
+        default=AccessArgs(),
+        description="API keys, and clients without keys.",
+    )
+    stream: StreamArgs = Field(
+        default=StreamArgs(),
+        description="The port of each replica for WebSockets and HTTP, which bypasses the proxy.",
+    )
+    resources: ResourceArgs = Field(
+        default=ResourceArgs(),
+        description="Resources that Ray reserves for each replica.",
+    )
     environment: EnvironmentArgs = Field(
-        default=EnvironmentArgs(), description="the Python that the policy runs in"
+        default=EnvironmentArgs(),
+        description="Python environment of the policy.",
     )
     dialects: DialectArgs = Field(
-        default=DialectArgs(), description="protocols of other systems whose clients may connect"
+        default=DialectArgs(),
+        description="Protocols of other systems whose clients may connect, by name.",
     )
     parts: PartArgs = Field(
         default=PartArgs(),
-        description=(
-            "parts of the replica that plug-ins add; null turns off a part that is on by default"
-        ),
+        description="Parts of the replica that plug-ins add, by name. null turns off a part that "
+        "is on by default.",
     )
 
     @property

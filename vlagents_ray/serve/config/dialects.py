@@ -33,11 +33,12 @@ class DialectConfig(BaseModel, extra="forbid"):
 
     mapping: MappingSetting | None = Field(
         default=None,
-        description="how the client's observations become ours: a preset's name, or an object, see "
-        "vlagents_ray.wire.mapping; unset: the client uses our names",
+        description="How observations of the client are converted: the name of a preset, or an "
+        "object (`vlagents_ray.wire.mapping`). null: the client uses this project's names.",
     )
     priority: PriorityName = Field(
-        default="robot", description="priority of its requests: robots go before simulations"
+        default="robot",
+        description="Priority of its requests. Robots are served before simulations.",
     )
 
     @field_validator("mapping")
@@ -56,13 +57,15 @@ class PortConfig(DialectConfig):
     """The settings of all dialects that have their own port."""
 
     port: int = Field(
-        ge=1, le=65535, description="that clients connect to; a taken one fails the deployment"
+        ge=1,
+        le=65535,
+        description="Port to which clients connect. The deployment fails if it is in use.",
     )
     host: str | None = Field(
         default=None,
         description=(
-            "the address to listen on; default: the address of the server that `vlagents-ray "
-            "serve` starts, and 127.0.0.1 under `serve deploy`"
+            "Address on which the dialect listens. null: the address of `vlagents-ray serve`, and "
+            "127.0.0.1 under `serve deploy`."
         ),
     )
 
@@ -72,7 +75,8 @@ class KeylessPortConfig(PortConfig):
 
     without_key: bool = Field(
         default=False,
-        description="with API keys: accept clients of this protocol without one, as it has no key",
+        description="Accept clients of this protocol without an API key, as it has no field for "
+        "one.",
     )
 
 

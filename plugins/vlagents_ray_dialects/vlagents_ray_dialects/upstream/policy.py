@@ -59,7 +59,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
         "vlagents",
         "sglang",
         "flashrt",
-    ]
+    ] = Field(description="protocol of the other server")
     urls: list[str] = Field(
         min_length=1,
         max_length=64,

@@ -46,27 +46,28 @@ class OpenVLAOFTConfig(prismatic.PrismaticConfig):
     """
 
     attention: Literal["sdpa", "eager"] = Field(
-        default="sdpa", description="of the language model; has no causal mask"
+        default="sdpa", description="attention of the language model, which has no causal mask"
     )
     center_crop: bool = Field(
-        default=True, description="trained with random crops (upstream's `image_aug`)"
+        default=True,
+        description="whether it was trained with random crops (upstream's `image_aug`)",
     )
     head: Literal["l1", "diffusion", "tokens"] = Field(
         default="l1",
-        description="how actions come out: by regression, by diffusion, or as tokens of bins",
+        description="how actions are predicted: by regression, by diffusion, or as tokens of bins",
     )
-    film: bool = Field(default=False, description="trained with FiLM (OFT+)")
+    film: bool = Field(default=False, description="whether it was trained with FiLM (OFT+)")
     horizon: int = Field(
         default=8, ge=1, description="rows of a chunk, as in training: LIBERO 8, ALOHA 25, Bridge 5"
     )
     bounds: prismatic.Bounds = Field(
         default="q99",
-        description="of actions and states in training: 'q99', or 'min_max' for ALOHA's absolute "
-        "joints",
+        description="bounds of actions and states in training: 'q99', or 'min_max' for ALOHA's "
+        "absolute joints",
     )
-    diffusion_steps: int = Field(default=50, ge=1, description="of training")
+    diffusion_steps: int = Field(default=50, ge=1, description="diffusion steps of the training")
     inference_steps: int = Field(
-        default=50, ge=1, description="of diffusion, at most as many as in training"
+        default=50, ge=1, description="diffusion steps of a call, at most as many as in training"
     )
 
     @model_validator(mode="after")

@@ -374,8 +374,8 @@ class PrismaticConfig(ModelConfig):
     )
     attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
         default="sdpa",
-        description="of the language model; flash_attention_2 needs the package flash-attn and a "
-        "GPU",
+        description="attention of the language model; flash_attention_2 needs the package "
+        "flash-attn and a GPU",
     )
 
     @model_validator(mode="after")
