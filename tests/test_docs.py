@@ -90,6 +90,7 @@ EXPLAINED = {
     "measured.md": ["serve"],
     "other_clients.md": ["serve"],
     "own_policy.md": ["eval"],
+    "policies.md": ["serve"],
     "programs.md": ["robot"],
     "run_file.md": ["robot"],
     "slurm.md": ["serve"],
@@ -98,7 +99,7 @@ EXPLAINED = {
 # Options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's
 # scripts.
 OF_OTHERS = {
-    *("--account", "--array", "--mem", "--name", "--nodes", "--ntasks", "--qos", "--requeue"),
+    *("--account", "--array", "--mem", "--name", "--nodes", "--ntasks", "--qos", "--requeue", "--time"),
     *(
         "--build-context",
         "--health-cmd",
@@ -118,6 +119,7 @@ OF_OTHERS = {
         "--size",
         "--steps",
         "--torchrl",
+        "--version",
         "--whole",
     ),
 }

@@ -4,42 +4,19 @@ key.
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
 
 import pytest
 import yaml
-from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
 
 from vlagents_ray.cli.evaluate import read_run
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
+from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.plan.cases import expand
-from vlagents_ray.evaluate.plan.config import (
-    ClockConfig,
-    RobotConfig,
-    RobotTask,
-    StopConfig,
-    TrackingConfig,
-)
 from vlagents_ray.registry import env_suite, names
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "examples" / "evaluations").glob("*.yaml"))
-PAGE = (ROOT / "docs" / "evaluation" / "run_file.md").read_text()
-MODELS = [
-    EvalConfig,
-    PolicyConfig,
-    SuiteConfig,
-    WorkerConfig,
-    ClockConfig,
-    StopConfig,
-    TrackingConfig,
-    RobotConfig,
-    RobotTask,
-]
 CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
 # Of models that are not told which camera is which.
 WITHOUT_WORDS = {
@@ -48,11 +25,6 @@ WITHOUT_WORDS = {
     "lerobot": {},
     "reference": {"front": "front", "wrist": "wrist"},
 }
-ELSEWHERE = {
-    ("EvalConfig", "out"),
-    ("EvalConfig", "worker"),
-    ("EvalConfig", "tracking"),
-}  # defaults that are said in words
 
 
 @pytest.mark.parametrize(
@@ -99,19 +71,3 @@ def test_a_model_of_an_example_looks_through_cameras_that_its_envs_have(
 
 def test_there_are_examples() -> None:
     assert {file.stem for file in FILES} >= {"tabletop", "libero", "simpler", "sweep", "realtime"}
-
-
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
-def test_the_page_has_every_key_with_its_default(model: type[BaseModel]) -> None:
-    table = re.search(rf"## `{model.__name__}`.*?\n\n((?:\|.*\n)+)", PAGE)
-    assert table is not None
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.*?) \|", table[1], re.MULTILINE))
-    assert list(rows) == list(model.model_fields)
-    for name, field in model.model_fields.items():
-        if (model.__name__, name) not in ELSEWHERE:
-            required = field.default is PydanticUndefined and field.default_factory is None
-            assert rows[name] == (
-                "required"
-                if required
-                else f"`{json.dumps(field.get_default(call_default_factory=True))}`"
-            )

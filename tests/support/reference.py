@@ -44,7 +44,7 @@ _NOTICE = (
 )
 _EXIT_STATUS = """\
 Exit status, unless a command lists others: 0 for success, 2 for wrong arguments or settings, 130 after Ctrl-C, and 1 for
-any other failure. `vlagents-ray --version` prints the version.
+any other failure. `--version` prints the version.
 """
 _ABOUT_RUN_FILE = """\
 All keys of the YAML file that [describes a run](../evaluation/running.md). An unknown key is an error. Every policy runs
@@ -59,10 +59,12 @@ _ABOUT_POLICIES = """\
 The keys below `args.config` of [a deployment file](deployment.md), which `--set KEY=VALUE` also sets, and the keys of
 its `wrappers`. [Model families](../policies/index.md) explains them.
 """
+# Keys that the model requires, and for which the command has a default.
+_DEFAULTS_OF_COMMANDS = {"out": "`runs/NAME`"}
 # Pages that explain a setting, by "Model.field".
 SEE = {
     "EvalConfig.workers": "evaluation/running.md#in-one-process",
-    "EvalConfig.accept_changes": "evaluation/running.md#one-program",
+    "EvalConfig.accept_changes": "evaluation/running.md#changed-code-and-weights",
     "EvalConfig.stop": "evaluation/running.md#early-stopping",
     "EvalConfig.track": "evaluation/results.md#trackers",
     "EvalConfig.robot": "evaluation/robot.md",
@@ -438,7 +440,7 @@ def _type(annotation: Any) -> str:
 def _default(name: str, field: FieldInfo) -> str:
     """Return the default of a field as YAML; its sections are in tables of their own."""
     if field.is_required():
-        return "required"
+        return _DEFAULTS_OF_COMMANDS.get(name, "required")
     value = field.get_default(call_default_factory=True)
     if value is PydanticUndefined or isinstance(value, BaseModel):
         return ""

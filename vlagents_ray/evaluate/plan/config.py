@@ -82,7 +82,8 @@ class PolicyConfig(_PlanModel):
 
     name: Name = Field(
         default="policy",
-        description="The name in the results. Two policies of one run have different names.",
+        description="The name in the results. Without it, a policy that is served has the served "
+        "policy's name. Two policies of one run have different names.",
     )
     source: str | None = Field(
         default=None,
