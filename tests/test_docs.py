@@ -99,7 +99,17 @@ EXPLAINED = {
 # Options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's
 # scripts.
 OF_OTHERS = {
-    *("--account", "--array", "--mem", "--name", "--nodes", "--ntasks", "--qos", "--requeue", "--time"),
+    *(
+        "--account",
+        "--array",
+        "--mem",
+        "--name",
+        "--nodes",
+        "--ntasks",
+        "--qos",
+        "--requeue",
+        "--time",
+    ),
     *(
         "--build-context",
         "--health-cmd",
