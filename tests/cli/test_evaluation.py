@@ -340,8 +340,8 @@ def test_the_plan_is_printed_without_asking_any_policy(
     print_plan(settings)
     text = capsys.readouterr().out
     assert "4 cases" in text
-    assert "20 episodes, 0 of them finished" in text
+    assert "20 episodes: 0 finished" in text
     assert "policy@20" in text
-    assert "unknown time" in text
-    assert "; not played yet: 4 of 4 cases" in " ".join(text.split())
+    assert ": unknown" in text
+    assert "(no earlier episodes of 4 of 4 cases)" in " ".join(text.split())
     assert not settings.out.exists(), "nothing is written"

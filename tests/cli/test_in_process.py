@@ -182,9 +182,9 @@ def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
         app, ["eval", "runs.yaml", "--dry-run", *words], env={"COLUMNS": "300"}
     )
     assert done.exit_code == 0, done.output
-    where = {0: "in one process, without Ray", 1: "with 1 worker;", 3: "with 3 workers;"}[workers]
+    where = {0: "in one process, without Ray", 1: "with 1 worker:", 3: "with 3 workers:"}[workers]
     assert where in done.stdout
-    assert "1 case: 1 policy at each checkpoint x 1 environment of suites" in done.stdout
+    assert "1 case: 1 policy x 1 environment" in done.stdout
     assert not (folder / "runs").exists()
 
 

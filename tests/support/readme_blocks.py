@@ -207,9 +207,12 @@ def not_printed(shown: str, printed: str) -> str | None:
 
 
 def _without_numbers(text: str) -> list[str]:
-    """Return the lines of a text that are not empty, with 0 for each number."""
+    """Return the lines of a text that are not empty, with 0 for each number, and the singular of a
+    noun behind it.
+    """
     lines = [re.sub("─+", "─", " ".join(line.split())) for line in text.splitlines()]
-    return [re.sub(r"\d[\d.,]*(e[-+]\d+)?", "0", line) for line in lines if line]
+    without = [re.sub(r"\d[\d.,]*(e[-+]\d+)?", "0", line) for line in lines if line]
+    return [re.sub(r"\b0 ([a-z]+)s\b", r"0 \1", line) for line in without]
 
 
 def check_commands(block: Block) -> None:

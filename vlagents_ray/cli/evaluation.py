@@ -461,34 +461,31 @@ def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> Non
     cases = [row.case for row in forecast]
     policies = len({case.policy_id for case in cases})
     envs = len({(case.suite.name, case.env) for case in cases})
-    factors = (
-        f"{counted(policies, 'policy', 'policies')} at each checkpoint x "
-        f"{counted(envs, 'environment')} of suites"
-    )
+    factors = f"{counted(policies, 'policy', 'policies')} x {counted(envs, 'environment')}"
     out.print(f"{counted(len(forecast), 'case')}: {factors}")
 
     planned = sum(case.planned for case in cases)
     finished = sum(row.finished for row in forecast)
     remaining = sum(row.remaining for row in forecast)
     out.print(
-        f"{counted(planned, 'episode')}, {finished} of them finished in {folder}, {remaining} to "
-        "play"
+        f"{counted(planned, 'episode')}: {finished} finished in {folder}, {remaining} remaining"
     )
 
     # Workers share one queue, so that at most one episode's time is lost at the end.
     total_s = sum(row.remaining * (row.seconds or 0.0) for row in forecast)
     seconds = total_s / max(1, min(workers, remaining))
-    time = f"{_time(seconds)}, judging from earlier episodes"
+    time = _time(seconds)
 
     unknown = sum(row.seconds is None for row in forecast)
     if unknown == len(forecast):
-        time = "unknown time"
-    unplayed = ""
+        time = "unknown"
+    without_episodes = ""
     if unknown:
-        unplayed = f"; not played yet: {unknown} of {counted(len(forecast), 'case')}"
+        cases_in_total = counted(len(forecast), "case")
+        without_episodes = f" (no earlier episodes of {unknown} of {cases_in_total})"
 
     where = f"with {counted(workers, 'worker')}" if workers else "in one process, without Ray"
-    out.print(f"{time} {where}{unplayed}")
+    out.print(f"estimated time {where}: {time}{without_episodes}")
 
 
 def _forecast_table(forecast: Sequence[Forecast]) -> Table:
@@ -496,7 +493,7 @@ def _forecast_table(forecast: Sequence[Forecast]) -> Table:
     rows = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
     for title in ("policy", "env"):
         rows.add_column(title, overflow="fold")
-    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
+    for title in ("seeds", "episodes", "finished", "remaining", "s each", "time"):
         rows.add_column(title, justify="right", no_wrap=True)
 
     for row in forecast:

@@ -123,7 +123,7 @@ def test_an_honest_bundle_holds_and_plays_again_to_the_bit(bundle: Path) -> None
     }  # fmt: skip
     assert (
         details(found, "replay of tabletop#1@1")
-        == "8 actions, every state, reward and success to the bit"
+        == "8 actions: all states, rewards and successes are bit-identical"
     )
 
 
@@ -169,7 +169,7 @@ def test_other_actions_than_were_executed_have_another_outcome(
         found, "trajectories"
     )
     assert verdicts(found)["replay of tabletop#0@0"] == "other here"
-    assert "the numbers differ from step 4 of 8 on" in details(found, "replay of tabletop#0@0")
+    assert "the numbers differ since step 4 of 8" in details(found, "replay of tabletop#0@0")
 
 
 def other_actions(path: Path) -> bytes:

@@ -121,7 +121,7 @@ def verify(
             folder.mkdir()
 
             manifest, digest, differences = unpack(bundle, folder, most_bytes=most_bytes)
-            fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
+            fine = f"{len(manifest.files)} files have the SHA-256 listed in {MANIFEST}"
             findings = [_finding("digests", differences, fine)]
 
             try:
@@ -235,7 +235,7 @@ def _check_cases(results: Results) -> Finding:
     return _finding(
         "database",
         contradictions,
-        f"{len(results.cases)} cases and {len(keys)} episodes have their settings' keys",
+        f"keys match the settings of all cases ({len(results.cases)}) and episodes ({len(keys)})",
     )
 
 
@@ -305,7 +305,7 @@ def _check_episodes(results: Results) -> Finding:
         if name not in recordings:
             contradictions.append(f"{name}: is the recording of no episode")
 
-    return _finding("episodes", contradictions, f"{number} have outcomes without contradiction")
+    return _finding("episodes", contradictions, f"the columns of {number} episodes are consistent")
 
 
 def _inconsistencies(case: CaseResults, episode: Episode) -> Iterator[str]:
@@ -413,7 +413,7 @@ def _check_trajectories(results: Results) -> Finding:
             "not checked",
             f"the bundle has none of {missing} episodes (eval --record all)",
         )
-    fine = f"{checked} have the actions, rewards and outcomes of the table"
+    fine = f"{checked} match the actions, rewards and outcomes in the database"
     if missing:
         fine += f"; {missing} others have none, so that their outcomes are only stated"
     return _finding("trajectories", contradictions, fine)
@@ -716,9 +716,9 @@ def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trus
     steps = len(played.success)
     first = min(played.differences, default=None)
     largest = max(played.differences.values(), default=0.0)
-    differs = f"the numbers differ from step {first} of {steps} on, by at most {largest:.3g}"
+    differs = f"the numbers differ since step {first} of {steps}, by at most {largest:.3g}"
     if first is None:
-        differs = "every number is equal to the bit"
+        differs = "all numbers are bit-identical"
 
     texts = {
         "ending": (played.ending, result.ending),
@@ -737,7 +737,7 @@ def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trus
         solved_there = "solved" if result.success_once else "not solved"
         return Finding(subject, "differs", f"{solved_here} here, {solved_there} there; {differs}")
 
-    detail = f"{steps} actions, every state, reward and success to the bit"
+    detail = f"{steps} actions: all states, rewards and successes are bit-identical"
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
 
