@@ -80,7 +80,7 @@ def test_a_number_with_an_exponent_is_a_number(text: str, value: object) -> None
 
 READERS = {
     "deployment": ("x.yaml", lambda file: read_deployment(str(file))),
-    "run": ("x.yaml", lambda file: read_run_file(file, "file of runs", "`policies`")),
+    "run": ("x.yaml", lambda file: read_run_file(file, "run file", "`policies`")),
     "limits": ("x.yaml", MotionLimits.read),
     "limits as JSON": ("x.json", MotionLimits.read),
     "keys": ("x.json", read_keys),

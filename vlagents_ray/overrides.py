@@ -278,7 +278,7 @@ def read_config_file(
 
     Args:
         file: The file.
-        noun: What the file is, for errors, such as "file of runs".
+        noun: What the file is, for errors, such as "run file".
         keys: Keys that such a file has, for errors, such as "`policies` and `suites`".
         overrides: The changes.
         cure: The end of the error for a missing file if no file has a similar name.

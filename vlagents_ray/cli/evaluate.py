@@ -63,7 +63,7 @@ class EvalOptions:
         list[str],
         typer.Argument(
             metavar="FILE | ENV...",
-            help="A file of runs (.yaml), or environments such as tabletop or 'libero/*'.",
+            help="A run file (.yaml), or environments such as tabletop or 'libero/*'.",
         ),
     ]
     source: Annotated[
@@ -195,7 +195,7 @@ class EvalOptions:
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Set a setting of the policy, or a key of the file of runs, such as "
+            help="Set a setting of the policy, or a key of the run file, such as "
             "suites.0.episodes=5. +KEY=VALUE adds a key, and ~KEY removes one. May be repeated.",
         ),
     ] = field(default_factory=list)
@@ -386,7 +386,7 @@ def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: run episodes in parallel, and report success rates with confidence
     intervals and videos.
 
-    A file of runs contains policies, their checkpoints, suites of environments and seeds. --set
+    A run file contains policies, their checkpoints, suites of environments and seeds. --set
     changes its keys. --out, --workers, --video, --record, --record-images, --track, --retries and
     --resume override them.
 
@@ -438,7 +438,7 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
     """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
 
     Raises:
-        ConfigError: An option is missing, or contradicts the file of runs.
+        ConfigError: An option is missing, or contradicts the run file.
         pydantic.ValidationError: A value is wrong.
     """
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
@@ -510,7 +510,7 @@ def _new_folder(env: str, *, resume: bool) -> Path:
 
 
 def _with_files_found(document: dict[str, Any], config_dir: Path | None) -> dict[str, Any]:
-    """Return a file of runs in which the deployment files of policies are paths, which may be
+    """Return a run file in which the deployment files of policies are paths, which may be
     names of files in the folder `config_dir`.
     """
     policies = document.get("policies")
@@ -559,9 +559,9 @@ def _settings_of(options: dict[str, Any], model: type[BaseModel]) -> dict[str, A
 
 
 def read_run(file: Path, overrides: Sequence[Override] = ()) -> dict[str, Any]:
-    """Read a file of runs, and return its settings, changed by `overrides`.
+    """Read a run file, and return its settings, changed by `overrides`.
 
     Raises:
         ConfigError: There is no such file, it is not a mapping, or it cannot be changed so.
     """
-    return read_run_file(file, "file of runs", "`policies` and `suites`", overrides)
+    return read_run_file(file, "run file", "`policies` and `suites`", overrides)

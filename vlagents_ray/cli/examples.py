@@ -22,7 +22,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "robot scripted --env tabletop --episodes 3 --rerun live",
         "robot --env tabletop --teleop keyboard --record demos",
     ),
-    "demo": ("demo",),
+    "demo": ("demo", "demo --out runs/second"),
     "doctor": ("doctor", "doctor --python .venv-lerobot/bin/python --json"),
     "report": ("report runs/first", "report runs/act runs/pi0 --out comparison.html"),
     "export": (
@@ -41,8 +41,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "keys create arm-1 --keys keys.json",
         "keys create learner --keys keys.json --scope weights --days 30",
     ),
-    "keys list": ("keys list --keys keys.json",),
-    "keys revoke": ("keys revoke arm-1 --keys keys.json",),
+    "keys list": ("keys list", "keys list --keys /etc/vlagents-ray/keys.json"),
+    "keys revoke": (
+        "keys revoke arm-1",
+        "keys revoke arm-1 --keys /etc/vlagents-ray/keys.json",
+    ),
     "init policy": ("init policy my_policy",),
     "init env": ("init env my_env",),
     "init dialect": ("init dialect my_dialect",),

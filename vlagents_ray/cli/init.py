@@ -69,8 +69,8 @@ def policy(name: Name) -> None:
 
 @init.command("env")
 def environment(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of
-    runs.
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a run
+    file.
     """
     with errors():
         _write(name, "env")

@@ -51,7 +51,16 @@ def _print_version(requested: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(
+    epilog=epilog(
+        (
+            "demo",
+            "serve deployments/pi0.yaml",
+            "eval tabletop --policy scripted",
+            "robot http://gpu-box:8000 --robot my_arm:MyArm",
+        )
+    )
+)
 def commands(
     version: Annotated[
         bool,

@@ -319,7 +319,7 @@ def read_run_file(
 
     Args:
         file: The file.
-        noun: A name of this type of file, for errors, such as "file of runs".
+        noun: A name of this type of file, for errors, such as "run file".
         keys: The keys that such a file has, for errors.
         overrides: The changes, as `parse_overrides` returns them.
 

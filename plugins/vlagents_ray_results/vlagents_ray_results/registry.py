@@ -5,17 +5,20 @@ from vlagents_ray.registry import RegistryEntry
 MERGE = RegistryEntry(
     "vlagents_ray_results.commands:merge_command",
     "Merge results: each episode once, by its key.",
-    examples=("merge runs/a runs/b --out runs/all",),
+    examples=(
+        "merge runs/a runs/b --out runs/all",
+        "merge runs/node-* --out runs/all --keep-first",
+    ),
 )
 BUNDLE = RegistryEntry(
     "vlagents_ray_results.commands:bundle_command",
     "Write an evaluation as one file that others can verify.",
-    examples=("bundle runs/first --videos",),
+    examples=("bundle runs/first", "bundle runs/first --videos --out first.zip"),
 )
 VERIFY = RegistryEntry(
     "vlagents_ray_results.commands:verify_command",
     "Check a bundle, and print what is equal or differs.",
-    examples=("verify first.bundle.zip --replay 10",),
+    examples=("verify first.bundle.zip", "verify first.bundle.zip --replay 10 --out runs/check"),
 )
 
 PARQUET = RegistryEntry("vlagents_ray_results.parquet:to_parquet", "a typed row for each episode")

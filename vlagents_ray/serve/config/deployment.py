@@ -415,7 +415,7 @@ class AutoscalingArgs(_DeploymentModel):
         default=1,
         ge=0,
         le=MOST_WORKERS,
-        description="Smallest number of replicas.",
+        description="Smallest number of replicas. With 0, an unused application has no replica.",
     )
     max_replicas: int = Field(
         default=1,
@@ -427,13 +427,15 @@ class AutoscalingArgs(_DeploymentModel):
         default=None,
         ge=0,
         le=MOST_WORKERS,
-        description="Number of replicas at the start. null: `min_replicas`.",
+        description="Number of replicas at the start. null: `min_replicas`. `vlagents-ray serve` "
+        "waits until the policy answers, which starts one.",
     )
     target_utilisation: float = Field(
         default=0.7,
         gt=0,
         le=1,
-        description="Share of the time in which a replica's policy is busy.",
+        description="Share of the time in which a replica's policy may be busy. The rest absorbs "
+        "bursts.",
     )
     target_waiting: float = Field(
         default=1.0,
@@ -445,7 +447,8 @@ class AutoscalingArgs(_DeploymentModel):
         default=None,
         gt=0,
         le=1_000_000,
-        description="Number of sessions of a replica. null: any.",
+        description="Number of sessions of a replica, for policies that keep much memory for each. "
+        "null: any.",
     )
     target_slo_load: float = Field(
         default=0.8,
@@ -472,8 +475,8 @@ class AutoscalingArgs(_DeploymentModel):
         default=300.0,
         ge=0,
         le=MOST_S,
-        description="Time for which fewer replicas must be needed before some are removed, in "
-        "seconds.",
+        description="Time for which fewer replicas, or none, must suffice before some are removed, "
+        "in seconds. Choose it long if weights load slowly.",
     )
 
     @model_validator(mode="after")

@@ -123,7 +123,12 @@ def eval_(
     "serve",
     context_settings=_BOTH,
     options_metavar="[OPTIONS] POLICY",
-    epilog=epilog(("slurm serve deployments/pi0.yaml --gpus-per-node 1 --time 8:00:00",)),
+    epilog=epilog(
+        (
+            "slurm serve deployments/pi0.yaml --gpus-per-node 1 --time 8:00:00",
+            "slurm serve scripted --time 1:00:00 --dry-run",
+        )
+    ),
 )
 def serve(
     context: typer.Context,

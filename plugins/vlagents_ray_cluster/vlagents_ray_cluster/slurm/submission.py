@@ -78,8 +78,8 @@ _OURS = {
     "wrap": "no `--wrap`, as the script is written for you",
     "wait": "`squeue`, and --dependency in the jobs that wait",
     "W": "`squeue`, and --dependency in the jobs that wait",
-    "input": "a deployment or a file of runs",
-    "i": "a file of runs",
+    "input": "a deployment or a run file",
+    "i": "a run file",
 }
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
