@@ -13,6 +13,7 @@ import pytest
 import yaml
 from ray.serve.schema import ServeApplicationSchema
 from readme_blocks import PAGES, commands, options_of, read_as_typed
+from reference import sections
 from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
@@ -161,6 +162,44 @@ def unknown_options(text: str, explained: Sequence[str] = ()) -> list[str]:
     ]
     have = set().union(*(options_of(line) for line in named)) | OF_OTHERS
     return [option for option in options if option not in have]
+
+
+def keys_by_section() -> dict[str, set[str]]:
+    """Return the keys below each key of a deployment file and of a run file."""
+    keys: dict[str, set[str]] = {}
+    for model, path in [*sections(ServerArgs, ""), *sections(EvalConfig, "")]:
+        section_name = path.rpartition(".")[2]
+        if section_name and section_name != "robot":  # in sentences `robot.NAME` is Python
+            keys.setdefault(section_name, set()).update(model.model_fields)
+    return keys
+
+
+KEYS = keys_by_section()
+OF_PYTHON = {"checkpoints.swap"}  # a module's function, not a key
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_key_of_a_file_in_a_sentence_exists(page: Path) -> None:
+    assert unknown_keys(page.read_text()) == []
+
+
+def test_a_key_that_no_file_has_is_found() -> None:
+    assert unknown_keys("Set `batch.max_sizes`, `batch.max_size=8` or `worker.cpus`.") == [
+        "batch.max_sizes"
+    ]
+
+
+def unknown_keys(text: str) -> list[str]:
+    """Return the keys in sentences, such as `batch.max_size`, that no section has."""
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    named = re.findall(r"`(\w+)\.(\w+)(?:[=:][^`]*)?`", prose)
+    return [
+        f"{section_name}.{key}"
+        for section_name, key in named
+        if section_name in KEYS
+        and key not in KEYS[section_name]
+        and f"{section_name}.{key}" not in OF_PYTHON
+    ]
 
 
 @pytest.mark.parametrize(

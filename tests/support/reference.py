@@ -278,6 +278,19 @@ def _target(place: str) -> Any:
 
 def _models(model: type[BaseModel], prefix: str) -> Iterator[str]:
     """Yield the section of a model, and those of the models in its fields, each once."""
+    paths = dict(sections(model, prefix))
+    anchors = {found: path.replace(".", "") for found, path in paths.items()}
+    for found, path in paths.items():
+        yield _section(found, path, anchors)
+
+
+def sections(model: type[BaseModel], prefix: str) -> list[tuple[type[BaseModel], str]]:
+    """Return a model and the models in its fields, each once, with the path of its key.
+
+    Args:
+        model: The model.
+        prefix: The path of the model itself.
+    """
     waiting = [(model, prefix)]
     paths: dict[type[BaseModel], str] = {}
     while waiting:
@@ -288,10 +301,7 @@ def _models(model: type[BaseModel], prefix: str) -> Iterator[str]:
         for name, field in current.model_fields.items():
             for inner in _inner_models(field.annotation):
                 waiting.append((inner, f"{path}.{name}".lstrip(".")))
-
-    anchors = {found: path.replace(".", "") for found, path in paths.items()}
-    for found, path in paths.items():
-        yield _section(found, path, anchors)
+    return list(paths.items())
 
 
 def _section(model: type[BaseModel], path: str, anchors: dict[type[BaseModel], str]) -> str:

@@ -66,8 +66,9 @@ def create(
     priority: Annotated[
         str | None,
         typer.Option(
-            metavar="PRIORITY",
-            help="Highest priority of its requests; with 'simulation', robots are served first.",
+            metavar="robot|simulation",
+            help="Highest priority of its requests. Robots are served before simulations; default: "
+            "robot.",
         ),
     ] = None,
     scope: Annotated[

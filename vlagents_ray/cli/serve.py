@@ -141,7 +141,8 @@ _PANELS = {
 def serve_command(options: ServeOptions) -> None:
     """Serve a policy until Ctrl-C.
 
-    Exit status: 0 after Ctrl-C or SIGTERM, 2 for invalid settings, 1 for any other failure.
+    Exit status: 0 if Ctrl-C or SIGTERM ended the server, 2 for invalid settings, 1 for any other
+    failure.
     """
     from vlagents_ray.serve.launch.deployment_file import with_dialect, with_gateways_at
     from vlagents_ray.serve.launch.server import running_server
