@@ -367,6 +367,8 @@ def _table(
     for attribute, field in fields.items():
         name = field.alias or attribute
         meaning = _sentence(_description(field, attribute, owner))
+        if field.default is None:
+            meaning = re.sub(r"; (?:unset|default): ", ". null: ", meaning)
         see = SEE.get(f"{model}.{name}")
         if see:
             page = see.partition("#")[0].removesuffix(".md").rpartition("/")[2]

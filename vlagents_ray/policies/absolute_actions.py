@@ -31,13 +31,13 @@ class AbsoluteActionsConfig(BaseModel, extra="forbid"):
 
     state: list[str] = Field(
         min_length=1,
-        description="parts of the proprioception to which actions are relative: in turn a number "
-        "for each relative column of an action",
+        description="Parts of the observation's state to which actions are relative. Together they "
+        "have one number for each relative column of an action.",
     )
     absolute: list[int] = Field(
         default=[],
-        description="columns of an action that are absolute already, such as grippers; -1 is the "
-        "last",
+        description="Columns of an action that are already absolute, such as grippers. -1 is the "
+        "last column.",
     )
 
 

@@ -235,8 +235,8 @@ class LeRobotDialectConfig(KeylessPortConfig):
     port: int = Field(default=8080, ge=1, le=65535)
     checkpoint: str | None = Field(
         default=None,
-        description="the `pretrained_name_or_path` that clients must name; default: any, as it is "
-        "not loaded: the policy of the deployment acts",
+        description="The `pretrained_name_or_path` that clients must name. null: any, as clients "
+        "use the policy of the deployment.",
     )
 
 

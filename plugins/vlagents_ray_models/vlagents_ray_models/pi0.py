@@ -74,7 +74,9 @@ class Pi0Config(AttentionConfig):
         default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10"
     )
     max_tokens: int = Field(
-        default=48, ge=1, description="tokens of an instruction, as in training; more are refused"
+        default=48,
+        ge=1,
+        description="tokens of an instruction, as in training; a longer one is an error",
     )
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0

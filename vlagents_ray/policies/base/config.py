@@ -34,94 +34,102 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     checkpoint: str = Field(
         min_length=1,
-        description="folder or file, or hub id: org/name, org/name@COMMIT; `{step}` stands for "
-        "checkpoint_step",
+        description="Folder, file or hub id (org/name, org/name@COMMIT). `{step}` stands for "
+        "`checkpoint_step`.",
     )
     checkpoint_step: int | None = Field(
-        default=None, ge=0, description="the training step that replaces `{step}`"
+        default=None, ge=0, description="Training step that replaces `{step}`."
     )
     device: str = Field(
         default="auto",
-        description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'",
+        description="Device: `cpu`, `cuda`, `cuda:1`, or `auto`, an accelerator if there is one.",
     )
     dtype: DType = Field(
-        default="auto", description="dtype of the weights; 'auto': the default of the model family"
+        default="auto", description="Dtype of the weights. `auto`: the default of the family."
     )
     matmul: Matmul = Field(
         default="high",
-        description="products of float32 matrices on a GPU: 'high' in TF32, which keeps 10 bits of "
-        "their inputs; 'highest' in float32, several times slower; of the whole process, in which "
-        "the last policy to load decides",
+        description="Precision of float32 matrix products on a GPU. `high`: TF32, which keeps 10 "
+        "bits of the inputs. `highest`: float32, several times slower. It applies to the whole "
+        "process, in which the last policy to load decides.",
     )
     quantization: Quantization | None = Field(
         default=None,
-        description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of "
-        "their memory, and other actions, so compare them before use; float8_dynamic: also compute "
-        "their products in 8 bits, which needs `compile` true, max or require",
+        description="Keep the weights of linear layers in 8 bits (torchao), which takes a quarter "
+        "to a half of their memory. It changes the actions, so compare them before use. "
+        "`float8_dynamic` also computes their products in 8 bits, which needs `compile` true, max "
+        "or require.",
     )
     adapters: dict[str, str] = Field(
         default={},
         description=(
             "LoRA adapters by name, as PEFT's folders or hub ids, that sessions may choose for the "
-            "checkpoint; usually set by the `checkpoints` of a deployment"
+            "checkpoint. The `checkpoints` of a deployment usually set them."
         ),
     )
     compile: CompileMode = Field(
         default="auto",
         description=(
-            "'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on a GPU "
+            "`graphs`: CUDA graphs of the forward pass for each of `batch_sizes`. `true`: on a GPU "
             "also graphs of the torch.compile'd forward pass, if they are faster, and on a CPU "
-            "torch.compile alone; a part that cannot be compiled, or whose results differ, runs "
-            "uncompiled; 'max': like true, but torch measures several kernels for each product, so "
-            "that loading takes longer; 'require': like true, but such a part is an error; 'auto': "
-            "'graphs' on a GPU, false on a CPU, with adapters, or if the family has no graphs"
+            "torch.compile alone. A part that cannot be compiled, or whose results differ, runs "
+            "uncompiled. `max`: like true, but torch measures several kernels for each product, so "
+            "that loading takes longer. `require`: like true, but such a part is an error. `auto`: "
+            "`graphs` on a GPU, and false on a CPU, with adapters, or if the family has no graphs."
         ),
     )
-    seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
+    seed: int = Field(
+        default=0, ge=0, description="Number that is mixed with the seed of each episode."
+    )
 
     cameras: dict[str, str] | None = Field(
         default=None,
-        description="the model's name of each camera -> ours; unset: the family's convention",
+        description="Camera of the observation for each camera name of the model. null: the "
+        "convention of the family.",
     )
     state: list[str] | None = Field(
         default=None,
         description=(
-            "parts of the proprioception that make up the model's state vector, in its order; "
-            "'gripper' means `Obs.gripper`, 'gripper_closed' means 1 - `Obs.gripper`; unset: the "
-            "convention of the model family"
+            "Parts of the observation's state that form the model's state vector, in its order. "
+            "`gripper` means `Obs.gripper`, and `gripper_closed` means 1 - `Obs.gripper`. null: "
+            "the convention of the family."
         ),
     )
 
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="chunk",
         description=(
-            "result of `act`: a whole chunk; the next row of a chunk that the policy keeps, where "
-            "the model runs every `execute` calls; or one row, the average of the chunks of the "
-            "model, which runs at each call"
+            "Result of a call. `chunk`: the whole chunk. `queue`: the next row of a chunk that the "
+            "policy keeps, so that the model runs every `execute` calls. `ensemble`: one row, the "
+            "average of the chunks of the model, which runs at each call."
         ),
     )
     execute: int | None = Field(
-        default=None, ge=1, description="rows of each chunk that are used; unset: all"
+        default=None, ge=1, description="Number of rows of each chunk that are used. null: all."
     )
     ensemble_m: float = Field(
         default=0.01,
-        description="weights exp(-m * i) of the average, oldest first (ACT, arXiv 2304.13705)",
+        description="The m in the weights exp(-m * i) of the average, oldest first (ACT, arXiv "
+        "2304.13705).",
     )
 
     max_samples: int = Field(
         default=1024,
         ge=0,
-        description="samples of its distribution that an observation may request",
+        description="Largest number of samples of its distribution that an observation may "
+        "request.",
     )
     max_rows: int = Field(
-        default=64, ge=1, description="rows in one forward pass, at most; samples count as rows"
+        default=64,
+        ge=1,
+        description="Largest number of rows in one forward pass. Samples count as rows.",
     )
     batch_sizes: list[int] | None = Field(
         default=None,
         description=(
-            "the only batch sizes to run, ascending; each is run, or compiled, when the model is "
-            "loaded, and smaller batches are padded; unset: the sizes of the deployment's `batch` "
-            "if the model is compiled, else any"
+            "The only batch sizes to run, ascending. Each is run, or compiled, when the model is "
+            "loaded, and smaller batches are padded. null: the sizes of the deployment's `batch` "
+            "if the model is compiled, otherwise any."
         ),
     )
 

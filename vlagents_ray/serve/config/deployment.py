@@ -191,7 +191,7 @@ class SessionArgs(_DeploymentModel):
 
 
 class SloArgs(_DeploymentModel):
-    """What a robot needs whose reset states no SLO, see `vlagents_ray.slo.Slo`."""
+    """The needs of robots that declare none at their reset, see `vlagents_ray.slo.Slo`."""
 
     hz: float = Field(
         le=MOST,
