@@ -18,7 +18,7 @@ DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 COMMIT = re.compile(r"\bcommit [0-9a-f]{8,12}\b")
 FIGURE = re.compile(r"\d (?:ms|s|GB|MiB|GB/s|TFLOP/s|W|J|MHz|times)\b")
 UNIT_OF_COLUMN = re.compile(
-    r"\| (?:[^|\n]* )?(?:ms|s|GB|MiB|W|J an act|MHz|actions a second)(?: [^|\n]*)? \|"
+    r"\| (?:[^|\n]* )?(?:ms|s|GB|MiB|W|J per call|MHz|actions per second)(?: [^|\n]*)? \|"
 )
 # Figures that no GPU gave.
 OTHER = re.compile(r"\*\*(?:computed|counted)\*\*|\bas computed\b|\bon a CPU\b|\bCPU time\b")

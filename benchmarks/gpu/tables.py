@@ -30,16 +30,16 @@ _KERNELS = 10  # of each core that the page shows; `latest.json` has 25
 _CURVE = {
     "rows": "rows",
     "network_ms": "network ms",
-    "bare_ms": "act ms",
+    "bare_ms": "call ms",
     "queued_ms": "queued ms",
-    "actions_per_s": "actions a second",
+    "actions_per_s": "actions per second",
     "peak_mib": "MiB",
     "watts": "W",
-    "joules_an_act": "J an act",
+    "joules_an_act": "J per call",
     "clock_mhz": "MHz",
 }
 _ACTS = {
-    "acts_per_s": "acts a second",
+    "acts_per_s": "calls per second",
     "median_ms": "median ms",
     "worst_ms": "longest ms",
 }
@@ -63,19 +63,19 @@ TABLES = (
     TableOf(
         "served",
         "robots",
-        "Robots that send three images as JPEG over a WebSocket, and act again at each answer",
+        "Robots that send three images as JPEG over a WebSocket, each as soon as it has an answer",
         {
             "robots": "robots",
             "network_ms": "network ms",
-            "median_ms": "act ms",
-            "acts_per_s": "acts a second",
+            "median_ms": "call ms",
+            "acts_per_s": "calls per second",
             "of_network": "of the network",
         },
     ),
     TableOf(
         "fleet",
         "fleet",
-        "Robots at a rate of their own",
+        "Robots with a fixed rate",
         {
             "hz": "Hz",
             "rows": "rows of a chunk",
@@ -93,7 +93,7 @@ TABLES = (
             "policy in": "policy in",
             "sessions": "sessions",
             "queued_ms": "queued ms",
-            "actions_per_s": "actions a second",
+            "actions_per_s": "actions per second",
             "reserved_mib": "MiB",
         },
     ),
@@ -101,12 +101,12 @@ TABLES = (
         "sharing",
         "shared",
         "Replicas that share the GPU, each with half of its memory",
-        {"replicas": "replicas", "actions_per_s": "actions a second", "batch_ms": "batch ms"},
+        {"replicas": "replicas", "actions_per_s": "actions per second", "batch_ms": "batch ms"},
     ),
     TableOf(
         "cold starts",
         "starts",
-        "From the start of a process to its first act",
+        "From the start of a process to its first action",
         {"mode": "mode", "seconds": "s", "load_s": "of that, loading, s"},
     ),
     TableOf(
@@ -124,19 +124,19 @@ TABLES = (
     TableOf(
         "loading",
         "acts",
-        "Eight sessions act while a second checkpoint loads",
+        "Eight sessions are served while a second checkpoint loads",
         {"while": "while", **_ACTS},
     ),
     TableOf(
         "captures",
         "acts",
-        "Graphs that are replayed while others are captured, without the lock that acts take",
+        "Graphs that are replayed while others are captured, without the lock that calls acquire",
         {"while": "while", **_ACTS, "failed": "failed", "failed_captures": "failed captures"},
     ),
     TableOf(
         "pushes",
         "pushes",
-        "Pushes of all weights while eight sessions act",
+        "Pushes of all weights while eight sessions are served",
         {"from": "from", "seconds": "s", **_ACTS, "peak_mib": "MiB"},
     ),
     TableOf(
@@ -155,7 +155,7 @@ TABLES = (
     TableOf(
         "numerics",
         "number_formats",
-        "Numbers of 8 bits: the error is that of acts against float32",
+        "Numbers of 8 bits: the error of actions against float32",
         {
             "numbers": "numbers",
             "compile": "compile",
