@@ -271,7 +271,7 @@ $(VENV)/server.txt: pyproject.toml | $(STAMP)
 $(VENV)-check/.installed: $(PROJECTS)
 	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
 	'$(PYTHON)' -m venv $(VENV)-check
-	@echo '== installing what the quick tests want into $(VENV)-check'
+	@echo '== installing what the quick tests need into $(VENV)-check'
 	$(VENV)-check/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[check]' \
 	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
 	@touch $@
@@ -279,7 +279,7 @@ $(VENV)-check/.installed: $(PROJECTS)
 $(VENV)-docs/.installed: pyproject.toml
 	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
 	'$(PYTHON)' -m venv $(VENV)-docs
-	@echo '== installing what the site wants into $(VENV)-docs'
+	@echo '== installing what the site needs into $(VENV)-docs'
 	$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[docs]'
 	@touch $@
 
