@@ -285,7 +285,7 @@ def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     with Store(resolve(fewer)):
         page = page_of(Results.load(tmp_path))
     assert page.text.count("(solved)") == 3 * 3 * 2  # policy_ids, tasks, episodes
-    assert "In brackets: beyond the point" in page.words
+    assert "In brackets: the episode is beyond the point" in page.words
 
 
 def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning_curve(
