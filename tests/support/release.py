@@ -42,6 +42,16 @@ def unfinished(changelog: str) -> list[str]:
     return [f"CHANGELOG.md: expected a heading '## [{VERSION}] - YYYY-MM-DD'"]
 
 
+def denials() -> list[str]:
+    """Return one line for each page that says that the package is not released."""
+    pages = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+    return [
+        f"{page.relative_to(ROOT)}: expected no sentence that this version is not released"
+        for page in pages
+        if re.search(r"\bnot\s+released\b", page.read_text())
+    ]
+
+
 def changed_files() -> list[str]:
     """Return one line if the working tree differs from its commit."""
     command = ["git", "-C", ROOT, "status", "--porcelain"]
@@ -52,7 +62,7 @@ def changed_files() -> list[str]:
 def main() -> int:
     """Print each problem, or else the version alone; return the exit status."""
     changelog = (ROOT / "CHANGELOG.md").read_text()
-    problems = [*other_versions(), *unfinished(changelog), *changed_files()]
+    problems = [*other_versions(), *unfinished(changelog), *denials(), *changed_files()]
     print(*(problems or [VERSION]), sep="\n", file=sys.stderr if problems else sys.stdout)
     return int(bool(problems))
 
