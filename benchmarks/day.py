@@ -352,7 +352,7 @@ class DayPolicy(Agent):
         rows = path[1:].astype(np.float32)
         if world.deltas:
             behind = np.roll(path, 1, axis=0)[1:]
-            # Of the lag, too, which is the same all day.
+            # This also corrects the lag, which is the same all day.
             pull = np.clip((path[0] - joints) / CHUNK, -_PULL, _PULL)
             rows[:, world.deltas] = (path[1:] - behind + pull)[:, world.deltas]
         place = int(random.integers(CHUNK))

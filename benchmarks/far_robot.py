@@ -110,7 +110,7 @@ class Ticks:
 
     at_s: list[float] = field(default_factory=list)  # its begin, by `time.monotonic`
     acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
-    # Of the observation behind each executed action of the policy.
+    # Age of the observation behind each executed action of the policy.
     age_ticks: list[int] = field(default_factory=list)
     # Distance of each such action from the one before.
     step: list[float] = field(default_factory=list)

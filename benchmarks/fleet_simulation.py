@@ -36,8 +36,8 @@ MODEL = "pi0"
 COSTS = CostCurve(0.0293, 0.00806)  # pi0 compiled, on an H200 (docs/measured_gpu.md)
 LARGEST_BATCH = 16
 TRANSPORT_S = 0.005
-# Of a replica. On an H200 with its compiled programs kept it is 50 s (docs/measured_gpu.md), but
-# nothing changes meanwhile.
+# Start of a replica. On an H200 with its compiled programs kept it takes 50 s
+# (docs/measured_gpu.md), but nothing changes meanwhile.
 START_S = 20.0
 MORNING_S = 60.0  # within which all robots start
 STEADY_S = 15.0  # after which something happens to robots that have started within 5 s

@@ -53,7 +53,7 @@ class Host:
     folder: Path  # outside, for its private files
     pid: int  # of its first process, in the outer namespace
     switch: int  # of the switch's process
-    # Of its processes, beside this process's.
+    # Variables of its processes, in addition to this process's.
     environment: dict[str, str] = field(default_factory=dict)
     _keeper: Any = None
 

@@ -342,7 +342,7 @@ class Series:
         figures: dict[str, Any] = {
             "learner": learner,
             "seed": seed,
-            # Of the optimizer; learners by reinforcement take as many as their episodes need.
+            # Steps of the optimizer; reinforcement learning takes as many as its episodes need.
             "steps": None if learner in REINFORCEMENT else self._sizes.steps,
             "episodes": episodes_of(run, self._sizes),
             "cpu_s": sum(cost["cpu_s"] for cost in costs.values()),

@@ -58,7 +58,7 @@ class PolicyPlan:
     seconds: float = 2.0  # of each measurement
     rounds: int = 3  # in which all measurements take turns
     side: int = 224  # px, of images if the policy takes any size
-    # Of parts of the state that the policy leaves open.
+    # Sizes of the parts of the state that the policy leaves open.
     dims: Mapping[str, int] = field(default_factory=dict)
 
 

@@ -18,7 +18,8 @@ DAEMONS = frozenset(
     | {"default_worker.py", "dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py"}
 )
 _IDLE_S = 3.0
-# Of an idle process; one that waits for events or a timer takes less than 0.02.
+# Cores that an idle process uses if it polls; one that waits for events or a timer uses less
+# than 0.02.
 _POLLING_CORES = 0.25
 _SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
 

@@ -102,7 +102,8 @@ class RolloutComparison:
     policies: tuple[str, ...] = tuple(_POLICIES)
     envs: tuple[int, ...] = (1, 16, 64)  # in all, of each way
     workers: int = 2  # at most, for all environments
-    # Of each way in each round, rounded up to whole turns of the environments; a quarter if slow.
+    # Episodes of each mode in each round, rounded up to a multiple of the environments; a quarter
+    # of them if the mode is slow.
     episodes: int = 64
     rounds: int = 3
     patience: float = 0.5  # `batch.patience` of the server

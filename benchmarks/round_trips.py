@@ -61,9 +61,9 @@ class RoundTripsOfAll:
     theirs: tuple[RoundTrips, ...] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
     steady: tuple[RoundTrips, ...] = ()  # of clients on the node, each without a break
-    # Of the images, by client; None: lossless.
+    # Quality of the images, by client; None: lossless.
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)
-    # Of an act: `MeteredDriver.per_act`, by client.
+    # Use of resources per call, by client: `MeteredDriver.per_act`.
     use: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class SoakLedger(Progress):
     """The time of each recorded episode, and the driver's CPU time by then."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
-        # Of time.time(); small compared with the growth to detect.
+        # Arrays of s of `time.time()`, which are small compared with the growth to detect.
         self.at_s, self.cpu_s = array("d"), array("d")
         self._progress = progress
 

@@ -49,7 +49,7 @@ class RegistryEntry:
     """
 
     # "module:Class". Of an export and a leader (see `robot.leaders.OpenLeader`), "module:function".
-    # Of a command, that or "module:app", a typer.Typer; the function of a subcommand, such as
+    # A command may also be "module:app", a typer.Typer; the function of a subcommand, such as
     # "robot.check", takes the arguments and returns the exit status.
     target: str
     # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one
@@ -69,11 +69,11 @@ class RegistryEntry:
     # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page
     # of its own name.
     page: str | None = None
-    # Of a part of a replica: whether it is on in each server, with its default settings.
+    # For a part of a replica: whether it is on in each server, with its default settings.
     by_default: bool = False
-    # Of a command: command lines without "vlagents-ray", for --help.
+    # For a command: examples for --help, without "vlagents-ray".
     examples: tuple[str, ...] = ()
-    # That registers it; of a plug-in, the name of its entry point's distribution.
+    # Distribution that registers it; for a plug-in, that of its entry point.
     distribution: str = CORE
 
 

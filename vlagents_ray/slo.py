@@ -14,8 +14,8 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, printable, shown
 from vlagents_ray.naming import did_you_mean
 
-# Of a rate, Hz, of an age, ms, and of a number of rows: the server computes with their reciprocals
-# and products.
+# Limits of a rate, Hz, of an age, ms, and of a number of rows: the server computes with their
+# reciprocals and products.
 _LEAST, MOST = 1e-6, 1e9
 _REASON_CHARACTERS = 1000  # of a server's reason why a robot is not served in time
 SHARE = 0.98

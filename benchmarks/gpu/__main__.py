@@ -23,7 +23,7 @@ from benchmarks.gpu.lab import SECONDS, Plan
 from benchmarks.gpu.runner import Runner, planned_seconds, show_plan
 from benchmarks.gpu.steps import RUNS, STEPS
 
-# Of a dry run, on a CPU that may be busy: its time, and the factor of the limits of its steps.
+# Limits of a dry run, on a CPU that may be busy: its time, and the factor for its steps.
 _DRY_S, _DRY_PATIENCE = 3600.0, 5.0
 
 

@@ -57,7 +57,8 @@ GPU_TESTS = (
     "tests/policies/compilation/test_cuda_graph.py",
     "plugins/vlagents_ray_learn/tests/test_one_gpu.py",
 )  # they need no Ray
-# Of matrix products in bfloat16; about 800 were seen, and less says that something else is wrong.
+# Least rate of matrix products in bfloat16. About 800 were measured; if it is lower, something else
+# is wrong.
 _H100_TFLOPS = 600
 GRAPH_ROWS = (1, 2, 4, 8, 16, 32)  # batch sizes with CUDA graphs
 WORDS = 200  # tokens of an instruction of π0.5

@@ -63,7 +63,7 @@ class LearnPlan(BaseModel):
     iterations: Count = 10  # of each method
     episodes: Count = 32  # of the student in each iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
-    # Of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20.
+    # Steps of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20.
     steps: Count | None = None
     evaluate_every: Count = 5  # iterations
     held_out: Count = 200  # episodes of an evaluation, the same for each version

@@ -40,7 +40,7 @@ class LimitedWebSocket:
     def __init__(self, connection: ClientConnection) -> None:
         """Limit what is sent over a connection, until `close`."""
         self.connection = connection
-        # Of the operations in progress, s, of `time.monotonic`.
+        # Deadlines of the operations in progress, s of `time.monotonic`.
         self._deadlines: set[float] = set()
         self._is_late = False  # whether the connection was ended since a limit was over
         self._closed = threading.Event()

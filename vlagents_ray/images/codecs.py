@@ -43,7 +43,7 @@ class ImageCodec:
 
     name: str = "jpeg"
     quality: int = 85  # 1 to 100
-    # Of colour: "444" keeps all, "422" and "440" half, "420" a quarter of the samples.
+    # Colour samples: "444" keeps all, "422" and "440" keep half, "420" keeps a quarter.
     subsampling: str = "444"
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ class VlagentsConfig(PreTrainedConfig):
     # Rows of each chunk that are executed; None: all that the server returns.
     n_action_steps: int | None = None
     checkpoint: str | None = None  # one of those that the server offers; None: its own
-    # Of the first session's first episode; each further one has the next number.
+    # Seed of the first session's first episode; each further episode has the next number.
     seed: int | None = None
     key_file: Path | None = None  # holds the API key; without it, VLAGENTS_RAY_API_KEY is the key
     ca: Path | None = None  # https: PEM file of the server's authorities; None: the system's

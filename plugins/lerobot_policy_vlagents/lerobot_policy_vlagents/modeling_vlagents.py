@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER, TICKS
 from vlagents_ray.robot.fit import Fit, Trained
 
-# Of RTCConfig; the server has its own.
+# Settings of RTCConfig that are rejected, since the server has its own.
 _GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")
 logger = logging.getLogger(__name__)
 
@@ -262,12 +262,12 @@ class _Sessions:
         self._agents: list[RemoteAgent] = []
         self._rows: list[deque[np.ndarray]] = []
         self._mapping: ObservationMapping | None = None  # None before the first episodes
-        # Of the next chunks with the robot; None once they were compared.
+        # Comparison of the next chunks with the robot; None once it is done.
         self._fit: Fit | None = None
         self._due = True  # whether the next batch begins episodes
         self._begun = 0  # episodes so far
-        # Of each session since its last request: ticks of LeRobot's loop, and those of them that it
-        # missed while it waited for a chunk.
+        # For each session, since its last request: the ticks of LeRobot's loop, and the ticks that
+        # it missed while it waited for a chunk.
         self._ticks: list[list[int]] = []
 
     def reset(self) -> None:

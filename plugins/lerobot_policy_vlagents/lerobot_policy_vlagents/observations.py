@@ -19,7 +19,7 @@ from vlagents_ray.dataset_contract import divided_state, state_parts, wanted_par
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.naming import did_you_mean
 
-# Of an environment with one camera; with more, `observation.images.NAME`.
+# Key of the image of an environment with one camera; others have `observation.images.NAME`.
 _IMAGE = "observation.image"
 _STATES = (OBS_STATE, OBS_ENV_STATE)
 _STATE_OPTION = "--policy.state='[joints, gripper]'"

@@ -40,7 +40,7 @@ _FLUSH = 200_000  # runs of ticks that are kept until they are added up
 # excess of a load over the mean one.
 _COMPARE_S = 3.0
 _TOLERATED = 1.25
-# Of loads that are compared, so that equal ones are equal: their digits, and their tolerance.
+# Digits to which loads are rounded, and the tolerance with which they are compared.
 _DIGITS, _EXACT = 9, 1e-6
 # As in `vlagents_ray.serve.scaling.sibling_replicas`: replicas that one asks for their sessions.
 _MOST_ASKED = 32

@@ -16,7 +16,7 @@ from vlagents_ray.policies.flow import FlowPasses
 from vlagents_ray_models.action_tokens import action_tokens
 from vlagents_ray_models.gemma_layers import Attention, GemmaLayers, compile_vision_layers
 
-# Of the sine and cosine of a flow time, in openpi; LeRobot's are in its config.
+# Periods of the sine and cosine of a flow time in openpi; LeRobot has them in its config.
 _MIN_PERIOD, _MAX_PERIOD = 4e-3, 4.0
 
 

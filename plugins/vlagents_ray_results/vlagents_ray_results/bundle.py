@@ -36,7 +36,7 @@ MOST_BYTES = 16 * 10**9  # of all members, unpacked
 _MOST_MEMBERS = 200_000
 _MOST_MANIFEST = 64 * 2**20  # bytes
 _CHUNK = 2**20
-# Of a path, as `naming.plain` leaves names: it neither is nor begins with a dot.
+# A part of a path, as `naming.plain` makes names: it does not begin with a dot.
 _PART = r"[\w@-][\w.@-]{0,200}"
 _KNOWN = re.compile(
     rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{storage.PROVENANCE}/[0-9a-f]{{64}}\.diff"

@@ -458,7 +458,7 @@ class MujocoArm:
 
             arm = self._arm_of(f"{name} {joint}")
             if _GRIPPER.search(name) or _GRIPPER.search(joint) or not moves_joint:
-                # Of two fingers that move against each other, one is open at its lower limit.
+                # If two fingers move against each other, one of them is open at its lower limit.
                 rising = arm_model.open_high if abs(high) >= abs(low) else not arm_model.open_high
                 drive = grippers[arm]
                 drive.low.append(low if rising else high)

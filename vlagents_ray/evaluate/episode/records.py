@@ -56,11 +56,11 @@ class EpisodeResult:
     checkpoint: str | None = None  # the checkpoint that the policy's reset returned
     weights: str | None = None  # digest of the loaded weights, for a policy that reports it
     revision: str | None = None  # their commit on the hub, if they were in its cache
-    # Of the weights that computed the last act; 0 is the loaded checkpoint.
+    # Version of the weights that computed the last action; 0 is the loaded checkpoint.
     policy_version: int | None = None
-    # Of that version, computed by the replica from the weights in memory.
+    # Fingerprint of that version, which the replica computes from the weights in memory.
     policy_fingerprint: str | None = None
-    first_policy_version: int | None = None  # of the weights that computed the first act
+    first_policy_version: int | None = None  # version for the first action
     # Digest of the executed actions, (steps, D) little-endian float32, row by row.
     actions_sha256: str | None = None
 

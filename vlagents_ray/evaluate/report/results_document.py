@@ -162,7 +162,7 @@ def _case(case: CaseResults) -> dict[str, Any]:
         "planned": _planned(case),
         "stopped": case.stopped_at is not None,
         "sequence": case.stop is not None,
-        # Of the ticks at which the policy was to act; None where the environment waits for it.
+        # Share of the ticks at which the policy was to act; None if the environment waits for it.
         "share_in_time": None if time_share is None else time_share.share,
     } | _rate(rate_of([case], "success_once"))
 

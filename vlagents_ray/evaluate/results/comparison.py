@@ -86,7 +86,7 @@ class Comparison:
     total: Line
     cases: tuple[CaseResults, ...] = ()  # the cases in real time; only of `clock_gaps`
     changes: tuple[Change, ...] = ()  # accepted differences between the two environments
-    # Of the compared cases; None where their environments waited for the policy.
+    # Shares over the compared cases; None if their environments waited for the policy.
     time_share_a: TimeShare | None = None
     time_share_b: TimeShare | None = None
 

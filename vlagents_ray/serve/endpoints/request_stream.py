@@ -94,8 +94,8 @@ class RequestStream(MessageHandler):
             self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
-            # Of TCP, the kernel records the time of the last segment, such as the one that says
-            # that the client has left.
+            # For TCP, the kernel records the time of the last segment, which may be the one that
+            # says that the client has left.
             may_have_waited=True,
         )
 

@@ -277,8 +277,8 @@ class ReplicaPace:
             # Each answer is worth most if all rows before it were executed.
             interval_s = max(longest_s, need.rows / need.hz)
         else:
-            # Of robots that asked at once, the first one that is answered asks again first, so that
-            # their next requests do not come at once again.
+            # If several robots asked at once, the one that is answered first asks again first, so
+            # that their next requests do not come at once again.
             waited_s = now - plan.asked
             earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
             backlog_s = now - plan.begins + waiting_s

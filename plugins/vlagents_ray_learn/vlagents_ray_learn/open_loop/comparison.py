@@ -151,7 +151,7 @@ class OpenLoopPlan:
     episodes: Sequence[int] | None = None  # indices in each dataset; None selects all
     # Largest number of compared rows of a chunk; None compares all rows that both chunks have.
     horizon: int | None = None
-    # Of the frames in a dataset without recorded answers: 2 skips every other one.
+    # Step from one compared frame to the next, in a dataset without recorded answers.
     stride: int = 1
     batch_size: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
