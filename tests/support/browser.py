@@ -74,6 +74,11 @@ class Page:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
+    def picture(self, clip: dict[str, float] | None = None) -> bytes:
+        """A PNG of the window, or of a part of the page: x, y, width, height and scale."""
+        part = {} if clip is None else {"clip": clip, "captureBeyondViewport": True}
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png", **part)["data"])
+
     def pdf(self) -> bytes:
         """The page as it is printed, on A4."""
         return base64.b64decode(

@@ -110,7 +110,7 @@ class Operator:
                 xyzw.
             arm: The index of the arm.
         """
-        x, y, z, *quaternion = np.round(pose, 2).tolist()
+        x, y, z, *quaternion = np.round(pose.astype(float), 2).tolist()
         pose_text = (
             f"{x} m in front of the base, {y} m to its left, {z} m above it, with the "
             f"quaternion xyzw {quaternion}"

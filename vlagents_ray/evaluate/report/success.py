@@ -172,7 +172,7 @@ def _learning_curve(title: str, cases: Sequence[CaseResults]) -> LearningCurve |
         levels.append(Series(name, [(first, rate), (last, rate)], level=True))
         level_rows.append((name, None, rate))
 
-    is_pushed = all("pushed_weights" in case.settings for case in cases if case.step is not None)
+    is_pushed = all(case.settings.get("pushed_weights") for case in cases if case.step is not None)
     x_label = "version of the weights" if is_pushed else "training step"
     chart = rate_chart([*curves, *levels], x_label, title)
     return LearningCurve(chart, level_rows + curve_rows)
