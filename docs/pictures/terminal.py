@@ -6,8 +6,9 @@ output of a command, with its colours, as an SVG.
         python docs/pictures/terminal.py \\
         "vlagents-ray eval tabletop --policy scripted --episodes 20 --out runs/first" \\
         docs/pictures/eval.svg
-    vlagents-ray robot check mujoco:so101 |
-        python docs/pictures/terminal.py "vlagents-ray robot check mujoco:so101" \\
+    vlagents-ray robot check mujoco:so101_new_calib.xml --robot-set like=so101 |
+        python docs/pictures/terminal.py \\
+        "vlagents-ray robot check mujoco:so101_new_calib.xml --robot-set like=so101" \\
         docs/pictures/check.svg
 
 Its background is dark in both colour schemes, as that of many terminals.
