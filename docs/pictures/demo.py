@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from tests.support.browser import Page, browser
 from vlagents_ray import Act, RemoteAgent
@@ -186,7 +186,14 @@ def write_gif(frames: Sequence[Image.Image], durations: Sequence[int], file: Pat
     """
     samples = [np.asarray(frame.resize((WIDTH // 2, HEIGHT // 2))) for frame in frames[::10]]
     samples += [np.asarray(frame.resize((WIDTH // 2, HEIGHT // 2))) for frame in frames[-2:]]
-    palette = Image.fromarray(np.concatenate(samples)).quantize(255, Image.Quantize.MAXCOVERAGE)
+    palette = Image.fromarray(np.concatenate(samples)).quantize(
+        255, Image.Quantize.MEDIANCUT, kmeans=2
+    )
+    # Means of the page's colours are tinted: keep these as they are.
+    colours = np.array(palette.getpalette()).reshape(-1, 3)
+    for exact in map(ImageColor.getrgb, (PAPER, "#f6f7f9", INK)):
+        colours[np.abs(colours - exact).sum(axis=1).argmin()] = exact
+    palette.putpalette(colours.flatten().tolist())
     indices = [
         np.asarray(frame.quantize(palette=palette, dither=Image.Dither.NONE)) for frame in frames
     ]
