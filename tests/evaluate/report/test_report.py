@@ -298,6 +298,8 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
     assert places == sorted(places)
     words = page.section("Learning curve")
     assert "base (no steps)" in words
+    assert "training step" in words
+    assert "version of the weights" not in words
     assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
     words = page.section("Comparison")
     first = [
