@@ -73,7 +73,7 @@ def test_llms_txt_names_each_page_of_the_navigation() -> None:
     assert listing.startswith("# vlagents_ray\n\n> ")
     assert set(named) == pages
     assert len(named) == len(pages)
-    assert "- [LeRobot](policies/lerobot.html): The policy `lerobot` serves checkpoints" in listing
+    assert "- [LeRobot](policies/lerobot.html): The policy `lerobot` " in listing
 
 
 # The lines of the module's path that heads a page of the reference.
@@ -112,10 +112,14 @@ def test_pages_fit_and_ask_for_nothing_outside_of_the_site(
 
 @pytest.mark.browser
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_picture_of_the_report_has_the_readers_colours(page: Page, scheme: str) -> None:
+def test_the_pictures_of_the_report_have_the_readers_colours(page: Page, scheme: str) -> None:
     page.open(SITE / "evaluation/reading.html", width=1280, scheme=scheme)
     shown = "[...document.images].filter(one => one.naturalWidth).map(one => one.currentSrc)"
-    assert page.value(shown) == [(SITE / f"evaluation/report-{scheme}.png").as_uri()]
+    parts = ("success", "comparison", "curve", "failures")
+    assert page.value(shown) == [
+        (SITE / "pictures/eval.svg").as_uri(),
+        *((SITE / f"evaluation/report-{part}-{scheme}.png").as_uri() for part in parts),
+    ]
 
 
 @pytest.mark.browser
