@@ -366,6 +366,7 @@ def test_every_page_stands_in_the_navigation_of_the_site() -> None:
     outside = {page.name for page in ROOT.glob("*.md")} | {
         "examples/README.md",
         "examples/experts/README.md",
+        "tests/README.md",
     }
     assert pages == navigation - outside
 
