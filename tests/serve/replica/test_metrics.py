@@ -88,6 +88,37 @@ def test_a_robot_with_two_models_is_counted_once_as_the_first(
     engine.close()
 
 
+def test_the_ticks_of_a_robot_that_is_always_in_time_are_exported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written: dict[str, float] = {}
+
+    def series(_tags: object, _kind: object, name: str, *_: object, **__: object) -> Any:
+        def increment(value: float = 1.0, _tags: object = None) -> None:
+            if value <= 0:
+                raise ValueError(f"value must be >0, got {value}")  # as Ray's counters do
+            written[name] = value
+
+        def observe(value: float, _tags: object = None) -> None:
+            written[name] = value
+
+        return SimpleNamespace(set=observe, inc=increment, observe=observe)
+
+    monkeypatch.setattr(metrics, "series", series)
+    engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
+    engine.start()
+    exporter = Exporter(engine, {})
+    engine.stats.enable()
+    engine.stats.report("robot", RobotReport(10, 0, 30.0))
+    exporter.export()
+    assert (written["ticks"], written["executed_age_ms"]) == (10, 30.0)
+    assert "starved_ticks" not in written
+
+    engine.stats.report("robot", RobotReport(0, 0, None))
+    exporter.export()
+    engine.close()
+
+
 @pytest.mark.parametrize("robots", [10, 10_000])
 def test_the_number_of_series_does_not_grow_with_the_robots(
     monkeypatch: pytest.MonkeyPatch, robots: int

@@ -213,8 +213,11 @@ class Exporter:
         for op, calls in collected.hung.items():
             self._hung.inc(calls, {"op": op})
         for priority, ticks in collected.ticks.items():
-            self._ticks.inc(ticks, {"priority": priority})
-            self._starved.inc(collected.starved[priority], {"priority": priority})
+            starved = collected.starved[priority]
+            if ticks:  # Ray's counters raise an error for 0
+                self._ticks.inc(ticks, {"priority": priority})
+            if starved:
+                self._starved.inc(starved, {"priority": priority})
         for priority, ages_ms in collected.ages_ms.items():
             for age_ms in _in_slices(ages_ms.values):
                 self._executed_age.observe(age_ms, {"priority": priority})
