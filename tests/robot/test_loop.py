@@ -433,6 +433,20 @@ def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None
     assert (report.safe, report.waiting) == ({}, report.safe_ticks)
     assert report.waiting > 10
     assert "waiting for an answer" in str(report.mostly_safe)
+    assert "use a lower rate (hz)" in str(report.mostly_safe)
+
+
+def test_the_warning_of_a_robot_that_the_guard_holds_names_the_limit_and_not_the_rate() -> None:
+    agent = Going()
+    robot = Watched(Going.contract)
+    settings = PlayerSettings(deadline_s=30.0, safe="hold")
+    guard = Guard(Going.contract, max_step=0.05, measure=lambda _: np.full(2, 9.5, np.float32))
+    with ChunkPlayer(agent, settings, check=guard) as player:
+        report = run_loop(robot, player, hz=200, seconds=0.1)
+    assert report.safe["max_step"] == report.safe_ticks > 1
+    assert "expected a step of at most max_step, 0.05, got" in str(report.mostly_safe)
+    assert "Compare the robot's pose" in str(report.mostly_safe)
+    assert "use a lower rate" not in str(report.mostly_safe)
 
 
 def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where_the_robot_stands() -> (

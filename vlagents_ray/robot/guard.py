@@ -216,8 +216,8 @@ class Guard:
             rounding = 2 * _ROUNDING * max(abs(number), abs(last_number))
             if abs(number - last_number) > steps[i] + rounding:
                 raise InvalidAction(
-                    f"action[{i}]: expected a step of at most max_step, got {number:g} after "
-                    f"{last_number:g}",
+                    f"action[{i}]: expected a step of at most max_step, {steps[i]:.3g}, got "
+                    f"{number:g} after {last_number:g}",
                     cause="max_step",
                 )
         if self.limits is not None:

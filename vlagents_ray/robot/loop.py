@@ -304,6 +304,30 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
         yield robot
 
 
+def _cure(cause: Cause) -> str:
+    """Return what to do about ticks without an action of the policy, in a sentence."""
+    match cause:
+        case "waiting" | "late" | "old":
+            return (
+                "If answers arrive too late, use a lower rate (hz) or a policy with longer chunks, "
+                "or let a tick wait for its answer (deadline_s, --deadline-ms)"
+            )
+        case "lost" | "failed":
+            return "Read the server's log"
+        case "limits" | "max_step" | "dynamics":
+            return (
+                "Compare the robot's pose with the policy's actions (units, order of joints, a "
+                "start far from the first action), and the limits with both; see docs/guard.md"
+            )
+        case "stopped":
+            return (
+                "After a stop, a robot that is not simulated waits for its operator "
+                "(watchdog.restart()); see docs/control_loop.md"
+            )
+        case _:
+            return "See docs/control_loop.md for this cause"
+
+
 @dataclass(slots=True)
 class LoopReport:
     """The outcome of a run of the control loop: its timing, and the ticks without an action of
@@ -355,9 +379,7 @@ class LoopReport:
                 cause, most_ticks = safe_cause, safe_ticks
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action "
-            f"of the policy, most often: {self.reasons.get(cause, cause)}. If answers arrive too "
-            "late, use a lower rate (hz) or a policy with longer chunks, or let a tick wait for "
-            "its answer (deadline_s, --deadline-ms)"
+            f"of the policy, most often: {self.reasons.get(cause, cause)}. {_cure(cause)}"
         )
 
     @property
