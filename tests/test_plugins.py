@@ -216,7 +216,10 @@ def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(
         registry.registered_class("trackers", "notebook9")
     [listed] = [row for row in policies_and_wrappers() if row.name == "pi9"]
     assert listed.what == "in vlagents-ray-models"
-    assert listed.missing == "not installed: pip install vlagents-ray-models"
+    assert (
+        listed.missing
+        == f"not installed: {registry.pip_install(distribution='vlagents-ray-models')}"
+    )
 
 
 def test_all_plugins_of_this_repository_are_installed_for_its_tests() -> None:

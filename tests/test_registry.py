@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
-from collections.abc import Iterator
+import shlex
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,9 @@ import tomllib
 
 import vlagents_ray
 from vlagents_ray import registry
+from vlagents_ray.envs import graphics
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy
+from vlagents_ray.registry import CORE, entries, pip_install
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
 FAMILIES = ["diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"]
@@ -75,8 +79,104 @@ def test_a_simulators_environment_is_for_the_workers_and_a_policys_for_its_deplo
 
 @pytest.mark.usefixtures("nothing_installed")
 def test_a_missing_simulator_or_runtime_is_cured_by_its_extra() -> None:
-    assert cure("mani_skill.envs") == "pip install 'vlagents-ray[maniskill]'"
-    assert cure("onnxruntime") == "pip install 'vlagents-ray-models[onnx]'"
+    assert cure("mani_skill.envs") == pip_install("maniskill")
+    assert cure("onnxruntime") == pip_install("onnx", "vlagents-ray-models")
+
+
+class InstalledFrom:
+    """The distribution of this package, as pip has recorded its installation."""
+
+    def __init__(self, record: str | None) -> None:
+        self._record = record
+
+    def read_text(self, name: str) -> str | None:
+        return self._record if name == "direct_url.json" else None
+
+
+@pytest.fixture
+def installed_from(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str | None], None]]:
+    def install(record: str | None) -> None:
+        monkeypatch.setattr(registry.metadata, "distribution", lambda _: InstalledFrom(record))
+        registry._checkout.cache_clear()
+
+    yield install
+    registry._checkout.cache_clear()
+
+
+@pytest.mark.parametrize("folder", ["plain", "with space"])
+@pytest.mark.parametrize("is_editable", [True, False])
+def test_what_was_installed_from_a_checkout_is_cured_by_that_checkout(
+    installed_from: Callable[[str | None], None], tmp_path: Path, folder: str, is_editable: bool
+) -> None:
+    checkout = tmp_path / folder
+    (checkout / "plugins/vlagents_ray_sims").mkdir(parents=True)
+    (checkout / "pyproject.toml").touch()
+    info = {"editable": True} if is_editable else {}
+    installed_from(json.dumps({"url": checkout.as_uri(), "dir_info": info}))
+
+    options = ["--editable"] if is_editable else []
+    sims = f"{checkout}/plugins/vlagents_ray_sims"
+    install = ["pip", "install", *options]
+    assert shlex.split(pip_install("serve")) == [*install, f"{checkout}[serve]"]
+    assert shlex.split(pip_install()) == [*install, f"{checkout}"]
+    assert shlex.split(pip_install("libero", "vlagents-ray-sims")) == [*install, f"{sims}[libero]"]
+    assert shlex.split(pip_install(distribution="vlagents-ray-sims")) == [*install, sims]
+    assert pip_install("arm", "cranes") == "pip install 'cranes[arm]'"  # a plug-in of others
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        None,
+        '{"url": "file:///wheels/vlagents_ray-0.1.0-py3-none-any.whl", "archive_info": {}}',
+        '{"url": "file:///no/such/checkout", "dir_info": {"editable": true}}',
+    ],
+    ids=["index", "archive", "removed"],
+)
+def test_what_was_installed_without_a_checkout_is_cured_by_a_package_index(
+    installed_from: Callable[[str | None], None], record: str | None
+) -> None:
+    installed_from(record)
+    assert pip_install("serve") == "pip install 'vlagents-ray[serve]'"
+    assert pip_install(distribution="vlagents-ray-sims") == "pip install vlagents-ray-sims"
+
+
+def extras_named_in_code() -> set[tuple[str, str]]:
+    """The arguments of all calls of `pip_install`: extra, distribution."""
+    named = set()
+    for source in (*ROOT.glob("vlagents_ray/**/*.py"), *ROOT.glob("plugins/*/*/**/*.py")):
+        for node in ast.walk(ast.parse(source.read_text())):
+            if not (isinstance(node, ast.Call) and ast.unparse(node.func) == "pip_install"):
+                continue
+            words = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
+            if words:
+                named.add((words[0], words[1] if len(words) > 1 else CORE))
+    return named
+
+
+def test_each_extra_that_a_message_names_exists() -> None:
+    extras = {}
+    for file in (ROOT / "pyproject.toml", *ROOT.glob("plugins/*/pyproject.toml")):
+        project = tomllib.loads(file.read_text())["project"]
+        extras[project["name"]] = set(project.get("optional-dependencies", ()))
+    named = extras_named_in_code()
+    assert ("serve", CORE) in named
+    assert ("libero", "vlagents-ray-sims") in named
+    named |= {(extra, CORE) for extra in registry._EXTRAS}
+    for kind in ("policies", "envs", "robots", "exports", "trackers"):
+        named |= {
+            (entry.extra, entry.distribution) for entry in entries(kind).values() if entry.extra
+        }
+    assert [(extra, name) for extra, name in sorted(named) if extra not in extras[name]] == []
+
+
+@pytest.mark.usefixtures("nothing_installed")
+def test_a_renderer_that_is_not_installed_is_cured_as_its_simulator_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(graphics.importlib.util, "find_spec", lambda _: None)
+    assert graphics.egl_probe.__wrapped__().cure == cure("mujoco")
+    assert graphics.render_probe.__wrapped__().cure == cure("sapien")
 
 
 @pytest.mark.usefixtures("nothing_installed")

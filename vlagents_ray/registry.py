@@ -17,15 +17,17 @@ import functools
 import importlib
 import json
 import logging
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib import resources
+from importlib import metadata, resources
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -220,12 +222,18 @@ def require(module: str, *, extra: str | None = None, distribution: str = CORE) 
         if error.name is None or error.name.partition(".")[0] != top:
             raise  # the module is installed, but lacks a dependency, which this error names
         raise MissingDependency(
-            f"{module!r} is not installed; {_install(top, extra, distribution)}"
+            f"{module!r} is not installed; {how_to_install(top, extra, distribution)}"
         ) from error
 
 
-def _install(package: str, extra: str | None = None, distribution: str = CORE) -> str:
-    """Return how to install an optional package, as the end of an error message."""
+def how_to_install(package: str, extra: str | None = None, distribution: str = CORE) -> str:
+    """Return how to install an optional package, as the end of an error message.
+
+    Args:
+        package: The name by which it is imported.
+        extra: The extra that installs it, if different from the usual one.
+        distribution: The distribution of that extra.
+    """
     simulators = [entry for entry in entries("envs").values() if package in entry.needs]
     policies = entries("policies").values()
     users = [entry for entry in (*simulators, *policies) if package in entry.needs]
@@ -296,8 +304,42 @@ def requirements_file(name: str) -> Path:
 
 
 def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
-    """Return the command that installs a distribution, with one of its extras."""
-    return f"pip install '{distribution}[{extra}]'" if extra else f"pip install {distribution}"
+    """Return the command that installs a distribution, with one of its extras.
+
+    If this package was installed from a checkout, so are its plug-ins: the same code, and maybe
+    a version that no package index has.
+    """
+    target, options = distribution, ""
+    checkout, is_editable = _checkout()
+    if checkout is not None:
+        folder = checkout
+        if distribution != CORE:
+            folder = checkout / "plugins" / distribution.replace("-", "_")
+        if folder.is_dir():
+            target, options = str(folder), "--editable " if is_editable else ""
+    if extra:
+        return f"pip install {options}'{target}[{extra}]'"
+    return f"pip install {options}{shlex.quote(target)}"
+
+
+@functools.lru_cache(maxsize=1)
+def _checkout() -> tuple[Path | None, bool]:
+    """Return the folder from which pip installed this package, None if it was an archive, and
+    whether it is used in place.
+    """
+    try:
+        # PEP 610
+        record = metadata.distribution(CORE).read_text("direct_url.json")
+    except metadata.PackageNotFoundError:  # the package is on PYTHONPATH only
+        record = None
+    if record is None:
+        return None, False
+    origin = json.loads(record)
+    if "dir_info" not in origin:
+        return None, False
+    folder = Path(unquote(urlsplit(origin["url"]).path))
+    is_editable = bool(origin["dir_info"].get("editable"))
+    return (folder, is_editable) if (folder / "pyproject.toml").is_file() else (None, False)
 
 
 def names(kind: str) -> list[str]:

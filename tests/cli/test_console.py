@@ -16,7 +16,7 @@ from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.main import app, envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.registry import entries, names
+from vlagents_ray.registry import entries, names, pip_install
 
 CLI = Path(console.__file__).parent
 CURE = (
@@ -128,10 +128,8 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     assert "  vlagents-ray venv create openvla  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
-    assert (
-        "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray-models[onnx]'"
-        in rest
-    )
+    cure = pip_install("onnx", "vlagents-ray-models")
+    assert f"  onnx: not in this environment (onnxruntime): {cure}" in rest
 
 
 def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:

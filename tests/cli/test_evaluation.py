@@ -38,6 +38,7 @@ from vlagents_ray.evaluate.plan.jobs import plan_jobs
 from vlagents_ray.evaluate.plan.resolved import ResolvedPlan, resolve
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.registry import pip_install
 
 WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
@@ -247,7 +248,7 @@ def test_a_page_whose_plugin_is_not_installed_is_named_before_anything_starts(
         "eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words
     )
     assert "page of evaluations 'live' is in vlagents-ray-live, which is not installed" in message
-    assert "pip install vlagents-ray-live" in message
+    assert pip_install(distribution="vlagents-ray-live") in message
     assert not (tmp_path / "out").exists()
 
 

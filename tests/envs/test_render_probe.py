@@ -9,6 +9,7 @@ import pytest
 
 from vlagents_ray.envs import graphics
 from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.registry import pip_install
 
 needs_sapien = pytest.mark.skipif(
     importlib.util.find_spec("sapien") is None, reason="sapien is not installed"
@@ -63,8 +64,8 @@ def test_a_driver_that_hangs_is_given_up_once_a_process(monkeypatch: pytest.Monk
 
 def test_without_sapien_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    assert graphics.render_probe().cure == "pip install 'vlagents-ray[maniskill]'"
-    assert "vlagents-ray[maniskill]" in (ManiSkill.missing() or "")
+    assert graphics.render_probe().cure == pip_install("maniskill")
+    assert pip_install("maniskill") in (ManiSkill.missing() or "")
 
 
 def test_a_machine_with_an_nvidia_driver_gets_its_own_cure(monkeypatch: pytest.MonkeyPatch) -> None:

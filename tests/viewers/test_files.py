@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import socket
 import subprocess
@@ -19,6 +20,7 @@ from eval_fakes import wait_for
 from vlagents_ray import ConfigError
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.images.jpeg_png import decode
+from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.viewers import ViewerFrame, open_viewer
 
@@ -126,7 +128,7 @@ def test_a_viewer_that_is_not_installed_names_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[rerun\]'"):
+    with pytest.raises(MissingDependency, match=re.escape(pip_install("rerun"))):
         open_viewer(str(tmp_path))
 
 

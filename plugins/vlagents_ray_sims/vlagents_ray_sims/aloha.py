@@ -15,7 +15,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv
 from vlagents_ray.interface import Obs
-from vlagents_ray.registry import require
+from vlagents_ray.registry import pip_install, require
 
 PROTOCOL = BenchmarkProtocol(
     name="ALOHA",
@@ -62,7 +62,7 @@ class Aloha(SimulatorEnv):
         ("gym_aloha", "dm_control", "mujoco"),
         ("gym-aloha", "dm-control", "mujoco"),
     )
-    cure = "pip install 'vlagents-ray-sims[aloha]'"
+    cure = pip_install("aloha", "vlagents-ray-sims")
     _protocol = PROTOCOL
 
     def __init__(

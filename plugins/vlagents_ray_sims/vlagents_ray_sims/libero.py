@@ -39,7 +39,7 @@ from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, Unkno
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.ray_tools.session import variables
-from vlagents_ray.registry import require
+from vlagents_ray.registry import pip_install, require
 from vlagents_ray_sims.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
 
 _CONFIG = "LIBERO_CONFIG_PATH"
@@ -337,7 +337,7 @@ class Libero(SimulatorEnv):
 
     suite, title = "libero", "LIBERO"
     packages, distributions = ("libero", "robosuite", "mujoco"), ("robosuite", "mujoco")
-    cure = "pip install 'vlagents-ray-sims[libero]'"
+    cure = pip_install("libero", "vlagents-ray-sims")
     suites: ClassVar[Mapping[str, Suite]] = SUITES
 
     def __init__(
@@ -664,9 +664,7 @@ def package_folder() -> Path:
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
     if spec is None or spec.origin is None:
-        raise MissingDependency(
-            "'libero' is another package; pip install 'vlagents-ray-sims[libero]' brings hf-libero"
-        )
+        raise MissingDependency(f"'libero' is another package; {Libero.cure} brings hf-libero")
     return Path(spec.origin).parent
 
 

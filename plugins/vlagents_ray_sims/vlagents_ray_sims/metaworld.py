@@ -18,7 +18,7 @@ from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.registry import require
+from vlagents_ray.registry import pip_install, require
 
 PROTOCOL = BenchmarkProtocol(
     name="Meta-World",
@@ -53,7 +53,7 @@ class MetaWorld(SimulatorEnv):
 
     suite, title = "metaworld", "Meta-World"
     packages, distributions = ("metaworld", "mujoco"), ("metaworld", "mujoco")
-    cure = "pip install 'vlagents-ray-sims[metaworld]'"
+    cure = pip_install("metaworld", "vlagents-ray-sims")
     _protocol = PROTOCOL
 
     def __init__(

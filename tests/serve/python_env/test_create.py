@@ -5,6 +5,7 @@ uses what it makes.
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import accelerator
+from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.python_env import create as making
 from vlagents_ray.serve.python_env.create import create, find_python, make_environment
 
@@ -339,7 +341,6 @@ def test_uv_looks_where_pip_was_told_to(monkeypatch: pytest.MonkeyPatch) -> None
 def test_without_uv_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(making.importlib.util, "find_spec", lambda _: None)
     monkeypatch.setattr(making.shutil, "which", lambda *_, **__: None)
-    with pytest.raises(
-        MissingDependency, match=r"'uv' is not installed; pip install 'vlagents-ray\[serve\]'"
-    ):
+    cure = re.escape(f"'uv' is not installed; {pip_install('serve')}")
+    with pytest.raises(MissingDependency, match=cure):
         create(tmp_path / "env")

@@ -22,6 +22,7 @@ from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, step_
 from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes, without
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import pip_install
 
 ON_GPU = ("gpu", "cuda", "physx_cuda")
 
@@ -146,7 +147,7 @@ class ManiSkill(SimulatorEnv):
         The first call in a process renders one frame in a child.
         """
         modules = ("mani_skill", "sapien", "gymnasium", "torch")
-        missing = without(modules, "pip install 'vlagents-ray[maniskill]'")
+        missing = without(modules, pip_install("maniskill"))
         if missing is not None:
             return missing
 

@@ -26,6 +26,7 @@ from ray.serve.exceptions import RayServeException
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.ray_tools import head_monitor, private, session
 from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.registry import pip_install
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch import haproxy
@@ -469,7 +470,7 @@ def own_ray(
         binary = haproxy.haproxy_binary() if ingress else None
         if binary is None and tls is not None and tls.client_ca is not None:
             raise ConfigError(
-                "TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'"
+                f"TLS with certificates of clients needs HAProxy: {pip_install('serve')}"
             )
         if not ingress:
             fixed["RAY_SERVE_ENABLE_HA_PROXY"] = "0"

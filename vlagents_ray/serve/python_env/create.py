@@ -24,7 +24,7 @@ import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
-from vlagents_ray.registry import plugin_distributions
+from vlagents_ray.registry import pip_install, plugin_distributions
 
 Progress = Callable[[str], None]
 
@@ -378,7 +378,7 @@ def _uv(arguments: Sequence[str]) -> str:
         folders = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
         binary = shutil.which("uv", path=folders)
         if binary is None:
-            raise MissingDependency("'uv' is not installed; pip install 'vlagents-ray[serve]'")
+            raise MissingDependency(f"'uv' is not installed; {pip_install('serve')}")
         command = [binary]
 
     done = subprocess.run(  # noqa: S603 - uv, as installed with this package
