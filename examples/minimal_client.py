@@ -4,8 +4,7 @@ simplejpeg and websockets.
     with Policy("ws://gpu-box:8000/v1/stream") as policy:
         policy.reset({"front": image}, {"joints": joints}, instruction="stack the cups")
         answer = policy.act({"front": image}, {"joints": joints})
-        answer["action"]  # (D,) float32, or (H, D) for a chunk; the other keys are "done" and
-        "info"
+        answer["action"]  # (D,) float32, or (H, D) for a chunk; also "done" and "info"
 
 docs/protocol.md specifies the messages. `vlagents_ray.RemoteAgent` also reconnects and resumes its
 episode.

@@ -3,10 +3,9 @@
 `Servo` finds the red hook and the green mark in the picture of own_env.py, and moves the hook
 towards the mark; your model replaces its 2 x 2 weights. In the folder of this file,
 
-    python own_policy.py                                        checks it, and plays 20 episodes
-    without a server vlagents-ray serve own_policy:Servo --set camera_turn=120   serves it to
-    robots, simulators and evaluations vlagents-ray eval own_env:CraneEnv --policy
-    http://localhost:8000 --out runs/crane
+    python own_policy.py  # checks it, and runs 20 episodes without a server
+    vlagents-ray serve own_policy:Servo --set camera_turn=120  # in another terminal
+    vlagents-ray eval own_env:CraneEnv --policy http://localhost:8000 --out runs/crane
 
 `vlagents-ray init policy NAME` writes a skeleton with its test and its deployment file.
 """

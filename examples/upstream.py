@@ -5,9 +5,8 @@ Here the server is openpi's: `theirs` implements its protocol in a few lines, in
 evaluation plays with the policy. `python upstream.py` does both in this process. With the real
 server at ws://gpu-box:9000,
 
-    python upstream.py ws://gpu-box:9000                 plays the same episodes with its model, if
-    its keys are these vlagents-ray serve deployments/upstream.yaml         puts batches, sessions,
-    keys and the live page before it
+    python upstream.py ws://gpu-box:9000  # runs the same episodes, if its keys are those below
+    vlagents-ray serve deployments/upstream.yaml  # adds batches, sessions, keys and the live page
 
 docs/policies/upstream.md has the other protocols (GR00T, OpenVLA, RoboArena, vla-eval, vlagents)
 and their keys.

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib
 import inspect
 import re
+import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,6 +35,12 @@ FRAGMENTS = {
     "which",
     "who",
 }
+
+ROOT = Path(__file__).parents[1]
+SOURCES = ("vlagents_ray", "plugins", "examples", "benchmarks")
+INDENTED = re.compile(r"(?:^ {4}.*\n|^\n(?= {4}))+", re.MULTILINE)
+# An indented block of a docstring that begins like this is Python.
+PYTHON = re.compile(r"(from|import|with|for) .*|\w+(\.\w+)*(, \w+)* = .*")
 
 
 @dataclass(frozen=True)
@@ -169,3 +178,39 @@ def test_a_good_docstring_has_no_fault() -> None:
         "    Their sum.\n"
     )
     assert list(Documented("add", doc, ("a", "b"), returns=True).faults()) == []
+
+
+def wrong_examples(source: str) -> list[str]:
+    """Return the Python examples in the docstrings of a module that are no valid Python, such as
+    those that were wrapped as prose.
+    """
+    wrong = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        docstring = ast.get_docstring(node) or ""
+        for block in INDENTED.findall(docstring + "\n"):
+            example = textwrap.dedent(block.strip("\n"))
+            if not PYTHON.match(example):
+                continue
+            try:
+                ast.parse(example)
+            except SyntaxError:
+                wrong.append(example)
+    return wrong
+
+
+def test_examples_in_docstrings_are_valid_python() -> None:
+    wrong = {}
+    for folder in SOURCES:
+        for path in (ROOT / folder).rglob("*.py"):
+            examples = wrong_examples(path.read_text())
+            if examples:
+                wrong[str(path.relative_to(ROOT))] = examples
+    assert wrong == {}
+
+
+def test_a_wrapped_example_is_found() -> None:
+    wrapped = 'config = Config(\n    out="a") summary = run(config)'
+    docstring = textwrap.indent(wrapped, "    ")
+    assert wrong_examples(f"'''An example.\n\n{docstring}\n\nIt ends.\n'''") == [wrapped]

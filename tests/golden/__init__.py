@@ -13,7 +13,8 @@ ZeroMQ and gRPC carry the messages. `traces/FILE.txt` has, for each scenario,
     == its name
     [[the endpoints at which the same bytes go both ways], {the settings of the server}]
     a; sends                the message of line a: ASCII as it is, «hexadecimal», «07*192» for 192
-      times the byte 07 «564c4101c3000000»{"op":"reset", …
+                            times the byte 07
+      «564c4101c3000000»{"op":"reset", …
     a; gets; binary         what came, and how: of a WebSocket its opcode, of gRPC the status
       «564c4101e4000000»{"request_id":"r-1", …
     server; drains          an event, see `Server.do`

@@ -6,8 +6,8 @@ right, whole requests before, with and after refused ones, in segments cut anywh
 `tests/integration/test_fuzz.py` does so after it. Some thousands in CI; as many as wanted by hand,
 all of them from one seed:
 
-    VLAGENTS_FUZZ_SEQUENCES=1000000 VLAGENTS_FUZZ_SEED=1 pytest tests/serve/test_fuzz_before_keys.py
-    -s --timeout 7200
+    export VLAGENTS_FUZZ_SEQUENCES=1000000 VLAGENTS_FUZZ_SEED=1
+    pytest tests/serve/test_fuzz_before_keys.py -s --timeout 7200
 """
 
 from __future__ import annotations

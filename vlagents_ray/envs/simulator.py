@@ -64,8 +64,8 @@ class SimulatorEnv(EvalEnv):
 
         with RoboCasa("NavigateKitchen") as env:
             obs, _ = env.reset(seed=0)
-            obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12,
-            np.float32)))
+            act = Act(action=np.zeros(12, np.float32))
+            obs, reward, terminated, truncated, info = env.step(act)
 
     A subclass sets the class variables below, makes its simulator in the constructor within
     `_making`, and registers its clean-up with `_resources`. `_begin` begins an episode and

@@ -1,10 +1,11 @@
-"""Evaluation: episodes as keyed jobs, played in parallel by Ray actors, recorded exactly once.
+"""Evaluations: episodes run in parallel in Ray actors, and each is recorded exactly once.
 
+    policies = [{"url": "http://localhost:8000"}]
     suites = [{"envs": ["tabletop"]}]
-    config = EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=suites,
-    out="runs/first") summary = evaluate(config)
+    summary = evaluate(EvalConfig(policies=policies, suites=suites, out="runs/first"))
 
-Configurations and results are read without Ray; code that plays or prints is loaded on first use.
+Configurations and results are read without Ray. Code that runs episodes or prints is imported on
+first use.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Plays the jobs of a plan on its workers, for an evaluation as for rollouts: hands out jobs,
-repeats attempts that infrastructure failed, and ends when too many episodes in a row are lost.
+"""The driver of evaluations and of rollouts: it hands the jobs of a plan to workers, repeats
+attempts that infrastructure failed, and ends when too many episodes in a row are lost.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Consumer(ABC):
 
     @abstractmethod
     def finished(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
-        """Take the result of an episode, which is not played again. Its status is "infra_failed"
+        """Take the result of an episode, which does not run again. Its status is "infra_failed"
         if it was lost.
         """
 
@@ -120,7 +120,7 @@ class Driver:
             self._count_loss(failure)
 
     def _must_be_alone(self, job: Job, failure: Failure) -> bool:
-        """Return whether the next attempt is played without other episodes in its simulator, as
+        """Return whether the next attempt runs without other episodes in its simulator, as
         one of them may be the cause of the failure.
 
         After a simulator broke, all its episodes are first repeated together, since most simulators
@@ -140,7 +140,7 @@ class Driver:
         return earlier == actions
 
     def _finish(self, job: Job, result: EpisodeResult, artifacts: Artifacts) -> None:
-        """Pass the result of an episode that was played to the consumer."""
+        """Pass the result of a finished episode to the consumer."""
         if result.status != "policy_error":
             self._lost = self._policy_errors = 0
         self._consumer.finished(job, result, artifacts)

@@ -5,11 +5,12 @@ A deployment file states a mapping as a preset's name (`presets`), as an object,
 that names a preset and overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
-     "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]}, "gripper":
-     {"key": "state", "index": 6, "open": 0.04, "closed": 0.0}, "instruction": "prompt|task_id",
-     "instructions": {"0": "turn on the radio"}, "info": {"unnorm_key": "unnorm_key"}, "action":
-     {"arm": {"stop": 6}, "hand": {"start": 6}}, "action_gripper": {"index": 6, "open": -1,
-     "closed": 1}}
+     "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
+     "gripper": {"key": "state", "index": 6, "open": 0.04, "closed": 0.0},
+     "instruction": "prompt|task_id", "instructions": {"0": "turn on the radio"},
+     "info": {"unnorm_key": "unnorm_key"},
+     "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
+     "action_gripper": {"index": 6, "open": -1, "closed": 1}}
 
 The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`.
 `states|state` is the first of the two that exists. A name and a key that end with `*` match all

@@ -1,10 +1,10 @@
 """Policies of TorchRL on this server, and served policies as modules of TorchRL.
 
 This module needs the extra "torchrl". A program that starts TorchRL's `ProcessInferenceServer` with
-an `MPTransport` uses this server after one more line:
+an `MPTransport` uses this server after two more lines:
 
-    from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as
-    MPTransport
+    from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer
+    from vlagents_ray_learn.torchrl import ServerAddress as MPTransport
 
 `ServedPolicy` is the module that TorchRL's collectors call; docs/evaluation/torchrl.md has an
 example.

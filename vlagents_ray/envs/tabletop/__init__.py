@@ -6,8 +6,9 @@ Base frame: origin in the middle of the table's surface, x to the right in the i
 the camera, z up; metres. The camera "front" looks down at an elevation of 70 degrees without
 perspective: the view's shorter side spans 0.66 m and the origin lies in the image's centre, so that
 
-    u = width / 2 + s * x,   v = height / 2 - s * (y * sin 70° + z * cos 70°),   s = min(width,
-    height) / 0.66 m
+    s = min(width, height) / 0.66  # pixels per metre
+    u = width / 2 + s * x
+    v = height / 2 - s * (y * sin(elevation) + z * cos(elevation))
 
 The camera "wrist" shows an enlarged third of that image, with the fingertips in its centre.
 """

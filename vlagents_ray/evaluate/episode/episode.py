@@ -1,8 +1,8 @@
-"""The loop of episodes: environments and an agent play against each other. Plain Python, no Ray.
+"""The loop of episodes, in which an agent acts in environments. It does not need Ray.
 
-The episodes of a batch are played in lockstep: at each step, one request to the policy serves all
-that need an answer. A single environment is a batch of one. Each episode has the same result as if
-it were played alone, except for the times.
+The episodes of a batch run in lockstep: at each step, one request to the policy contains the
+observations of all environments that need an action. A single environment is a batch of one. Each
+episode has the same result as if it ran alone, except for the times.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ class EvalCase:
 
     @cached_property
     def place(self) -> str:
-        """Fingerprint of the environment; a worker plays cases with the same value without
+        """Fingerprint of the environment; a worker runs cases with the same value without
         making another one.
         """
         return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])

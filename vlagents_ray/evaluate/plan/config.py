@@ -558,7 +558,7 @@ class EvalConfig(_PlanModel):
 
     @property
     def real_robot(self) -> RobotConfig | None:
-        """The robot, if the plan is played on one; else None."""
+        """The robot, if the episodes run on a real one; otherwise None."""
         return self.robot if self.robot is not None and self.robot.arm is not None else None
 
 

@@ -35,7 +35,7 @@ class Job:
     key: EpisodeKey
     case: EvalCase
     attempt: int = 1
-    # Whether it is played without others in its simulator, so that an error names this episode.
+    # Whether it runs without others in its simulator, so that an error names this episode.
     alone: bool = False
 
     def again(self, *, alone: bool = False) -> Job:
@@ -78,7 +78,7 @@ class JobQueue:
         """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job
         of its kind waits.
 
-        They are of one case, as many as it plays at once. A worker keeps its env while that has
+        They are of one case, as many as run at once. A worker keeps its env while that has
         episodes; then it takes the place with the most waiting jobs for each worker, by `working`,
         the number of busy workers at each place.
         """
@@ -131,7 +131,7 @@ class JobQueue:
         ]
 
     def _first(self, place: str) -> tuple[Job, ...]:
-        """Take the first job at a place, and those that may be played together with it."""
+        """Take the first job at a place, and those that may run together with it."""
         jobs = self._waiting[place]
         first = jobs.popleft()
         taken = [first]

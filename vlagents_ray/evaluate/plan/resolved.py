@@ -51,12 +51,12 @@ class TimeLimits:
 class ResolvedPlan:
     """Everything that is decided before the first episode; only `resolve` makes it.
 
-    Whatever plays, records or shows the episodes takes this value, and resolves nothing again.
+    All code that runs, records or shows the episodes uses this value, and resolves nothing again.
     """
 
     # Each has its policy, checkpoint, environment, seeds, worker settings and fingerprint.
     cases: tuple[EvalCase, ...]
-    # Ray actors that play, each with an environment; 0: this process plays, without Ray.
+    # Ray actors, each with an environment; with 0, the episodes run in this process without Ray.
     workers: int
     limits: TimeLimits
     retries: int  # further attempts at an episode after an infrastructure failure
@@ -99,7 +99,7 @@ def resolve(config: EvalConfig, workers: int | None = None) -> ResolvedPlan:
     cases = tuple(plan_cases(config))
     require_envs(cases)
     settings = config
-    if config.real_robot is not None:  # its trials are played in this process
+    if config.real_robot is not None:  # its trials run in this process
         workers = 0
     else:
         workers = chosen_workers(config, cases) if workers is None else workers
@@ -135,10 +135,10 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
     """Return `config.workers` or, if that is None, 0 for a short evaluation that needs no Ray, else
     1.
 
-    A single worker plays one episode after another, as this process does, so that Ray adds its
-    start and a message to each act. In return a simulator that crashes or hangs is replaced, which
-    a long evaluation needs. Ray is also chosen if this process is in a cluster or `RAY_ADDRESS`
-    names one, and for workers with a GPU.
+    A single worker runs one episode after another, as this process does, so that Ray adds its
+    start and a message to each call of the policy. In return, a simulator that crashes or hangs is
+    replaced, which a long evaluation needs. Ray is also chosen if this process is in a cluster or
+    `RAY_ADDRESS` names one, and for workers with a GPU.
 
     Args:
         config: The configuration; its policies need not be resolved.
@@ -166,7 +166,7 @@ def chosen_workers(config: EvalConfig, cases: Sequence[EvalCase]) -> int:
 
 
 def _reasons_for_ray(config: EvalConfig, cases: Sequence[EvalCase]) -> list[str]:
-    """Return why the evaluation cannot be played without Ray, one reason an entry."""
+    """Return why the evaluation cannot run without Ray, one reason an entry."""
     reasons = []
     for policy in config.policies:
         for url in (policy.url, policy.source):
