@@ -70,6 +70,17 @@ def test_the_tests_that_a_page_names_exist(page: Path) -> None:
     assert named or page.name != "guarantees.md"
 
 
+def test_the_tables_of_tests_that_contributing_names_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    tables = re.findall(r"`([A-Z_]{4,})`(?=[^|;]*? of `(tests/[\w/]+\.py)`)", text)
+    missing = []
+    for table, file in tables:
+        if not re.search(rf"^{table}\b.* = ", (ROOT / file).read_text(), re.MULTILINE):
+            missing.append(f"{table} of {file}")
+    assert missing == []
+    assert len(tables) >= 6
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_commands_on_a_page_are_such_as_the_command_line_takes(page: Path) -> None:
     for line, whole in commands(page.read_text()):
