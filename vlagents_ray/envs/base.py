@@ -147,7 +147,8 @@ class EvalEnv(Environment):
         """Check that a task exists, as far as that is possible without the simulator.
 
         Args:
-            task: The part of the env's name after the first slash; None if it has none.
+            task: The part of the env's name after the first slash; None if it has none, which is
+                no error where the constructor has a default.
 
         Raises:
             UnknownEnv: The task does not exist.
