@@ -63,6 +63,9 @@ NOT_RUN = {
     "vlagents-ray serve my_policies:Reach --set gain=0.3": (
         "test_served_pages.py serves examples/own_policy.py so"
     ),
+    "vlagents-ray serve reach:Reach": (
+        "it serves until Ctrl-C; test_weights_endpoint.py serves the page's policy"
+    ),
     "vlagents-ray venv create hf --out .venv-hf": "it downloads packages",
     "vlagents-ray venv create openpi --out .venv-openpi": "it downloads packages",
     "vlagents-ray venv create rcs": "it downloads packages",

@@ -5,9 +5,12 @@ it.
 from __future__ import annotations
 
 import json
+import runpy
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -16,6 +19,7 @@ import pytest
 from asgi_server import served
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
+from readme_blocks import DOCS, blocks, run
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
@@ -37,7 +41,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent, Obs, TrainableAgent
 from vlagents_ray.protocol.frames import read_error
-from vlagents_ray.protocol.messages import MessageLimits
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits
 from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
@@ -89,7 +93,8 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
         engine.start()
         context = PartContext(engine, "this", "here", dict, slow_s=slow_s, open_to_network=insecure)
         part = WeightsPart(PartConfig(), context)
-        inside = build_http_app(engine, dict, MessageLimits(), more=part.routes())
+        about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}
+        inside = build_http_app(engine, lambda: about, MessageLimits(), more=part.routes())
         server = served(AccessMiddleware(inside, keys, "app"))
         opened.extend((server, engine))
         return SimpleNamespace(url=f"http://127.0.0.1:{server.__enter__()}", engine=engine)
@@ -132,6 +137,18 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
     assert held["offset"].tolist() == [0, 0]  # no session has begun since
     newest = server.engine.models.own_weights.newest.values
     assert (newest["gain"][0], newest["gain"][-1], newest["offset"][0]) == (1, 1, 1)
+
+
+def test_the_first_example_of_the_page_prints_what_it_shows(
+    serving: Serving, tmp_path: Path
+) -> None:
+    page = blocks((DOCS / "weights.md").read_text())
+    [example] = [block for block in page if "RemoteAgent(" in block.source]
+    [definition] = [block for block in page if "class Reach(" in block.source]
+    (tmp_path / "reach.py").write_text(definition.source)
+    server = serving(runpy.run_path(str(tmp_path / "reach.py"))["Reach"]())
+    host = server.url.removeprefix("http://")
+    run(replace(example, server="reach:Reach", not_run=None), tmp_path, host, page="weights")
 
 
 def test_values_that_are_received_are_not_copied_again(

@@ -109,8 +109,9 @@ class Publisher(AbstractContextManager["Publisher"]):
             values: The values by the names of `Trainable.parameters`: numpy or JAX arrays or torch
                 tensors, e.g. a `state_dict`. They are copied before this returns, so that the
                 learner can continue.
-            mode: When sessions change to the version: at their next reset ("next_episode"), or
-                between two calls of the policy ("keep").
+            mode: When sessions that follow the newest version change to it: at their next reset
+                ("next_episode"), or between two calls of the policy ("keep"). Robots follow only if
+                they reset with `weights="follow"`.
             partial: Whether names may be missing, as when only adapters are trained. Their values
                 do not change.
             allow_same: Whether all values may equal those of the policy.
