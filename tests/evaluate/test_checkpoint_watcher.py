@@ -79,6 +79,7 @@ def test_half_a_checkpoint_is_never_taken_and_a_whole_one_is(write: Write, tmp_p
         assert watcher.scan(now) == []
     assert moments > 3
     assert watcher.scan(now + 9) == []
+    assert watcher.waiting() == {100: "changed less than 10 s ago"}
     assert watcher.scan(now + 20) == [100]
     assert watcher.scan(now + 99) == [], "each is told once"
 

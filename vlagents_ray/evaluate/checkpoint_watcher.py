@@ -132,7 +132,8 @@ class CheckpointWatcher:
         if self._marker is not None:
             state.why = "" if (entry / self._marker).exists() else f"has no {self._marker}"
         else:
-            state.why = "" if now - state.since >= self._settle_s else "is too new, or changes"
+            settled = now - state.since >= self._settle_s
+            state.why = "" if settled else f"changed less than {self._settle_s:g} s ago"
         if state.why:
             return False
 
