@@ -1,1 +1,1 @@
-"""The rollout workers: Ray actors that play episodes."""
+"""The rollout workers: Ray actors that run episodes."""

@@ -1,4 +1,4 @@
-"""The workers that play episodes: their interface, and the state of one."""
+"""The workers that run episodes: their interface, and the state of one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WorkerHandle:
     actor: Any
     starting: Any  # ObjectRef of `ready()`; None once the worker runs
     started_at: float  # time of its start
-    jobs: tuple[Job, ...] = ()  # the jobs that it plays, all of one case
+    jobs: tuple[Job, ...] = ()  # the jobs that it runs, all of one case
     running: Any = None  # ObjectRef of `run(jobs)`
     env_place: str | None = None  # the place of its environment
     query: Any = None  # ObjectRef of `progress()`
@@ -42,7 +42,7 @@ class WorkerHandle:
 
 
 class Workers(contextlib.AbstractContextManager["Workers"]):
-    """The workers of an evaluation, wherever they play. Use it as a context manager, whose end
+    """The workers of an evaluation, wherever they run. Use it as a context manager, whose end
     ends them.
     """
 
@@ -69,7 +69,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     @property
     def busy(self) -> bool:
-        """Whether any worker plays."""
+        """Whether any worker runs an episode."""
         return any(worker.jobs for worker in self._workers)
 
     def kinds(self, *, occupied: bool = True) -> Counter[str]:
@@ -92,11 +92,11 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     @abstractmethod
     def start(self, case: EvalCase) -> None:
-        """Start one more worker that can play `case`."""
+        """Start one more worker that can run `case`."""
 
     @abstractmethod
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Play `jobs` on `worker`, side by side."""
+        """Run `jobs` on `worker`, in lockstep."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:

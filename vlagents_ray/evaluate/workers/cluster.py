@@ -136,7 +136,8 @@ class CapacityMonitor:
     """Decides whether an evaluation continues while the cluster has no room for some of its
     workers.
 
-    It continues as long as other workers play: a worker's node may have been lost, and may return.
+    It continues as long as other workers run: a worker's node may have been lost, and may
+    return.
     """
 
     def __init__(self, workers: int, place_s: float, now: Callable[[], float] = monotonic) -> None:
@@ -150,11 +151,11 @@ class CapacityMonitor:
         self._workers = workers
         self._place_s = place_s
         self._now = now
-        self._last_played = now()  # time at which an episode was last being played
+        self._last_played = now()  # time at which an episode last ran
         self._warned = False  # whether the user was warned that there is no room for all
 
     def note_playing(self) -> None:
-        """Note that an episode is being played."""
+        """Note that an episode runs."""
         self._last_played = self._now()
 
     def note_started(self) -> None:
@@ -168,7 +169,7 @@ class CapacityMonitor:
     def report_shortage(self, worker: WorkerConfig, running: int) -> None:
         """Warn that a worker has waited too long while `running` run.
 
-        Raises `ConfigError` if no episode is played either.
+        Raises `ConfigError` if no episode runs either.
         """
         idle_too_long = self.timed_out(self._last_played)
         if self._warned and not idle_too_long:

@@ -28,11 +28,11 @@ _STACK_LINES = 6  # the innermost three calls
 
 
 class InProcessWorkers(Workers):
-    """One worker, which plays while it is waited for.
+    """One worker, which runs its episodes in `wait`.
 
     A call that hangs is reported, but no time limit can end it. A signal ends it, with
-    `KeyboardInterrupt`: the thread that plays is the one that would look at the event of
-    `stop_signals`.
+    `KeyboardInterrupt`: the thread that runs the episodes is the one that would read the event
+    of `stop_signals`.
     """
 
     def __init__(

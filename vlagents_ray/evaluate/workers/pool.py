@@ -191,7 +191,7 @@ class WorkerPool(Workers):
             yield from zip(jobs, self._reports(worker, ref), strict=True)
 
     def _reports(self, worker: WorkerHandle, ref: Any) -> list[Report]:
-        """Return the reports of a worker that has played its jobs; kill it if it broke."""
+        """Return the reports of a worker that has run its jobs; kill it if it broke."""
         jobs, worker.jobs, worker.running = worker.jobs, (), None
         try:
             reports: list[Report] = ray.get(ref)

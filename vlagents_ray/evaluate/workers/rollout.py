@@ -112,7 +112,7 @@ class Rollout:
         self._env_place: str | None = None  # `EvalCase.place` of the environment
         self._repeatable = True  # whether every second pass so far repeated its episode
         self._surplus = 0  # successes over failures in this environment
-        self._thread = 0  # id of the thread that plays
+        self._thread = 0  # id of the thread that runs episodes
         self._current_phase: tuple[episode.Phase, float, int] = ("idle", monotonic(), 0)
 
     def ready(self, credentials: Credentials) -> dict[str, Any]:
@@ -239,7 +239,7 @@ class Rollout:
     def _finish_recording(
         self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder
     ) -> Artifacts:
-        """Return the artifacts of an episode; if images are missing, play it again."""
+        """Return the artifacts of an episode; if images are missing, run it again."""
         reset_options = job.case.suite.reset_options
         artifacts = recording.finish(
             result,
@@ -252,9 +252,9 @@ class Rollout:
         return artifacts
 
     def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
-        """Return whether each step is rendered as it is played, if only failures need images.
+        """Return whether each step is rendered as it is executed, if only failures need images.
 
-        The alternative is to play the failed episodes again. That saves nothing if the policy gets
+        The alternative is to run the failed episodes again. That saves nothing if the policy gets
         each image, and costs more than it saves if most episodes fail. It is impossible if one
         simulator runs several environments together.
         """
@@ -410,7 +410,7 @@ def _agent(
         connect_timeout_s=limits.connect_s,
         codec=policy.codec,
         priority=priority,
-        # An interrupted episode is played again, so that its result depends only on its key.
+        # An interrupted episode runs again, so that its result depends only on its key.
         resume=False,
     )
 
