@@ -204,7 +204,7 @@ def main(
         known = [client.transport for client in CLIENTS]
         unknown = sorted(set(only) - set(known))
         if unknown:
-            raise ConfigError(f"transports: expected some of {sorted(known)}, got {unknown}")
+            raise ConfigError(f"transports: expected only {sorted(known)}, got {unknown}")
         clients = [client for client in CLIENTS if not only or client.transport in only]
         measured = {
             **measured_on("python -m benchmarks.act_path"),

@@ -333,7 +333,7 @@ def check_plot_file(file: Path | None) -> None:
         return
     if file.suffix not in _SUFFIXES:
         raise ConfigError(
-            f"--plot: got {file.name!r}, want a name that ends in one of {list(_SUFFIXES)}"
+            f"--plot: expected a name that ends in one of {list(_SUFFIXES)}, got {file.name!r}"
         )
     require("matplotlib")
 

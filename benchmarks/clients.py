@@ -47,7 +47,7 @@ def measure_clients(
     node = shutil.which("node")
     if node is None or not (TYPESCRIPT / "dist" / "index.js").exists():
         raise ConfigError(
-            f"clients: want Node.js 18, and `npm ci && npm run build` in {TYPESCRIPT}"
+            f"clients: expected Node.js 18, and `npm ci && npm run build` in {TYPESCRIPT}"
         )
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -95,7 +95,7 @@ def _compiled(folder: Path) -> str:
     except (FileNotFoundError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", error)
         raise ConfigError(
-            f"clients: want what {CLIENTS / 'cpp' / 'README.md'} installs; the compiler: {said}"
+            f"clients: expected what {CLIENTS / 'cpp' / 'README.md'} installs; the compiler: {said}"
         ) from error
     return program
 

@@ -105,10 +105,10 @@ def parse_counts(text: str, option: str) -> list[int]:
         counts = sorted({int(one) for one in parse_list(text)})
     except ValueError as error:
         raise ConfigError(
-            f"{option}: got {text!r}, want numbers with commas between them"
+            f"{option}: expected numbers with commas between them, got {text!r}"
         ) from error
     if not counts or counts[0] < 1:
-        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
+        raise ConfigError(f"{option}: expected numbers from 1 on, got {text!r}")
     return counts
 
 

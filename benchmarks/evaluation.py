@@ -95,7 +95,7 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         if self.episodes % max(1, self.workers):
             raise ConfigError(
-                f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers"
+                f"episodes: expected a multiple of the {self.workers} workers, got {self.episodes}"
             )
 
     def env(self, notes: Path) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def measure_evaluation(
     """
     wanted = list(PEERS) if "all" in peers else peers
     if unknown := set(wanted) - set(PEERS):
-        raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
+        raise ConfigError(f"peers: expected only {list(PEERS)}, or 'all', got {sorted(unknown)}")
     versions = installed(peers_python, list(PEERS)) if wanted and peers_python.is_file() else {}
     scripts = {peer: SCRIPTS / PEERS[peer] for peer in wanted if peer in versions}
     skipped = {
@@ -181,7 +181,7 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     seeds, steps = sorted(note.seed for note in episodes), {note.steps for note in episodes}
     if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
         raise ProcessFailed(
-            f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and "
+            f"{folder.name}: ran {len(episodes)} episodes with {len(set(seeds))} seeds and "
             f"{sorted(steps)} steps, want each of {plan.episodes} once with {plan.max_steps}; its "
             "results stand for something else"
         )

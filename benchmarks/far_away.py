@@ -102,7 +102,7 @@ def run(
     arm.send(json.dumps({"seconds": seconds, **how}))
     begun = arm.read(_START_S)
     if begun != "begun":
-        raise ConfigError(f"the robot: got {begun!r}, want that it begins")
+        raise ConfigError(f"the robot: expected that it begins, got {begun!r}")
     healed = None
     if cut_s:
         time.sleep(cut_after_s)
@@ -203,7 +203,7 @@ def main(
     with errors():
         chosen = modes.split(",")
         if unknown := sorted(set(chosen) - set(MODES)):
-            raise ConfigError(f"--modes: got {unknown}, want some of {list(MODES)}")
+            raise ConfigError(f"--modes: expected only {list(MODES)}, got {unknown}")
         rows = measure(delay_ms, loss, mbit, cut_s, seconds, chosen, congestion, progress)
     shown = table(
         "link",

@@ -398,7 +398,7 @@ def main(
     with errors():
         names = parse_list(systems)
         if unknown := [name for name in names if name not in SYSTEMS]:
-            raise ConfigError(f"--systems: expected some of {list(SYSTEMS)}, got {unknown}")
+            raise ConfigError(f"--systems: expected only {list(SYSTEMS)}, got {unknown}")
         if transport not in TRANSPORTS:
             raise ConfigError(f"--transport: expected one of {list(TRANSPORTS)}, got {transport!r}")
         if delay is not None and link is None:

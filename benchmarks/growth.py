@@ -229,7 +229,7 @@ def main(
     """
     with errors():
         if transport not in TRANSPORTS:
-            raise ConfigError(f"--transport: got {transport!r}, want one of {list(TRANSPORTS)}")
+            raise ConfigError(f"--transport: expected one of {list(TRANSPORTS)}, got {transport!r}")
         check_plot_file(plot)
         origin = measured_on("python -m benchmarks.growth")
         plan = GrowthPlan(

@@ -390,7 +390,7 @@ def main(
         names = parse_list(learners)
         unknown = sorted(set(names) - set(LEARNERS))
         if unknown or not names:
-            raise ConfigError(f"--learners: expected some of {list(LEARNERS)}, got {unknown}")
+            raise ConfigError(f"--learners: expected only {list(LEARNERS)}, got {unknown}")
         numbers = parse_seeds(seeds)
         sizes = Sizes(recorded, steps, iterations, rollouts, held_out, metaworld)
         require("torch").set_num_threads(1)  # of the evaluations; other numbers round differently

@@ -80,8 +80,8 @@ def _without(function: FunctionType, lines: str, instead: str) -> None:
     source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(function)))
     if found_lines != 1:
         raise ConfigError(
-            f"{function.__name__}: got {found_lines} places with the lines for the tap, want 1; "
-            "look there"
+            f"{function.__name__}: expected 1, got {found_lines} places with the lines for the "
+            "tap; look there"
         )
     found: dict[str, Any] = {}
     exec(source, vars(sender), found)  # noqa: S102 - the package's own source

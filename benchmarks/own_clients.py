@@ -99,7 +99,7 @@ def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, st
     wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
     if unknown := set(only) - {one.transport for one in OWN_CLIENTS}:
         known_here = sorted({one.transport for one in OWN_CLIENTS})
-        raise ConfigError(f"transports: got {sorted(unknown)}, want some of {known_here}")
+        raise ConfigError(f"transports: expected only {known_here}, got {sorted(unknown)}")
     skipped = {
         w.name: f"no transport {w.transport!r} in this version"
         for w in wanted

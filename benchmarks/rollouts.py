@@ -113,13 +113,15 @@ class RolloutComparison:
 
     def __post_init__(self) -> None:
         if unknown := set(self.policies) - set(_POLICIES):
-            raise ConfigError(f"policies: got {sorted(unknown)}, want some of {list(_POLICIES)}")
+            raise ConfigError(
+                f"policies: expected only {list(_POLICIES)}, got {sorted(unknown)}"
+            )
         if odd := [envs for envs in self.envs if envs % min(envs, self.workers)]:
             raise ConfigError(
-                f"--envs: got {odd}, want multiples of the {self.workers} workers, or 1"
+                f"--envs: expected multiples of the {self.workers} workers, or 1, got {odd}"
             )
         if self.torchrl not in ("", "grouped", "processes"):
-            raise ConfigError(f"--torchrl: got {self.torchrl!r}, want 'grouped' or 'processes'")
+            raise ConfigError(f"--torchrl: expected 'grouped' or 'processes', got {self.torchrl!r}")
 
     @property
     def options(self) -> dict[str, int]:

@@ -154,7 +154,7 @@ def measure(
         for one in own:
             drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
         if not drivers:
-            raise ConfigError("nothing to measure: want a transport or another server")
+            raise ConfigError("nothing to measure: expected a transport or another server")
         said = {name: driver.ready() for name, driver in drivers.items()}
         meters = metered(drivers)
         found = in_turns(meters, calls, progress)

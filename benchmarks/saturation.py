@@ -96,7 +96,7 @@ def parts(scaling: Mapping[str, Any], load: Load) -> list[dict[str, Any]]:
     rows = [row for row in cluster["rows"] if row["app"] == OWN]
     if len(rows) < 2:
         raise ConfigError(
-            "scaling: got one number of workers, want two on the last cluster: --workers 1,16"
+            "scaling: expected two on the last cluster: --workers 1,16, got one number of workers"
         )
     costs, flooded = scaling["driver"]["costs_ms"], scaling["driver"]["flooded"]
     watched = min(load.workers, QUERIES_PER_S * WATCH_S)  # a second

@@ -69,7 +69,7 @@ class ScalingPlan:
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
             raise ConfigError(
-                f"workers: got {list(self.workers)}, want ascending numbers from 1 on"
+                f"workers: expected ascending numbers from 1 on, got {list(self.workers)}"
             )
 
     @property

@@ -368,7 +368,7 @@ def main(
         chosen = [one.strip() for one in only.split(";")] if only else [way.name for way in ways()]
         if unknown := set(chosen) - {way.name for way in ways()}:
             raise ConfigError(
-                f"--only: got {sorted(unknown)}, want ways of {[way.name for way in ways()]}"
+                f"--only: expected ways of {[way.name for way in ways()]}, got {sorted(unknown)}"
             )
         found, skipped = list[Played](), dict[str, str]()
         for way in ways():
@@ -388,7 +388,7 @@ def main(
             row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]
         ]:
             raise VLAgentsError(
-                f"actions differ in {broken}, want those of {STANDARD!r} to the bit"
+                f"actions differ in {broken}, expected those of {STANDARD!r}, bit-identical"
             )
 
 

@@ -45,7 +45,7 @@ def prepare(source: Path, folder: Path, line: str) -> Path:
     program.
     """
     if not (source / RECIPE / "vla-grpo.py").is_file():
-        raise ConfigError(f"--source: got {source}, want a checkout of TorchRL, with {RECIPE}")
+        raise ConfigError(f"--source: expected a checkout of TorchRL, with {RECIPE}, got {source}")
     shutil.copytree(source / RECIPE, folder)
     text = (folder / "utils.py").read_text()
     if IMPORT not in text:

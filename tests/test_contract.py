@@ -324,7 +324,7 @@ class TestAPolicyOfSeveralPartsServedAsOne:
 @pytest.mark.parametrize(
     ("cls", "wrong", "said"),
     [
-        (CameraSpec, "hight", "CameraSpec: expected some of ['height', 'width'], got ['hight'];"),
+        (CameraSpec, "hight", "CameraSpec: expected only ['height', 'width'], got ['hight'];"),
         (ActionSpec, "horizon", "the rows of a chunk are Contract(chunk=…)"),
         (Contract, "control_hertz", "did you mean 'control_hz'?"),
     ],

@@ -411,9 +411,7 @@ def closed(
     type_names = {field.name: str(field.type) for field in fields(cls)}
     unknown = sorted(str(key) for key in data if key not in type_names)
     if unknown:
-        raise error(
-            f"{where}: expected some of {sorted(type_names)}, got {unknown}; leave these out"
-        )
+        raise error(f"{where}: expected only {sorted(type_names)}, got {unknown}; leave these out")
 
     for name, value in data.items():
         is_of_type = _TYPE_CHECKS.get(type_names[name])

@@ -85,7 +85,7 @@ def explain_unknown_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
 
                 suggestions = "".join(did_you_mean(name, fields) for name in unknown)
                 raise TypeError(
-                    f"{cls.__name__}: expected some of {fields}, got {unknown}{suggestions or hint}"
+                    f"{cls.__name__}: expected only {fields}, got {unknown}{suggestions or hint}"
                 ) from error
 
         cls.__init__ = init  # type: ignore[method-assign, assignment]

@@ -150,7 +150,7 @@ class RecordedDataset:
             missing = sorted(set(chosen) - {episode.index for episode in episodes})
             if missing:
                 raise ConfigError(
-                    f"{self.root}: expected some of its {len(episodes)} episodes, got {missing}"
+                    f"{self.root}: expected only its {len(episodes)} episodes, got {missing}"
                 )
             episodes = [episode for episode in episodes if episode.index in set(chosen)]
         if not self.traced:
@@ -340,8 +340,8 @@ class RecordedDataset:
         unknown = [name for name in names.cameras.values() if name not in features]
         if unknown:
             raise ConfigError(
-                f"--camera-map: expected some of {sorted(dataset_names.values())} of {self.root}, "
-                f"got {unknown[0]!r}{did_you_mean(unknown[0], features)}"
+                f"--camera-map: expected only {sorted(dataset_names.values())} of {self.root}, got "
+                f"{unknown[0]!r}{did_you_mean(unknown[0], features)}"
             )
         return {features[name]: camera for camera, name in names.cameras.items()}
 

@@ -88,7 +88,7 @@ class Slo:
         for name in value:
             if name not in names:
                 hint = did_you_mean(str(name)[:80], names) or "; leave it out"
-                raise ConfigError(f"slo: expected some of {names}, got {shown(name)}{hint}")
+                raise ConfigError(f"slo: expected only {names}, got {shown(name)}{hint}")
         if "hz" not in value:
             raise ConfigError(
                 f"slo: expected hz, got {shown(value)}; give the rate of the control loop"

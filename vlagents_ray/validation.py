@@ -67,8 +67,8 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
         unknown = sorted(set(requested) - set(offered))
         if unknown:
             raise NotOffered(
-                f"info[{WANT!r}]: expected some of {sorted(offered)}, the `behaviour` of the "
-                f"policy's contract, got {unknown}; leave it out, or use a policy that returns it"
+                f"info[{WANT!r}]: expected only {sorted(offered)}, the `behaviour` of the policy's "
+                f"contract, got {unknown}; leave it out, or use a policy that returns it"
             )
 
     if contract is not None and (contract.cameras or contract.state or contract.gripper):

@@ -63,7 +63,8 @@ def write_checkpoint(
     known = FAMILIES.get(family)
     if known is None:
         raise ConfigError(
-            f"family: got {family!r}, want one of {list(FAMILIES)}{did_you_mean(family, FAMILIES)}"
+            f"family: expected one of {list(FAMILIES)}{did_you_mean(family, FAMILIES)}, got "
+            f"{family!r}"
         )
     dtype = dtype or known.dtypes[0]
     if dtype not in known.dtypes:
@@ -79,7 +80,7 @@ def write_checkpoint(
         )
     folder = folder.absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder}: is there already; name a new folder, or remove it")
+        raise ConfigError(f"{folder}: exists already; name a new folder, or remove this one")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         module = importlib.import_module(f"{__package__}.{known.module}")

@@ -86,7 +86,7 @@ def write_weights(
     total, free = sum(map(_size, tensors.values())), shutil.disk_usage(folder).free
     if total > free:
         raise ConfigError(
-            f"{folder}: got {free / 1e9:.1f} GB of free space, want {total / 1e9:.1f} GB"
+            f"{folder}: expected {total / 1e9:.1f} GB, got {free / 1e9:.1f} GB of free space"
         )
     files = _file_names(len(shards))
     generator = require("torch").Generator().manual_seed(0)

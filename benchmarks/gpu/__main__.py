@@ -51,7 +51,7 @@ def main(
     named = [name.strip() for name in steps.split(",") if name.strip()]
     unknown = [name for name in named if name not in STEPS]
     if unknown:
-        raise typer.BadParameter(f"--steps: expected some of {list(STEPS)}, got {unknown}")
+        raise typer.BadParameter(f"--steps: expected only {list(STEPS)}, got {unknown}")
 
     chosen = [run] if run else list(RUNS)
     extras: list[str] = []

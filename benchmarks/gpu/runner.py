@@ -163,7 +163,7 @@ class Runner:
             f"{'all met' if not unmet else f'{len(unmet)} not met'}"
         )
         for check in unmet:
-            typer.echo(f"  {check['name']}: got {check['got']}, want {check['want']}")
+            typer.echo(f"  {check['name']}: expected {check['want']}, got {check['got']}")
 
 
 def planned_seconds(steps: Sequence[Step]) -> float:

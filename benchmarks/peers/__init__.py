@@ -168,7 +168,7 @@ def peer_clients(
     """
     wanted = PEERS if "all" in names else tuple(names)
     if unknown := set(wanted) - set(PEERS):
-        raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
+        raise ConfigError(f"peers: expected only {list(PEERS)}, or 'all', got {sorted(unknown)}")
     found: list[PeerClient] = []
     skipped: dict[str, str] = {}
     versions: dict[str, str] = {}

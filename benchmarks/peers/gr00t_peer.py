@@ -17,7 +17,7 @@ import zmq
 
 def _encode(value: Any) -> Any:
     if not isinstance(value, np.ndarray):
-        raise TypeError(f"got {type(value).__name__}, want an array")
+        raise TypeError(f"expected an array, got {type(value).__name__}")
     file = io.BytesIO()
     np.save(file, value, allow_pickle=False)
     return {"__ndarray_class__": True, "as_npy": file.getvalue()}
@@ -48,7 +48,7 @@ def serve(host: str, port: int, policy: peer.Policy) -> None:
     while True:
         request = from_bytes(socket.recv())
         if request["endpoint"] != "get_action":
-            raise ValueError(f"endpoint: got {request['endpoint']!r}, want 'get_action'")
+            raise ValueError(f"endpoint: expected 'get_action', got {request['endpoint']!r}")
         socket.send(to_bytes([{"arm": policy()[None]}, {}]))
 
 

@@ -32,8 +32,8 @@ def predict_action(policy: peer.Policy, payload: dict[str, Any]) -> JSONResponse
     for name in ("image", "wrist_image"):
         if not isinstance(payload[name], np.ndarray):
             raise TypeError(
-                f"{name}: got {type(payload[name]).__name__}, want an array; is json_numpy patched "
-                "in?"
+                f"{name}: expected an array, got {type(payload[name]).__name__}; is json_numpy "
+                "patched in?"
             )
     (action,) = policy()
     return JSONResponse(json_numpy.dumps(action)) if double_encoded else JSONResponse(action)
@@ -62,7 +62,7 @@ def connect(target: peer.Target) -> peer.Client:
     def act(obs: dict[str, Any]) -> np.ndarray:
         action = requests.post(f"http://{target.host}:{target.port}/act", json=obs).json()  # noqa: S113 - as its users
         if not isinstance(action, np.ndarray):
-            raise TypeError(f"got {action!r}, want an action")
+            raise TypeError(f"expected an action, got {action!r}")
         return action
 
     return peer.Client(lambda: obs, act)

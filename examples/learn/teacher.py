@@ -49,7 +49,9 @@ class Teacher(Agent):
 
     def act(self, obs: Obs) -> Act:
         if self._colour is None:
-            raise NotReset("teacher: act before reset; call reset(obs, instruction) first")
+            raise NotReset(
+                "teacher: act was called before reset; call reset(obs, instruction) first"
+            )
         if "front" not in obs.cameras:
             raise MissingCamera("front", have=obs.cameras)
         if "xyzrpy" not in obs.state:

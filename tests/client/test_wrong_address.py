@@ -36,12 +36,12 @@ def ports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, int]]:
         (
             "http://127.0.0.1:{TLS}",
             ConfigError,
-            "this port speaks TLS; write https://127.0.0.1:{TLS}",
+            "this port expects TLS; write https://127.0.0.1:{TLS}",
         ),
         (
             "http://127.0.0.1:{MUTUAL}",
             ConfigError,
-            "this port speaks TLS; write https://127.0.0.1:{MUTUAL}",
+            "this port expects TLS; write https://127.0.0.1:{MUTUAL}",
         ),
         (
             "https://127.0.0.1:{PLAIN}",

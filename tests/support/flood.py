@@ -141,7 +141,7 @@ class _LeasedChannel:
 
 def _claim(key: bytes) -> _LeasedChannel:
     if key not in LEASED:
-        raise MalformedMessage("plasma: this channel is not leased; ask for one")
+        raise MalformedMessage("plasma: this channel is not leased; request a channel first")
     return _LeasedChannel(key)
 
 

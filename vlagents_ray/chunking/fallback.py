@@ -353,7 +353,7 @@ class Motion:
         action = check_action(action, self._contract)
         if action.ndim != 1:
             raise InvalidAction(
-                f"action: expected a single row (D,), got shape {action.shape}; take one row of "
+                f"action: expected a single row (D,), got shape {action.shape}; pass one row of "
                 "the chunk"
             )
         return action if self._check is None else self._check(action, last)

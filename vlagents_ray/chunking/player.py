@@ -379,7 +379,7 @@ class ChunkPlayer(Agent):
         """Return the action of this tick, (D,) float32."""
         tick = self._tick
         if tick is None:
-            raise NotReset("act before reset; reset first")
+            raise NotReset("act was called before reset; reset first")
         begun = time.monotonic()
         self._tick_begins.append(begun)
         self._motion.tick()

@@ -156,7 +156,7 @@ def _write(name: str, kind: Kind) -> None:
     existing = [str(path) for path in texts if path.exists()]
     if existing:
         raise ConfigError(
-            f"{', '.join(existing)}: there already, and nothing was written; choose another NAME"
+            f"{', '.join(existing)}: already exist, so nothing was written; choose another NAME"
         )
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(

@@ -151,7 +151,7 @@ def export_command(
             if to not in formats:
                 raise ConfigError(
                     f"{folder}: expected a format for a LeRobotDataset, one of {formats}, got "
-                    f"{to!r}; give it with --to"
+                    f"{to!r}; add --to FORMAT"
                 )
             recorded: Path | Results = folder
             export = registered_function("dataset_exports", to)

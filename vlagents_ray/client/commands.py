@@ -51,7 +51,7 @@ class CommandInbox:
         unknown = sorted(set(allow) - set(COMMANDS))
         if unknown:
             raise ConfigError(
-                f"allow: expected some of {list(COMMANDS)}, got {unknown}; leave these out"
+                f"allow: expected only {list(COMMANDS)}, got {unknown}; leave these out"
             )
 
         self.control = RobotControl()  # the control of the last run

@@ -157,7 +157,7 @@ class Connection:
         try:
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 raise ConfigError(
-                    f"{self.url}: speaks protocol {metadata.get('protocol')}, this client "
+                    f"{self.url}: uses protocol {metadata.get('protocol')}, this client "
                     f"{PROTOCOL_VERSION}; upgrade the older of the two"
                 )
             contract = metadata.get("contract")

@@ -176,4 +176,4 @@ def require_plain(url: SplitResult, timeout_s: float) -> None:
         if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):
             return
     port = url.netloc.rpartition("@")[2]
-    raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")
+    raise ConfigError(f"http://{port}: this port expects TLS; write https://{port}")

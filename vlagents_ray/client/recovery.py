@@ -154,7 +154,7 @@ class ClientSession:
         the reset is late.
         """
         if self.episode is None:
-            raise NotReset("act before reset; reset first")
+            raise NotReset("act was called before reset; reset first")
         self.id = request.session = uuid.uuid4().hex
         self.resumed = True
         return self.reset(self.episode)

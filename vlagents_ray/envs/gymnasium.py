@@ -271,7 +271,9 @@ class Gymnasium(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Execute an action, (D,), clipped to the action space; see `EvalEnv.step`."""
         if not self._ready:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+            raise NotReset(
+                f"{self._name}: step was called before reset; call reset(seed=...) first"
+            )
 
         action = one_row(act, self._contract).astype(np.float64)
         if self._unit_actions:

@@ -177,7 +177,9 @@ class SimulatorEnv(EvalEnv):
         """Execute an action, (D,); see `EvalEnv.step`."""
         self._alive()
         if self._steps is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+            raise NotReset(
+                f"{self._name}: step was called before reset; call reset(seed=...) first"
+            )
 
         action = one_row(act, self._contract)
         with failing(self._name, "step"):

@@ -352,7 +352,7 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
             saved = read_values(file)
     except (OSError, MalformedMessage, MemoryError) as error:
         raise ConfigError(
-            f"{folder / WEIGHTS}: is damaged, or of another format ({error}); copy it again"
+            f"{folder / WEIGHTS}: is damaged, or has a different format ({error}); copy it again"
         ) from error
 
     _require_complete(folder, saved, network)
@@ -502,6 +502,6 @@ def _layer(
     if not all(values.to(weight.dtype).isfinite().all() for values in (down, up * scale)):
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: expected values that are finite as {weight.dtype}, got "
-            "NaN or infinity; take an earlier step of the training"
+            "NaN or infinity; use an earlier step of the training"
         )
     return down, up, scale

@@ -492,8 +492,8 @@ class Compilation:
             failures += core.settle(size)
         if failures and self.mode == "require":
             raise ConfigError(
-                f"compile: require: {'; '.join(failures)}; with `compile: true` it would run "
-                "without"
+                f"compile: require: {'; '.join(failures)}; with `compile: true` these parts run "
+                "uncompiled"
             )
         if failures:
             report_uncompiled(f"{size} rows: {'; '.join(failures)}")

@@ -68,7 +68,9 @@ class Random(Agent):
     def act(self, obs: Obs) -> Act:
         """Draw a chunk, (D,) or (chunk, D); with `info["samples"]` also samples of it."""
         if self._rng is None or self._draws is None:
-            raise NotReset("random: act before reset; call reset(obs, instruction, seed=...) first")
+            raise NotReset(
+                "random: act was called before reset; call reset(obs, instruction, seed=...) first"
+            )
         low, high, chunk = self.config.low, self.config.high, self.config.chunk
         shape = (self.config.action_dim,) if chunk == 1 else (chunk, self.config.action_dim)
         act = Act(self._rng.uniform(low, high, shape).astype(np.float32))

@@ -57,6 +57,6 @@ class Scripted(Agent):
         """Return the action of the session's expert, (D,)."""
         if self._expert is None:
             raise NotReset(
-                "scripted: act before reset; call reset(obs, instruction, env=...) first"
+                "scripted: act was called before reset; call reset(obs, instruction, env=...) first"
             )
         return self._expert.act(obs)

@@ -132,7 +132,7 @@ class MotionLimits:
         unknown = sorted(set(document) - known_keys)
         if unknown:
             suggestions = "".join(did_you_mean(str(key), known_keys) for key in unknown)
-            raise ConfigError(f"expected some of {sorted(known_keys)}, got {unknown}{suggestions}")
+            raise ConfigError(f"expected only {sorted(known_keys)}, got {unknown}{suggestions}")
         if not isinstance(document.get("joints", []), list):
             raise ConfigError(f"joints: expected a list of names, got {document['joints']!r}")
 

@@ -363,7 +363,9 @@ class ModelWeights:
                     f"{number}, as another push was faster; push again"
                 )
             if self._staged is not None:
-                raise Overloaded("weights: another push is under way; push again when it is over")
+                raise Overloaded(
+                    "weights: another push is in progress; push again when it has ended"
+                )
             self._staged = placeholder
         try:
             with self._uncaptured(pushed):
@@ -773,7 +775,7 @@ class WeightUpdates:
 
     def _sleep(self, weights: ModelWeights, rest: Rest) -> None:
         if self._asleep is not None:
-            raise Overloaded("sleep: the policy sleeps already; call wake first")
+            raise Overloaded("sleep: the policy is already asleep; call wake first")
         self.acting_lock.acquire()
         try:
             weights.sleep(offload=rest.offload)

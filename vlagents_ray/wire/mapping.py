@@ -621,7 +621,7 @@ class KeyMapping:
         known = [*camera_keys, *state_keys, *self._gripper_keys()]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
-                f"observation: expected some of {known}, which the mapping reads, got "
+                f"observation: expected at least one of {known}, which the mapping reads, got "
                 f"{keys(flat)}; choose the preset of this client, or change the mapping"
             )
 

@@ -21,7 +21,7 @@ function apply(action) {
   void action; // send it to the robot
 }
 
-// A robot wants an answer soon or none: with a time to answer of its own, and without the wait of a server that starts.
+// A late answer is of no use to a robot: this agent has a short time limit, and does not wait for a server that starts.
 const player = new ChunkPlayer(new RemoteAgent(url, { timeoutMs: 3000 }), { ahead: 2 });
 let slowestMs = 0;
 let tick = 0;

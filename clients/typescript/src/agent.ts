@@ -23,7 +23,7 @@ export interface Options {
   transport?: "websocket" | "http";
   /** Whether a session that was lost is begun again; otherwise its error is thrown. */
   resume?: boolean;
-  /** What the robot gives and takes: the server refuses a reset if its policy does not fit. */
+  /** The robot's observations and actions. The server rejects a reset if its policy does not fit them. */
   contract?: Json;
 }
 
@@ -63,7 +63,7 @@ export class RemoteAgent {
   constructor(url: string, options: Options = {}) {
     const address = /^(http|ws)(s?):\/\/[^/?#]+[^?#]*$/.exec(url);
     if (address === null) {
-      throw new InvalidInput(`url: got '${url}', want one like http://gpu-box:8000`, "invalid_input");
+      throw new InvalidInput(`url: expected a URL such as http://gpu-box:8000, got '${url}'`, "invalid_input");
     }
     const key = options.key ?? process.env["VLAGENTS_RAY_API_KEY"];
     this.server = {
@@ -104,7 +104,7 @@ export class RemoteAgent {
   async act(obs: Obs, timeoutMs = this.options.timeoutMs): Promise<Answer> {
     return this.alone(async () => {
       const episode = this.episode;
-      if (episode === undefined) throw new NotReset("act before reset; call reset with the first observation", "not_reset");
+      if (episode === undefined) throw new NotReset("act was called before reset; call reset with the first observation", "not_reset");
       const ends = Date.now() + timeoutMs;
       let resumed = false;
       try {
@@ -220,7 +220,7 @@ export class RemoteAgent {
 
   private async alone<T>(call: () => Promise<T>): Promise<T> {
     if (this.busy) {
-      throw new InvalidInput("another call of this agent is not over; await it, or take an agent for each robot", "invalid_input");
+      throw new InvalidInput("another call of this agent is still running; await it, or create an agent for each robot", "invalid_input");
     }
     this.busy = true;
     try {

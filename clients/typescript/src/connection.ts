@@ -68,7 +68,7 @@ async function readMetadata(server: Server, timeoutMs: number): Promise<Metadata
   try {
     metadata = JSON.parse(text);
   } catch {
-    throw new VLAgentsError(`${server.url}/v1/metadata: got no JSON; is this a server of vlagents_ray?`);
+    throw new VLAgentsError(`${server.url}/v1/metadata: expected JSON, got something else; is this a server of vlagents_ray?`);
   }
   const protocol = (metadata as Metadata | null)?.protocol;
   if (protocol !== PROTOCOL_VERSION) {
@@ -161,7 +161,7 @@ class WebSocketConnection implements Connection {
     const id = request.request_id ?? `${++this.count}`;
     const frame = encodeRequests([{ ...request, request_id: id }]);
     if (frame.length > MESSAGE_BYTES) {
-      const detail = `message: got ${frame.length} bytes, the limit of a WebSocket is ${MESSAGE_BYTES}; send JPEG files`;
+      const detail = `message: expected at most ${MESSAGE_BYTES} bytes over a WebSocket, got ${frame.length}; send JPEG files`;
       return Promise.reject(errorOf("too_large", detail));
     }
     return new Promise((resolve, reject) => {

@@ -77,11 +77,11 @@ export function pack(header: { [key: string]: Json }, blobs: readonly Uint8Array
 
 /** Return the header of a frame, and views of its blobs. */
 export function unpack(frame: Uint8Array): { header: Record<string, unknown>; blobs: Uint8Array[] } {
-  if (frame.length < PREFIX) throw malformed(`frame: got ${frame.length} bytes, want at least ${PREFIX}`);
+  if (frame.length < PREFIX) throw malformed(`frame: expected at least ${PREFIX} bytes, got ${frame.length}`);
   const magic = String.fromCharCode(...frame.subarray(0, 3));
-  if (magic !== "VLA") throw malformed(`frame: got ${show(magic)} at its start, want "VLA"`);
+  if (magic !== "VLA") throw malformed(`frame: expected "VLA" at its start, got ${show(magic)}`);
   if (frame[3] !== PROTOCOL_VERSION) {
-    throw malformed(`frame: got version ${frame[3]}, this side speaks ${PROTOCOL_VERSION}; upgrade the older`);
+    throw malformed(`frame: expected version ${PROTOCOL_VERSION} of the protocol, got ${frame[3]}; upgrade the older side`);
   }
   const length = new DataView(frame.buffer, frame.byteOffset).getUint32(4, true);
   let at = PREFIX + length;
@@ -113,7 +113,7 @@ export function decodeReplies(frame: Uint8Array): Reply[] {
   const { header, blobs } = unpack(frame);
   const nodes = header["replies"] ?? [header];
   if (!Array.isArray(nodes) || nodes.length === 0 || !nodes.every(isObject)) {
-    throw malformed(`replies: got ${show(nodes)}, want a list of replies`);
+    throw malformed(`replies: expected a list of replies, got ${show(nodes)}`);
   }
   return nodes.map((node) => readReply(node, new ValueReader(blobs)));
 }
@@ -161,12 +161,12 @@ function readReply(node: Record<string, unknown>, reader: ValueReader): Reply {
 
 function readAct(act: unknown, reader: ValueReader): Act {
   if (!isObject(act) || typeof act["done"] !== "boolean" || !isObject(act["info"])) {
-    throw malformed(`reply: got ${show(act)}, want action, done and info`);
+    throw malformed(`reply: expected action, done and info, got ${show(act)}`);
   }
   const action = reader.array(act["action"]);
   const { data, shape } = action;
   if (!(data instanceof Float32Array) || shape.length < 1 || shape.length > 2 || data.length === 0) {
-    throw malformed(`action: got ${action.dtype} of shape [${shape}], want <f4 of [D] or [H, D], neither 0`);
+    throw malformed(`action: expected <f4 of shape [D] or [H, D] without an axis of 0, got ${action.dtype} of shape [${shape}]`);
   }
   const width = shape[shape.length - 1] ?? 0;
   const height = shape.length === 2 ? (shape[0] ?? 0) : 1;

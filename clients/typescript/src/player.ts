@@ -63,7 +63,7 @@ export class ChunkPlayer {
   constructor(private readonly agent: RemoteAgent, private readonly options: PlayerOptions = {}) {
     const { ahead = 0 } = options;
     if (!Number.isInteger(ahead) || ahead < 0) {
-      throw new InvalidInput(`ahead: got ${ahead}, want a whole number of rows from 0 on`, "invalid_input");
+      throw new InvalidInput(`ahead: expected a whole number of rows, 0 or more, got ${ahead}`, "invalid_input");
     }
   }
 
@@ -139,7 +139,7 @@ export class ChunkPlayer {
     const asked = this.asked;
     this.asked = undefined;
     this.plan = await asked!;
-    if (this.plan.answer.rows.length === 0) throw new InvalidInput("act: got a chunk without rows", "invalid_action");
+    if (this.plan.answer.rows.length === 0) throw new InvalidInput("act: expected a chunk with rows, got an empty one", "invalid_action");
   }
 
   private async settled(): Promise<void> {

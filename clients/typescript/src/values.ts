@@ -33,7 +33,7 @@ export class NdArray {
 
   constructor(dtype: DType, shape: readonly number[], data: TypedArray) {
     if (!(data instanceof VIEWS[dtype]) || data.length !== shape.reduce((all, n) => all * n, 1)) {
-      throw new InvalidInput(`array: got ${data.length} values, want ${VIEWS[dtype].name} of shape [${shape}]`, "invalid_input");
+      throw new InvalidInput(`array: expected the values of ${VIEWS[dtype].name} of shape [${shape}], got ${data.length} values`, "invalid_input");
     }
     this.dtype = dtype;
     this.shape = shape;
@@ -80,7 +80,7 @@ export class ValueWriter {
     const { height, width, data } = value;
     if (!(data instanceof Uint8Array) || data.length !== height * width * 3) {
       throw new InvalidObservation(
-        `camera '${name}': got ${data?.length} bytes, want ${height} x ${width} x 3 of RGB, or new ImageFile(bytes)`,
+        `camera '${name}': expected ${height} x ${width} x 3 bytes of RGB, or new ImageFile(bytes), got ${data?.length}`,
         "invalid_observation",
       );
     }
@@ -101,11 +101,11 @@ export class ValueWriter {
     if (value instanceof Int32Array) return this.array(new NdArray("<i4", [value.length], value));
     if (Array.isArray(value)) return value.map((item) => this.value(item));
     if (typeof value === "object" && Object.getPrototypeOf(value) === Object.prototype) {
-      if (Object.hasOwn(value, "$")) throw new InvalidInput("info: got the key '$', which the protocol uses", "invalid_input");
+      if (Object.hasOwn(value, "$")) throw new InvalidInput("info: expected no key '$', which the protocol uses, got it; rename the key", "invalid_input");
       const pairs = Object.entries(value).filter(([, item]) => item !== undefined);
       return Object.fromEntries(pairs.map(([key, item]) => [key, this.value(item)]));
     }
-    throw new InvalidInput(`info: got ${String(value).slice(0, 40)}, want null, boolean, number, text, bytes, array, list or object`, "invalid_input");
+    throw new InvalidInput(`info: expected null, boolean, number, text, bytes, array, list or object, got ${String(value).slice(0, 40)}`, "invalid_input");
   }
 
   private blob(bytes: Uint8Array): number {
@@ -125,7 +125,7 @@ export class ValueReader {
 
   value(node: unknown, depth = 0): Value {
     if (node === null || typeof node !== "object") return node as Value;
-    if (depth > MAX_DEPTH) throw malformed(`JSON: got more than ${MAX_DEPTH} levels`);
+    if (depth > MAX_DEPTH) throw malformed(`JSON: expected at most ${MAX_DEPTH} levels, got more`);
     if (Array.isArray(node)) return node.map((item) => this.value(item, depth + 1));
     if (Object.hasOwn(node, "$")) return this.reference(node as { $: unknown });
     const found: { [key: string]: Value } = {};
@@ -139,7 +139,7 @@ export class ValueReader {
   /** Return the array to which a node refers. */
   array(node: unknown): NdArray {
     const found = this.value(node);
-    if (!(found instanceof NdArray)) throw malformed(`reference: got ${show(node)}, want an array`);
+    if (!(found instanceof NdArray)) throw malformed(`reference: expected an array, got ${show(node)}`);
     return found;
   }
 
@@ -153,13 +153,13 @@ export class ValueReader {
     if (kind === "bin" && reference.length === 2) return new Uint8Array(this.blob(first));
     if (kind === "img" && reference.length === 2) return new ImageFile(new Uint8Array(this.blob(first)));
     if (kind === "nd" && reference.length === 4) return readArray(this.blob(first), dtype, shape);
-    throw malformed(`reference: got ${show(node)}, want 'nd', 'img', 'bin' or 'float'`);
+    throw malformed(`reference: expected 'nd', 'img', 'bin' or 'float', got ${show(node)}`);
   }
 
   private blob(index: unknown): Uint8Array {
     const found = typeof index === "number" && Number.isInteger(index) ? this.blobs[index] : undefined;
     if (found === undefined) {
-      throw malformed(`reference: got blob ${show(index)}, want a number below ${this.blobs.length}`);
+      throw malformed(`reference: expected a blob below ${this.blobs.length}, got ${show(index)}`);
     }
     this.left -= found.length;
     if (this.left < 0) throw malformed(`reference: the blobs named take more than ${COPIED_BYTES} bytes`);
@@ -170,15 +170,15 @@ export class ValueReader {
 function readArray(data: Uint8Array, dtype: unknown, shape: unknown): NdArray {
   if (littleEndian === false) throw malformed("arrays: this machine is big-endian, which is not supported");
   if (typeof dtype !== "string" || !Object.hasOwn(VIEWS, dtype)) {
-    throw malformed(`array: got type ${show(dtype)}, want one like '<f4' or '|u1'`);
+    throw malformed(`array: expected a type such as '<f4' or '|u1', got type ${show(dtype)}`);
   }
   const View = VIEWS[dtype as DType];
   if (!Array.isArray(shape) || shape.length > 32 || !shape.every((n) => Number.isInteger(n) && n >= 0)) {
-    throw malformed(`array: got shape ${show(shape)}, want at most 32 non-negative integers`);
+    throw malformed(`array: expected at most 32 non-negative integers, got shape ${show(shape)}`);
   }
   const sizes = shape as number[];
   if (sizes.reduce((all, n) => all * n, View.BYTES_PER_ELEMENT) !== data.length) {
-    throw malformed(`array: got ${data.length} bytes, want [${sizes}] of ${dtype}`);
+    throw malformed(`array: expected the bytes of [${sizes}] ${dtype}, got ${data.length}`);
   }
   const copy = new Uint8Array(data); // typed arrays must begin at a multiple of their size; `slice` of a Buffer copies nothing
   return new NdArray(dtype as DType, sizes, new View(copy.buffer, 0, data.length / View.BYTES_PER_ELEMENT));

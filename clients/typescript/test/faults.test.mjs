@@ -18,7 +18,7 @@ import { answer, fail, fakeServer, LONG_MS, reply, thrown, with_ } from "./fake-
 
 const golden = new URL("../../golden/", import.meta.url);
 
-test("a wrong url, and act before reset, are refused without a server", async () => {
+test("a wrong url, and a call of act before reset, are rejected without a server", async () => {
   assert.throws(() => new RemoteAgent("gpu-box:8000"), InvalidInput);
   await thrown(new RemoteAgent("http://127.0.0.1:9").act({}), NotReset, "not_reset");
 });

@@ -52,7 +52,7 @@ class ObservationMapping:
         robots = {_short(key): key for key in shapes if key.startswith(_IMAGE)}
         if unknown := [name for name in config.cameras.values() if name not in robots]:
             raise ConfigError(
-                f"policy.cameras: expected some of the cameras here, {sorted(robots)}, got "
+                f"policy.cameras: expected only the cameras here, {sorted(robots)}, got "
                 f"{unknown[0]!r}{did_you_mean(unknown[0], robots)}"
             )
         known = {name: key for name, key in robots.items() if name not in config.cameras.values()}

@@ -589,7 +589,7 @@ class Arro(Wrapper):
     def _begun(self) -> dict[str, Track]:
         """Return the tracks by camera; raises `NotReset` before the first episode."""
         if self.tracks is None:
-            raise NotReset("arro: act before reset; call reset(obs, instruction) first")
+            raise NotReset("arro: act was called before reset; call reset(obs, instruction) first")
         return self.tracks
 
 

@@ -67,7 +67,7 @@ def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_le
     measured = tuner(dtypes=["bfloat16", "float16", "auto"], off=5.0, compile=True)
     assert {point.variant.name for point in measured.measure()} == {"own settings"}
     refused, crashed = measured.left_out
-    assert refused.startswith("dtype: bfloat16: refused, as actions differ by")
+    assert refused.startswith("dtype: bfloat16: rejected, as actions differ by")
     assert crashed == "dtype: float16: ended with exit status 7"
 
 

@@ -108,7 +108,7 @@ class ClientReader:
             while missing:
                 wait_s = min(silent_s, deadline - time.monotonic())
                 if wait_s <= 0:
-                    raise MessageTooLarge("a message took longer than a client may take")
+                    raise MessageTooLarge("a message took longer than the time limit of a client")
 
                 self._connection.settimeout(wait_s)
                 received = self._connection.recv(min(missing, _READ_BYTES))
@@ -126,8 +126,8 @@ class ClientReader:
             data, self._data = self._data, memoryview(b"")
             if self._is_given_up:
                 raise Overloaded(
-                    "the messages in flight leave no room for one that arrives slowly; send it "
-                    "again"
+                    "the messages in flight leave too little memory for a message that arrives "
+                    "this slowly; send it again"
                 )
         return data
 

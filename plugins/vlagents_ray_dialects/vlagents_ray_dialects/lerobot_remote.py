@@ -443,7 +443,7 @@ class Offer:
         required = body.get("required_capabilities", [])
         if not isinstance(required, list) or not set(map(str, required)) <= set(MERGES):
             raise UnsupportedRequest(
-                f"required_capabilities: expected some of {list(MERGES)}, got {shown(required)}"
+                f"required_capabilities: expected only {list(MERGES)}, got {shown(required)}"
             )
         settings = body.get("chunk_settings", {})
         if not isinstance(settings, dict):

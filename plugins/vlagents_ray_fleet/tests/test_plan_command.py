@@ -96,7 +96,7 @@ def test_too_few_gpus_are_an_exit_status_and_a_sentence_with_the_missing_ones(fi
         ("rows: 50", "row: 50", "there is no such setting; expected one of .*did you mean 'rows'"),
         ("hz: 10 ", "hz: 0 ", r"robots\.arms\.hz: expected greater than 0, got 0"),
         ("count: 12", "count: many", "robots.arms.count: expected a valid integer, got 'many'"),
-        ("pi0: {rows: 25}", "pi: {rows: 25}", "expected some of .*, got 'pi'; did you mean 'pi0'"),
+        ("pi0: {rows: 25}", "pi: {rows: 25}", "expected only .*, got 'pi'; did you mean 'pi0'"),
         ("count: 4\n  memory_gb: 80", "count: 4", "gpus.memory_gb: is missing; add"),
         ("memory_gb: 18", "memory_gb: 180", "expected at most the 80 of a GPU, got 180"),
         ("fixed_ms: 29.3, ", "", "expected fixed_ms with row_ms, got"),

@@ -190,7 +190,7 @@ class FleetFile(_FleetModel):
             for name in robots.models:
                 if name not in self.models:
                     raise ValueError(
-                        f"robots.{group}.models: expected some of {sorted(self.models)}, got "
+                        f"robots.{group}.models: expected only {sorted(self.models)}, got "
                         f"{name!r}{did_you_mean(name, self.models)}"
                     )
                 used.add(name)

@@ -368,7 +368,7 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(
     ("settings", "message"),
     [
         ({"groups": 0}, "groups: expected at least 1, got 0"),
-        ({"want": ["logits"]}, r"want: expected some of .*, got \['logits'\]"),
+        ({"want": ["logits"]}, r"want: expected only .*, got \['logits'\]"),
         ({"first": -1}, "first: expected at least 0, got -1"),
     ],
 )

@@ -111,7 +111,7 @@ def test_the_first_act_is_made_with_the_weights_that_woke_the_policy(
         assert acted(engine) == acted(alone)
         weights.sleep()
         first = asked(engine)
-        with pytest.raises(Overloaded, match="sleeps already; call wake first"):
+        with pytest.raises(Overloaded, match="already asleep; call wake first"):
             weights.sleep()
         with pytest.raises(PolicyUnavailable, match="got one that sleeps; give wake"):
             weights.push(gains(1))

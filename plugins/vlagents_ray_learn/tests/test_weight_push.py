@@ -224,7 +224,7 @@ def test_if_one_replica_cannot_sleep_none_does_and_all_wake_together(app: Applic
     app.replicas[1].fails.clear()
     asyncio.run(pusher.rest(Rest("sleep")))
     for replica in app.replicas:
-        with pytest.raises(Overloaded, match="sleeps already"):
+        with pytest.raises(Overloaded, match="already asleep"):
             replica.engine.weights.rest(Rest("sleep"))
     asyncio.run(pusher.rest(Rest("wake")))
     assert app.gains() == [(0, 0.0)] * len(app.replicas)
@@ -241,7 +241,7 @@ def test_a_replica_that_ends_does_not_hold_up_the_others(app: Application, phase
 def test_a_push_beside_another_is_refused_and_leaves_that_one_alone(app: Application) -> None:
     app.start(Gain(), Gain())
     app.replicas[1].engine.weights.stage(1, _gains(7), PushOptions())  # by another coordinator
-    with pytest.raises(Overloaded, match="another push is under way"):
+    with pytest.raises(Overloaded, match="another push is in progress"):
         app.push(5)
     app.replicas[1].engine.weights.commit(1, PushOptions())
     assert app.gains() == [(0, 0.0), (1, 7.0)]

@@ -222,7 +222,7 @@ def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(
             refused(Publisher(server.url, api_key=robot))
     learner = Publisher(server.url, api_key=key)
     learner.sleep(offload=False, at_most_s=60)
-    with pytest.raises(Overloaded, match="sleeps already"):
+    with pytest.raises(Overloaded, match="already asleep"):
         learner.sleep()
     assert learner.wake(gains(1)) == 1
     with pytest.raises(Forbidden):
@@ -306,7 +306,7 @@ def test_a_push_that_dies_half_way_leaves_nothing_behind(serving: Serving) -> No
     with opened(server) as socket:
         answer(socket, header_of(values))
         answer(socket, next(parts_of(values)))
-        with pytest.raises(Overloaded, match="another push is under way here"):
+        with pytest.raises(Overloaded, match="another push is in progress here"):
             Publisher(server.url).push(gains(2))
     weights = Publisher(server.url)
 

@@ -145,7 +145,7 @@ def test_all_replicas_sleep_and_wake_together(start: Start) -> None:
     first, second = start(), start()
     first.call(WeightsPart.rest_all, Rest("sleep", offload=False))
     for replica in (first, second):
-        with pytest.raises(Overloaded, match="sleeps already"):
+        with pytest.raises(Overloaded, match="already asleep"):
             replica.engine.weights.rest(Rest("sleep"))
     second.call(WeightsPart.rest_all, Rest("wake"))
     assert [first.acted(), second.acted()] == [(0, 0.0)] * 2

@@ -101,7 +101,8 @@ class TransitionRecorder(EpisodeRecorder):
         if missing:
             raise ConfigError(
                 f"want: expected {' and '.join(missing)} in act.info[{BEHAVIOUR!r}], got "
-                f"{sorted(behaviour)}; take a policy that returns it, or leave it out of `want`"
+                f"{sorted(behaviour)}; use a policy that returns these values, or remove them from "
+                "`want`"
             )
 
         rows = len(act.rows())
@@ -305,7 +306,7 @@ class RolloutPlan:
                 raise ConfigError(f"{name}: expected at least {least}, got {value}")
         unknown = sorted(set(self.want) - set(WANTED))
         if unknown:
-            raise ConfigError(f"want: expected some of {list(WANTED)}, got {unknown}")
+            raise ConfigError(f"want: expected only {list(WANTED)}, got {unknown}")
 
     def config(self) -> EvalConfig:
         """Return the settings of an evaluation of these episodes, which writes no results."""

@@ -286,7 +286,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             VLAgentsError: An environment failed.
         """
         if not self._obs:
-            raise NotReset("step before reset; call reset(seed=...) first")
+            raise NotReset("step was called before reset; call reset(seed=...) first")
         if self._over.any() and self.autoreset_mode == vector.AutoresetMode.DISABLED:
             raise NotReset(
                 f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is "

@@ -149,7 +149,9 @@ class _WeightsEndpoint:
     async def _receive_push(self, socket: WebSocket) -> dict[str, Any]:
         """Receive the weights of a push, make the replicas act with them, and return the answer."""
         if self._receiving:
-            raise Overloaded("weights: another push is under way here; push again when it is over")
+            raise Overloaded(
+                "weights: another push is in progress here; push again when it has ended"
+            )
         self._receiving = True
         try:
             options = _read_options(socket.query_params)
@@ -233,8 +235,8 @@ def _read_rest(step: Any, query: Mapping[str, str]) -> Rest:
         return Rest(step, **options)
     except (KeyError, ValueError) as error:
         raise InvalidInput(
-            "rest: expected sleep, restore or wake, offload=true or false, and at_most_s=SECONDS, "
-            f"got {step[:20]!r}, {shown(dict(query), 99)}"
+            "weights: expected the step sleep, restore or wake, offload=true or false, and "
+            f"at_most_s=SECONDS, got {step[:20]!r}, {shown(dict(query), 99)}"
         ) from error
 
 

@@ -192,7 +192,7 @@ class _LiveEndpoint:
             message = await asyncio.wait_for(socket.receive(), _SILENT_S)
         except asyncio.TimeoutError:
             raise MalformedMessage(
-                f"live: asked for nothing within {_SILENT_S:g} s; watch again"
+                f"live: expected a request within {_SILENT_S:g} s; watch again"
             ) from None
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message["code"])

@@ -166,7 +166,7 @@ class Ring:
             StorageFailed: The folder is full.
         """
         if not self._saving.acquire(blocking=False):
-            raise Overloaded("save: another session is being saved; press again when that is done")
+            raise Overloaded("save: another session is being saved; press again when it is saved")
 
         try:
             self._writer.require_room()
@@ -174,7 +174,8 @@ class Ring:
                 frames = deque(self._frames.get(session, ()))
             if not frames:
                 raise InvalidInput(
-                    f"session {session!r}: nothing to save yet; it has acted on nothing"
+                    f"session {session!r}: there is nothing to save yet, because the policy has "
+                    "not acted in it"
                 )
 
             instruction = ""

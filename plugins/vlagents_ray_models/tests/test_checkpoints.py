@@ -58,7 +58,7 @@ def test_a_family_asks_for_the_commit(family: str, monkeypatch: pytest.MonkeyPat
     if "trust_checkpoint" in fields:
         settings["trust_checkpoint"] = True
     policy = cls.from_config(settings)
-    with pytest.raises(ConfigError, match="nor to be had from the hub"):
+    with pytest.raises(ConfigError, match="nor available from the hub"):
         policy.initialize()
     assert requested == [("org/name", COMMIT)]
 

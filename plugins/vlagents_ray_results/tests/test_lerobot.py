@@ -217,18 +217,18 @@ def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
         (
             {"cameras": ["wrst"]},
             (
-                r"cameras: .*Roller: expected some of \['base', 'wrist'\], got 'wrst'; did you mean "
+                r"cameras: .*Roller: expected only \['base', 'wrist'\], got 'wrst'; did you mean "
                 r"'wrist'"
             ),
         ),
         (
             {"state": ["joints", "torque"]},
-            "state: .*Roller: expected some of .*'gripper', 'joints'.*got 'torque'",
+            "state: .*Roller: expected only .*'gripper', 'joints'.*got 'torque'",
         ),
         ({"state": ["joints", "joints"]}, "expected each name once"),
         (
             {"environment_state": ["gripper"]},
-            "environment_state: .*expected some of .*'joints', 'xyzrpy'.*got 'gripper'",
+            "environment_state: .*expected only .*'joints', 'xyzrpy'.*got 'gripper'",
         ),
     ],
 )

@@ -152,7 +152,7 @@ def test_cameras_are_chosen(results: Results, tmp_path: Path) -> None:
 
     done = export(results.out, tmp_path / "x.mcap", "--set", "cameras=[fornt]")
     assert done.exit_code == 2
-    assert "cameras: expected some of ['front'], got 'fornt'; did you mean 'front'" in done.stderr
+    assert "cameras: expected only ['front'], got 'fornt'; did you mean 'front'" in done.stderr
     assert not (tmp_path / "x.mcap").exists()
     assert not list(tmp_path.glob("*.part"))
 

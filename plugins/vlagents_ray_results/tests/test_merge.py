@@ -387,7 +387,7 @@ def test_other_weights_under_the_same_name_are_not_merged(
     for other in (b, elsewhere):
         with pytest.raises(
             ConfigError,
-            match=r"was played by several weights under one name: .*'x'.*'y'.*merge those",
+            match=r"was run by several weights under one name: .*'x'.*'y'.*merge those",
         ):
             merge(tmp_path / "out", [a, other])
     with_weights(b, "x")

@@ -106,7 +106,9 @@ def to_lerobot(
         recorded = solved
 
     if path.exists() and any(path.iterdir()):
-        raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
+        raise ConfigError(
+            f"{path}: expected a new or empty folder, got one with files; export into a new folder"
+        )
     rates = {_fps(case) for case, _ in recorded}
     if len(rates) > 1:
         raise ConfigError(
@@ -263,7 +265,7 @@ def _chosen(option: str, names: Sequence[str] | None, known: Sequence[str], env:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ConfigError(
-            f"{option}: {env}: expected some of {sorted(known)}, got "
+            f"{option}: {env}: expected only {sorted(known)}, got "
             f"{', '.join(map(repr, unknown))}{did_you_mean(unknown[0], known)}"
         )
     if len(set(names)) < len(names):

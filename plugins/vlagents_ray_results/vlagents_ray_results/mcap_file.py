@@ -301,8 +301,7 @@ def _chosen_cameras(names: Sequence[str] | None, known: Iterable[str]) -> list[s
     for name in names:
         if name not in known:
             raise ConfigError(
-                f"cameras: expected some of {sorted(known)}, got {name!r}"
-                f"{did_you_mean(name, known)}"
+                f"cameras: expected only {sorted(known)}, got {name!r}{did_you_mean(name, known)}"
             )
     return list(names)
 

@@ -87,9 +87,9 @@ def merge(
             changes = _add_policies(merged, folder, db) + _add_cases(merged, folder, db)
             if changes and not accept_changes:
                 raise ConfigError(
-                    f"{folder} was not played with the same program as the folders before "
-                    f"it:\n{listed(changes)}\n"
-                    f"merge them apart, or mix them and have the report say so (--accept-changes)"
+                    f"{folder} was not run with the same code and files as the folders before "
+                    f"it:\n{listed(changes)}\nmerge them separately, or allow the difference, "
+                    "which the report then shows (--accept-changes)"
                 )
 
             conflicts += _add_episodes(merged, folder, db)
@@ -282,8 +282,8 @@ def _require_one(subject: str, kind: str, keys: dict[str, str]) -> None:
     """Raise `ConfigError` if there are several; `keys` has the key of an episode of each."""
     if len(keys) > 1:
         raise ConfigError(
-            f"{subject}: was played by several {kind}: {keys}; merge those apart, or give "
-            "one of them another policy's `name` in its evaluation"
+            f"{subject}: was run by several {kind}: {keys}; merge those separately, or give one of "
+            "them another policy's `name` in its evaluation"
         )
 
 

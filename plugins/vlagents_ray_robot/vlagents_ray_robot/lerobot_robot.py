@@ -114,8 +114,8 @@ class LeRobotRobot:
         except Exception as error:
             suggestion = did_you_mean(robot_type, package.RobotConfig.get_known_choices())
             raise ConfigError(
-                f"lerobot:{robot_type}: LeRobot refuses the settings {settings} ({error})"
-                f"{suggestion}"
+                f"lerobot:{robot_type}: LeRobot rejects the settings {settings} "
+                f"({error}){suggestion}"
             ) from error
 
         not_positions = [name for name in self._robot.action_features if not name.endswith(".pos")]

@@ -58,7 +58,7 @@ def test_the_contract_is_known_before_the_simulator_is_made() -> None:
             "robocasa/OpenDrawer",
             {"split": "test"},
             ConfigError,
-            r"split: expected some of \['target'.*got \['test'\]",
+            r"split: expected only \['target'.*got \['test'\]",
         ),
         ("robocasa/OpenDrawer", {"action_order": "any"}, ConfigError, "action_order"),
         ("robocasa/OpenDrawer", {"object_registries": ["aigen"]}, ConfigError, "object_registries"),

@@ -385,7 +385,9 @@ class Calvin(SimulatorEnv):
     def _playing(self) -> Chain:
         """Return the chain of the current episode; raises `NotReset` if there is none."""
         if self._chain is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+            raise NotReset(
+                f"{self._name}: step was called before reset; call reset(seed=...) first"
+            )
         return self._chain
 
 

@@ -236,7 +236,7 @@ class RoboCasa(RobosuiteEnv):
         """Raise `ConfigError` unless an option has values, all of which are allowed."""
         if not values or not set(values) <= set(allowed):
             raise ConfigError(
-                f"{self._name}: {option}: expected some of {list(allowed)}, got {list(values)}"
+                f"{self._name}: {option}: expected only {list(allowed)}, got {list(values)}"
             )
 
     @classmethod

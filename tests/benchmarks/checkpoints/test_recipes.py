@@ -66,7 +66,7 @@ def test_what_is_in_a_folder_stays(tmp_path: Path, known: Known) -> None:
     asked = known()
     (tmp_path / "weights").write_text("precious")
     for folder in (tmp_path, tmp_path / "weights"):
-        with pytest.raises(ConfigError, match="is there already"):
+        with pytest.raises(ConfigError, match="exists already"):
             write_checkpoint("own", folder)
     assert (tmp_path / "weights").read_text() == "precious"
     assert asked == []

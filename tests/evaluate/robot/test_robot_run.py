@@ -184,7 +184,7 @@ def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_poi
 
 def test_a_task_without_a_rubric_knows_no_partial_success() -> None:
     with pytest.raises(
-        ConfigError, match=r"expected some of the rubric's marks .*, got a partial success"
+        ConfigError, match=r"expected only the rubric's marks .*, got a partial success"
     ):
         Verdict("partial", ("lid",)).score({})
     with pytest.raises(ConfigError, match=r"got the parts \['lid'\]"):

@@ -326,6 +326,6 @@ NAMED = f"org/name@{COMMIT}"
 
 def test_an_adapter_is_asked_for_by_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = empty_hub(monkeypatch)
-    with pytest.raises(ConfigError, match="nor to be had from the hub"):
+    with pytest.raises(ConfigError, match="nor available from the hub"):
         find_adapter(NAMED, "org/base", [], "")
     assert asked == [("org/name", COMMIT)]

@@ -466,8 +466,8 @@ def test_the_audit_log_says_which_key_did_what_and_not_each_time(
     assert lines == [
         "key arm: let in by http",
         "key arm: reset session 'robot-1'",
-        "key (none): refused: an unknown key",
-        "key arm: refused: too_many_requests",
+        "key (none): rejected: an unknown key",
+        "key arm: rejected: too_many_requests",
     ]
     now += audit._EVERY_S
     caller.note("reset session", repr("robot-2"))

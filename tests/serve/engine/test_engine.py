@@ -128,7 +128,7 @@ def test_what_the_policy_does_not_offer_is_refused_before_it_acts(
 ) -> None:
     engine = serving(Echo())
     ask(engine, "a", "reset")
-    with pytest.raises(NotOffered, match=r"expected some of \[\], .*, got \['logprob'\]"):
+    with pytest.raises(NotOffered, match=r"expected only \[\], .*, got \['logprob'\]"):
         ask(engine, "a", "act", {"want": ["logprob"]})
     act = ask(engine, "a", "act").act
     assert act.action[1] == 1, "the policy's step was not counted"

@@ -263,7 +263,7 @@ class ManiSkillBatch(BatchEnv):
         """Execute an action in each episode, by one step of the simulator."""
         if not self._playing:
             raise NotReset(
-                f"maniskill/{self._task}: step before reset; call reset(seeds=...) first"
+                f"maniskill/{self._task}: step was called before reset; call reset(seeds=...) first"
             )
         actions = np.zeros((self.num_envs, self._contract.action.dim or 0), np.float32)
         for i, act in enumerate(acts):

@@ -214,7 +214,7 @@ class Tabletop(EvalEnv):
         """Execute an action, (4,); see `EvalEnv.step`."""
         world, goal = self._world, self._goal
         if world is None or goal is None:
-            raise NotReset("tabletop: step before reset; call reset(seed=...) first")
+            raise NotReset("tabletop: step was called before reset; call reset(seed=...) first")
 
         action = one_row(act, self._contract)
         if self._disturbance and self._draws.random() < _DISTURBED:

@@ -115,8 +115,8 @@ class Verdict:
         if not rubric or unknown_parts:
             actual = f"the parts {unknown_parts}" if rubric else "a partial success"
             raise ConfigError(
-                f"verdict: expected some of the rubric's marks {sorted(rubric)}, got {actual}; "
-                "see `robot.tasks`"
+                f"verdict: expected only the rubric's marks {sorted(rubric)}, got {actual}; see "
+                "`robot.tasks`"
             )
         points = sum(rubric[name] for name in set(self.earned))
         return points / sum(rubric.values())

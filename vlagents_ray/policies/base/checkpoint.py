@@ -196,7 +196,7 @@ def _from_hub(name: str) -> Path:
                 f"{commit!r}; its branches and tags are {_revisions(hub, repository)}"
             ) from error
         raise ConfigError(
-            f"checkpoint {name!r}: neither a path here nor to be had from the hub "
+            f"checkpoint {name!r}: neither a path on this machine nor available from the hub "
             f"({type(error).__name__}); download it to a folder and name that, or check the id "
             "(org/name or org/name@COMMIT), the network and your token"
         ) from error

@@ -140,7 +140,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return `self.model`; raises `PolicyFailed` before `initialize`."""
         if self.model is None:
             raise PolicyFailed(
-                f"{type(self).__name__}: act before initialize; the checkpoint is not loaded"
+                f"{type(self).__name__}: act was called before initialize; the checkpoint is not "
+                "loaded"
             )
         return self.model
 
@@ -442,7 +443,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return the episode of this session; raises `NotReset` if there is none."""
         if self.episode is None:
             raise NotReset(
-                f"{type(self).__name__}: act before reset; call reset(obs, instruction) first"
+                f"{type(self).__name__}: act was called before reset; call reset(obs, instruction) "
+                "first"
             )
         return self.episode
 

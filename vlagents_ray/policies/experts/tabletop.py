@@ -72,7 +72,7 @@ class TabletopExpert:
         """Return the next action along the plan, (4,); `done` after its last waypoint."""
         if not self._plan:
             raise NotReset(
-                f"{self._env_name}: act before reset; call reset(obs, instruction) first"
+                f"{self._env_name}: act was called before reset; call reset(obs, instruction) first"
             )
         if "xyzrpy" not in obs.state:
             raise MissingState("xyzrpy", have=obs.state)

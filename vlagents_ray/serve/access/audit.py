@@ -81,7 +81,7 @@ class Audit:
         """Log that the key `name` was refused; an empty name means a missing or an unknown key."""
         suffix = self._count(name, reason)
         if suffix is not None:
-            logger.warning("key %s: refused: %s%s", name or "(none)", reason, suffix)
+            logger.warning("key %s: rejected: %s%s", name or "(none)", reason, suffix)
 
     def _count(self, name: str, event: str) -> str | None:
         """Count an event, and decide whether it is logged.

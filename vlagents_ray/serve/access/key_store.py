@@ -83,7 +83,7 @@ class Key:
         if unknown:
             meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)
             raise ConfigError(
-                f"key {self.name!r}: scopes: expected some of {list(SCOPES)}, got {unknown}{meant}"
+                f"key {self.name!r}: scopes: expected only {list(SCOPES)}, got {unknown}{meant}"
             )
         if not isinstance(self.revoked, bool):
             raise ConfigError(
@@ -144,7 +144,7 @@ def _parse(entry: Any) -> Key:
     if unknown:
         meant = "".join(did_you_mean(field, known) for field in unknown)
         raise ConfigError(
-            f"key {entry['name']!r}: expected some of {sorted(known)}, got {sorted(unknown)}{meant}"
+            f"key {entry['name']!r}: expected only {sorted(known)}, got {sorted(unknown)}{meant}"
         )
 
     values = dict(entry)

@@ -147,7 +147,7 @@ class Pool:
         with self._lock:
             channel = self._leased.pop(key, None)
         if channel is None:
-            raise MalformedMessage("plasma: this channel is not leased; ask for one")
+            raise MalformedMessage("plasma: this channel is not leased; request a channel first")
         return channel
 
     def release(self, channel: Channel) -> None:

@@ -231,7 +231,7 @@ class UnixConnection(PolledConnection):
         if self._sender is None:
             self._refused_keys += 1
             if self._refused_keys >= REFUSALS:
-                self.end(f"its key was refused {REFUSALS} times; connect with another one")
+                self.end(f"its key was rejected {REFUSALS} times; connect with another one")
                 self.disconnect()  # its further messages are not read
         elif self.account.refused_too_often:
             self.end(REFUSED)
@@ -304,7 +304,7 @@ class UnixConnection(PolledConnection):
             The sender of this message; None if the message was the key itself.
         """
         if isinstance(self._check_key, NoKey):
-            raise TypeError(f"a key, although none is asked for: {self._check_key.value}")
+            raise TypeError(f"got a key, although no key is required: {self._check_key.value}")
 
         is_key = self._key is None
         if self._key is None:

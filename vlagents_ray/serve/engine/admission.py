@@ -164,7 +164,8 @@ class Admission:
                 self._resize(arriving, size)
         if not has_room:
             raise Overloaded(
-                "the messages in flight leave no room for one that arrives slowly; send it again"
+                "the messages in flight leave too little memory for a message that arrives this "
+                "slowly; send it again"
             )
 
     def _room(self, limit: int, key: str | None) -> int:

@@ -105,7 +105,7 @@ class SessionMoves:
             )
             if tuple(state.policy) != model.version:
                 raise UnknownSession(
-                    f"session {session_id!r}: of another version of the policy; reset it"
+                    f"session {session_id!r}: belongs to another version of the policy; reset it"
                 )
 
             number, fingerprint = state.weights

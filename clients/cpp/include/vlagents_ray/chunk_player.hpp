@@ -48,7 +48,7 @@ class ChunkPlayer {
   explicit ChunkPlayer(Client& client, std::size_t ahead = 0, std::size_t execute = 0)
       : client_(client), ahead_(ahead), execute_(execute) {
     if (execute != 0 && ahead >= execute)
-      throw Error("invalid_input", "ahead: got " + std::to_string(ahead) + ", want less than execute");
+      throw Error("invalid_input", "ahead: expected less than execute, got " + std::to_string(ahead));
     thread_ = std::thread([this] { work(); });
   }
 

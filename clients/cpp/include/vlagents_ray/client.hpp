@@ -25,7 +25,7 @@ struct Options {
   double timeout_s = 30.0;        // what one call may take, reconnecting included; 2 to 5 for a robot
   int jpeg_quality = 90;          // 1 to 100 of raw images, colours at full resolution; 0 sends raw pixels
   bool resume = true;             // begin the session again where its connection was lost
-  std::size_t history = 16;       // observations that are kept for that, if the policy's contract wants no fewer; at most 256
+  std::size_t history = 16;       // observations kept for that, unless the policy's contract needs fewer; at most 256
   std::string priority = "robot"; // or "simulation", which robots go before
   std::string session;            // 1 to 128 visible ASCII characters; "" makes a UUID
   Json contract;                  // what the robot gives and takes; the server compares it with the policy's
@@ -36,8 +36,8 @@ class Client {
  public:
   /// Connects to nothing: the first call does.
   explicit Client(Options options) : options_(std::move(options)), url_(detail::Url::parse(options_.url)) {
-    if (!(options_.timeout_s > 0)) throw Error("invalid_input", "timeout_s: want more than 0 seconds");
-    if (options_.jpeg_quality < 0 || options_.jpeg_quality > 100) throw Error("invalid_input", "jpeg_quality: want 0 to 100");
+    if (!(options_.timeout_s > 0)) throw Error("invalid_input", "timeout_s: expected more than 0 seconds");
+    if (options_.jpeg_quality < 0 || options_.jpeg_quality > 100) throw Error("invalid_input", "jpeg_quality: expected 0 to 100");
     options_.history = std::min<std::size_t>(options_.history, 256);
     session_ = options_.session.empty() ? detail::new_uuid() : options_.session;
     if (!options_.api_key.empty()) headers_["authorization"] = "Bearer " + options_.api_key;
@@ -149,7 +149,7 @@ class Client {
     const Json metadata = detail::get_json(url_, "/v1/metadata", headers, deadline);
     const auto version = detail::number_at(metadata, "protocol", 1000);
     if (version && *version != detail::protocol_version)
-      throw Error("malformed", "got version " + std::to_string(*version) + " of the protocol, want 1; update the client");
+      throw Error("malformed", "expected version 1 of the protocol, got " + std::to_string(*version) + "; update the client");
     const auto wanted = detail::number_at(detail::object_at(metadata, "contract"), "history", options_.history);
     kept_ = wanted ? static_cast<std::size_t>(*wanted) : options_.history;
     const Json stream = detail::object_at(metadata, "stream");
@@ -203,7 +203,7 @@ class Client {
     request.header["session"] = session_;
     request.header["request_id"] = request_id;
     request.header["priority"] = options_.priority;
-    request.header["deadline_ms"] = 900 * left_s;  // the server's own refusal arrives in time
+    request.header["deadline_ms"] = 900 * left_s;  // the server's own error arrives in time
     if (step_) request.header["step"] = *step_;
     const std::uint64_t before = connection_->received();
     detail::Frame reply;

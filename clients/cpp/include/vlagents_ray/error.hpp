@@ -11,7 +11,7 @@ namespace vlagents_ray {
 /// What went wrong, with the stable `code` of docs/troubleshooting.md.
 ///
 /// The server's codes arrive as they are. The client itself raises
-///   "unavailable"        the server cannot be reached, or refused the connection,
+///   "unavailable"        the server cannot be reached, or rejected the connection,
 ///   "connection_lost"    the connection broke during a request, which may have been executed,
 ///   "deadline_exceeded"  no time was left before the request was sent, so it was not executed,
 ///   "outcome_unknown"    no answer came in time: the request may have been executed, or may still be,
@@ -22,7 +22,7 @@ namespace vlagents_ray {
 class Error : public std::runtime_error {
  public:
   /// @param code one of docs/troubleshooting.md
-  /// @param detail got, want and cure, in English
+  /// @param detail the expected value, the given value and the cure, in English
   /// @param retry_after_s seconds after which the same request is worth another try, of 429 and 503
   Error(std::string code, const std::string& detail, std::optional<double> retry_after_s = std::nullopt)
       : std::runtime_error(code + ": " + detail),

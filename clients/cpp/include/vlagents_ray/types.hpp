@@ -28,14 +28,14 @@ struct Image {
   /// @param pixels height * width * 3 bytes, RGB
   static Image rgb(Bytes pixels, std::size_t height, std::size_t width) {
     if (height == 0 || width == 0 || height > 65535 || width > 65535 || pixels.size() != height * width * 3)
-      throw Error("invalid_input", "image: got " + std::to_string(pixels.size()) + " bytes, want height * width * 3 of " +
-                                       std::to_string(height) + " x " + std::to_string(width) + " pixels");
+      throw Error("invalid_input", "image: expected height * width * 3 bytes for " + std::to_string(height) + " x " +
+                                       std::to_string(width) + " pixels, got " + std::to_string(pixels.size()));
     return Image{std::move(pixels), height, width};
   }
 
   /// @param bytes a JPEG or PNG file
   static Image file(Bytes bytes) {
-    if (bytes.empty()) throw Error("invalid_input", "image: got an empty file, want JPEG or PNG");
+    if (bytes.empty()) throw Error("invalid_input", "image: expected a JPEG or PNG file, got an empty one");
     return Image{std::move(bytes), 0, 0};
   }
 };
@@ -62,7 +62,7 @@ struct Act {
   /// @param number from 0 to rows - 1
   std::vector<float> row(std::size_t number) const {
     if (number >= rows)
-      throw Error("invalid_input", "row: got " + std::to_string(number) + ", want less than " + std::to_string(rows));
+      throw Error("invalid_input", "row: expected less than " + std::to_string(rows) + ", got " + std::to_string(number));
     const auto begin = values.begin() + static_cast<std::ptrdiff_t>(number * dim);
     return {begin, begin + static_cast<std::ptrdiff_t>(dim)};
   }

@@ -536,7 +536,7 @@ class Tuner:
                     f"{self._plan.tolerance:.2%}"
                 )
                 if variant.changes or points:
-                    raise VariantFailed(f"refused, as {off}")
+                    raise VariantFailed(f"rejected, as {off}")
                 raise VariantFailed(
                     f"{off}, for the same observations and seeds, so that nothing can be compared "
                     "with them; let the seed of `reset` determine what is random in the policy, or "

@@ -363,7 +363,7 @@ def _require_known(value: Mapping[str, Any], known_keys: set[str], path: str) ->
     unknown = value.keys() - known_keys
     if unknown:
         raise MalformedMessage(
-            f"{path}: expected some of the keys {sorted(known_keys)}, got {shown(sorted(unknown))}"
+            f"{path}: expected only the keys {sorted(known_keys)}, got {shown(sorted(unknown))}"
         )
 
 

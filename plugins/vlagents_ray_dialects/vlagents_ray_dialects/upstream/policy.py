@@ -279,7 +279,7 @@ class Upstream(Agent):
             ids = [session._session or "" for session in sessions]
             return list(self._sessions.ask(ids, observations))
         if self._lanes is None:
-            raise NotReset("upstream: act before initialize; there is no connection")
+            raise NotReset("upstream: act was called before initialize; there is no connection")
         return list(self._lanes.ask(observations))
 
     def _check(self, client: UpstreamClient, metadata: Mapping[str, Any]) -> None:

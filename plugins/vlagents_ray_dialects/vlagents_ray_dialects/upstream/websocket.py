@@ -84,11 +84,11 @@ class WebSocketClient(UpstreamClient):
         except InvalidStatus as error:
             if error.response.status_code in _REFUSED:
                 raise Unauthorized(
-                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); "
+                    f"upstream {url}: it rejects the API key (HTTP {error.response.status_code}); "
                     "name the environment variable with the right one in key_env"
                 ) from error
             raise PolicyUnavailable(
-                f"upstream {url}: refused with HTTP {error.response.status_code}"
+                f"upstream {url}: rejected the connection with HTTP {error.response.status_code}"
             ) from error
         except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
             raise self.unreachable(error) from error

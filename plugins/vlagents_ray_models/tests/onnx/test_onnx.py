@@ -476,7 +476,7 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             SAME.format(4),
             {"state": ["a"], "contract": {"hz": 3}},
-            r"contract: expected some of .*, got \['hz'\]",
+            r"contract: expected only .*, got \['hz'\]",
         ),
         (
             SAME.format(4),

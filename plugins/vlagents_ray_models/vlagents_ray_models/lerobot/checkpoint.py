@@ -133,7 +133,7 @@ def _read_settings(folder: Path, config: LeRobotConfig) -> Any:
         known = {setting.name for setting in dataclasses.fields(settings)}
         unknown = sorted(set(config.overrides) - known)
         if unknown:
-            raise ConfigError(f"overrides: expected some of {sorted(known)}, got {unknown}")
+            raise ConfigError(f"overrides: expected only {sorted(known)}, got {unknown}")
         if not config.overrides:
             return settings
 
@@ -162,7 +162,7 @@ def require_served(policy_type: str, folder: Path) -> None:
     reason = reason_not_served(policy_type)
     if reason is not None:
         raise ConfigError(
-            f"checkpoint {folder}: is a {policy_type!r}, which is not served here: {reason}"
+            f"checkpoint {folder}: its type {policy_type!r} cannot be served here: {reason}"
         )
 
     if policy_type in _PATCHED and not is_new():

@@ -469,7 +469,7 @@ def _cameras(
     known = sorted(name_of.values())
     unknown = sorted(set(config.masked_cameras) - set(known))
     if unknown:
-        raise ConfigError(f"masked_cameras: expected some of {known}, got {unknown}")
+        raise ConfigError(f"masked_cameras: expected only {known}, got {unknown}")
     if config.masked_cameras and settings.type not in samplers.MASKING:
         raise ConfigError(
             f"masked_cameras: expected none, as LeRobot's {settings.type!r} needs all its "

@@ -95,8 +95,8 @@ class Processors:
         unknown = sorted(set(config.processors) - before.keys() - after.keys())
         if unknown:
             raise ConfigError(
-                "processors: expected some of the checkpoint's "
-                f"{[sorted(before), sorted(after)]}, got {unknown}; correct the names"
+                f"processors: expected only the checkpoint's {[sorted(before), sorted(after)]}, "
+                f"got {unknown}; correct the names"
             )
 
         self.steps = [list(before), list(after)]  # the registered names, for both pipelines

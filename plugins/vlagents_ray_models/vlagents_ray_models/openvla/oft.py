@@ -550,8 +550,8 @@ def _require_layers(weights: Weights, layers: Iterable[str], component: str) -> 
     names = set(weights)
     if names != expected:
         raise ConfigError(
-            f"{component}: misses {sorted(expected - names)}, has {sorted(names - expected)} too; "
-            "is it of another kind?"
+            f"{component}: expected {sorted(expected - names)}, got {sorted(names - expected)} in "
+            "addition to the others; is it of a different kind?"
         )
     return weights
 

@@ -500,9 +500,8 @@ def _remote(checkpoint: Path, file: str, auto_class: str) -> Any:
     class_reference = content.get("auto_map", {}).get(auto_class)
     if class_reference is None:
         raise ConfigError(
-            f"trust_remote_code: expected code named in {checkpoint / file}, got no "
-            f"{auto_class!r} in its auto_map; take the classes from a source tree instead: set "
-            "source_dir"
+            f"trust_remote_code: expected code named in {checkpoint / file}, got no {auto_class!r} "
+            "in its auto_map; use the classes of a source tree instead: set source_dir"
         )
     return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(
         class_reference, str(checkpoint)

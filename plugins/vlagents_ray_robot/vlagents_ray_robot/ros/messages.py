@@ -80,7 +80,7 @@ def image(message: Any) -> np.ndarray:
     if not isinstance(encoding, str) or encoding not in _PIXEL:
         raise InvalidObservation(
             f"image: expected an encoding of {list(_PIXEL)}, got {shown(encoding)}; have the "
-            "camera's driver publish rgb8, and take no topic of depth for a camera"
+            "camera's driver publish rgb8, and do not use a depth topic for a camera"
         )
 
     height = _whole("height", field(message, "height"))

@@ -110,7 +110,9 @@ class AlohaExpert:
 
     def act(self, obs: Obs) -> Act:
         if not self._commands:
-            raise NotReset("aloha expert: act before reset; call reset(obs, instruction) first")
+            raise NotReset(
+                "aloha expert: act was called before reset; call reset(obs, instruction) first"
+            )
         self._step += 1
         commands = [_interpolate(self._commands[arm], self._step) for arm in _BASES]
         return Act(np.concatenate(commands).astype(np.float32))

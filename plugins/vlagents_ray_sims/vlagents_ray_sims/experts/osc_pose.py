@@ -65,7 +65,9 @@ class PickExpert(ABC):
     def act(self, obs: Obs) -> Act:
         """Begin the next phase if the hand has arrived, and move the hand towards its target."""
         if self._first is None:
-            raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
+            raise NotReset(
+                f"{self._name}: act was called before reset; call reset(obs, instruction) first"
+            )
 
         hand, orientation = self._hand(obs)
         phase = self._phases[self._phase]

@@ -69,32 +69,32 @@ inline void encode_frame(const Request& request, Bytes& data) {
 }
 
 inline Frame decode_frame(const Bytes& data) {
-  const auto refused = [](const std::string& reason) { return Error("malformed", "frame: " + reason); };
-  if (data.size() < prefix_size || std::memcmp(data.data(), "VLA", 3) != 0) throw refused("got no VLA at its start");
+  const auto rejected = [](const std::string& reason) { return Error("malformed", "frame: " + reason); };
+  if (data.size() < prefix_size || std::memcmp(data.data(), "VLA", 3) != 0) throw rejected("expected VLA at its start, got other bytes");
   if (data[3] != protocol_version)
-    throw refused("got version " + std::to_string(data[3]) + " of the protocol, want 1; update the client");
+    throw rejected("expected version 1 of the protocol, got " + std::to_string(data[3]) + "; update the client");
   std::uint32_t length = 0;
   for (int byte = 0; byte < 4; ++byte) length |= static_cast<std::uint32_t>(data[4 + byte]) << (8 * byte);
-  if (length > data.size() - prefix_size) throw refused("got a header that is longer than the frame");
+  if (length > data.size() - prefix_size) throw rejected("the header is longer than the frame");
   Frame frame;
   frame.header = parse_json(reinterpret_cast<const char*>(data.data()) + prefix_size, length);
-  if (!frame.header.is_object()) throw refused("got a header that is no object");
+  if (!frame.header.is_object()) throw rejected("expected a JSON object as header, got something else");
   const auto sizes = frame.header.find("blobs");
-  if (sizes == frame.header.end() || !sizes->is_array()) throw refused("got a header without the list `blobs`");
+  if (sizes == frame.header.end() || !sizes->is_array()) throw rejected("expected the list `blobs` in the header, got none");
   std::size_t at = prefix_size + length;
   for (const Json& size : *sizes) {
     const std::size_t gap = padding(at);
     if (!size.is_number_unsigned() || gap > data.size() - at || size.get<std::uint64_t>() > data.size() - at - gap)
-      throw refused("got a blob that is longer than the frame");
+      throw rejected("a blob is longer than the frame");
     if (std::any_of(data.begin() + static_cast<std::ptrdiff_t>(at), data.begin() + static_cast<std::ptrdiff_t>(at + gap),
                     [](std::uint8_t byte) { return byte != 0; }))
-      throw refused("got other bytes than zeros before a blob");
+      throw rejected("expected zeros before a blob, got other bytes");
     const auto begin = data.begin() + static_cast<std::ptrdiff_t>(at + gap);
     const auto end = begin + size.get<std::ptrdiff_t>();
     frame.blobs.emplace_back(begin, end);
     at = static_cast<std::size_t>(end - data.begin());
   }
-  if (at != data.size()) throw refused("got bytes after the last blob");
+  if (at != data.size()) throw rejected("expected the end after the last blob, got more bytes");
   return frame;
 }
 
@@ -114,29 +114,29 @@ inline const Json* reference(const Json& value) {
   const auto found = value.find("$");
   if (found == value.end()) return nullptr;
   if (!found->is_array() || found->size() < 2 || !(*found)[0].is_string())
-    throw Error("malformed", "frame: got the reference " + value.dump());
+    throw Error("malformed", "frame: invalid reference " + value.dump());
   return &*found;
 }
 
 inline const Bytes& blob_of(const Json& reference, const std::vector<Bytes>& blobs) {
   if (!reference[1].is_number_unsigned() || reference[1].get<std::uint64_t>() >= blobs.size())
-    throw Error("malformed", "frame: got a reference to a blob that is not there: " + reference.dump());
+    throw Error("malformed", "frame: the blob of this reference does not exist: " + reference.dump());
   return blobs[reference[1].get<std::size_t>()];
 }
 
 inline Array array_of(const Json& reference, const std::vector<Bytes>& blobs) {
-  const auto refused = [&] { return Error("malformed", "frame: got the array " + reference.dump()); };
-  if (reference.size() != 4 || reference[0] != "nd" || !reference[2].is_string() || !reference[3].is_array()) throw refused();
+  const auto rejected = [&] { return Error("malformed", "frame: invalid array " + reference.dump()); };
+  if (reference.size() != 4 || reference[0] != "nd" || !reference[2].is_string() || !reference[3].is_array()) throw rejected();
   Array found{reference[2].get<std::string>(), {}, blob_of(reference, blobs)};
   std::size_t bytes = item_size(found.type);
-  if (bytes == 0 || reference[3].size() > 32) throw refused();
+  if (bytes == 0 || reference[3].size() > 32) throw rejected();
   for (const Json& axis : reference[3]) {
-    if (!axis.is_number_unsigned() || axis.get<std::uint64_t>() > std::numeric_limits<std::uint32_t>::max()) throw refused();
+    if (!axis.is_number_unsigned() || axis.get<std::uint64_t>() > std::numeric_limits<std::uint32_t>::max()) throw rejected();
     found.shape.push_back(axis.get<std::size_t>());
-    if (found.shape.back() != 0 && bytes > std::numeric_limits<std::size_t>::max() / found.shape.back()) throw refused();
+    if (found.shape.back() != 0 && bytes > std::numeric_limits<std::size_t>::max() / found.shape.back()) throw rejected();
     bytes *= found.shape.back();
   }
-  if (bytes != found.bytes.size()) throw refused();
+  if (bytes != found.bytes.size()) throw rejected();
   return found;
 }
 
@@ -175,7 +175,7 @@ struct Room {
   std::size_t bytes = 128 * 1024 * 1024;
 
   static void take(std::size_t& left, std::size_t size) {
-    if (size > left) throw Error("too_large", "frame: got more than 1,000,000 values, or 128 MiB, behind its references");
+    if (size > left) throw Error("too_large", "frame: expected at most 1,000,000 values and 128 MiB behind its references, got more");
     left -= size;
   }
 };
@@ -228,7 +228,7 @@ inline Json resolved(const Json& value, const std::vector<Bytes>& blobs, parts::
     if (kind == "float" && (*found)[1] == "nan") return std::numeric_limits<double>::quiet_NaN();
     if (kind == "float" && (*found)[1] == "inf") return std::numeric_limits<double>::infinity();
     if (kind == "float" && (*found)[1] == "-inf") return -std::numeric_limits<double>::infinity();
-    throw Error("malformed", "frame: got the reference " + value.dump());
+    throw Error("malformed", "frame: invalid reference " + value.dump());
   }
   if (!value.is_object() && !value.is_array()) return value;
   Json copy = value;

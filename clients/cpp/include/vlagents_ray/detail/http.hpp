@@ -42,7 +42,7 @@ struct Url {
     if (scheme == "https" || scheme == "wss")
       throw Error("invalid_input", text + ": this client does no TLS; let a tunnel (ssh -L, stunnel) or a proxy on this "
                                           "machine encrypt, and give its http:// address");
-    if (scheme != "http" && scheme != "ws") throw Error("invalid_input", text + ": want http://host:port or ws://host:port");
+    if (scheme != "http" && scheme != "ws") throw Error("invalid_input", "url: expected http://host:port or ws://host:port, got " + text);
     const std::string rest = text.substr(colon + 3);
     const auto slash = rest.find('/');
     const std::string place = rest.substr(0, slash);
@@ -58,7 +58,7 @@ struct Url {
     const bool digits = !url.port.empty() && url.port.find_first_not_of("0123456789") == std::string::npos;
     const bool visible = std::all_of(text.begin(), text.end(), [](char letter) { return letter > ' ' && letter < 127; });
     if (url.host.empty() || url.port.size() > 5 || !digits || !visible)
-      throw Error("invalid_input", text + ": want http://host:port");
+      throw Error("invalid_input", "url: expected http://host:port, got " + text);
     return url;
   }
 
@@ -79,7 +79,7 @@ class Reader {
     while (true) {
       const char letter = static_cast<char>(byte(deadline));
       if (letter == '\n') break;
-      if (found.size() >= most) throw Error("malformed", "HTTP: got a longer head than this client reads");
+      if (found.size() >= most) throw Error("malformed", "HTTP: the head of the answer is longer than this client reads");
       found.push_back(letter);
     }
     if (!found.empty() && found.back() == '\r') found.pop_back();
@@ -107,7 +107,7 @@ class Reader {
     while (buffered() || fill(deadline)) {
       data.insert(data.end(), buffer_ + at_, buffer_ + end_);
       at_ = end_;
-      if (data.size() > most) throw Error("too_large", "HTTP: got a longer answer than this client reads");
+      if (data.size() > most) throw Error("too_large", "HTTP: the answer is longer than this client reads");
     }
   }
 
@@ -129,7 +129,7 @@ struct Response {
   Headers headers;
   Bytes body;
 
-  /// What a refusal says, as an exception.
+  /// Return the exception for the answer of a rejected request.
   Error error() const {
     const std::string code = status == 401   ? "unauthorized"
                              : status == 403 ? "forbidden"
@@ -162,7 +162,7 @@ inline Headers read_headers(Reader& reader, const Deadline& deadline) {
   for (std::string line = reader.line(left, deadline); !line.empty(); line = reader.line(left, deadline)) {
     left -= std::min(left, line.size() + 1);
     const auto colon = line.find(':');
-    if (colon == std::string::npos) throw Error("malformed", "HTTP: got a header without a colon");
+    if (colon == std::string::npos) throw Error("malformed", "HTTP: expected a colon in each header, got a header without one");
     headers[lower(line.substr(0, colon))] = trimmed(line.substr(colon + 1));
   }
   return headers;
@@ -179,29 +179,29 @@ inline Response read_head(Reader& reader, const Deadline& deadline) {
 }
 
 inline void read_body(Reader& reader, Response& response, const Deadline& deadline) {
-  const auto refuse = [](std::size_t size) {
-    if (size > max_body) throw Error("too_large", "HTTP: got a longer answer than this client reads");
+  const auto check_size = [](std::size_t size) {
+    if (size > max_body) throw Error("too_large", "HTTP: the answer is longer than this client reads");
   };
   const auto number = [](const std::string& text, int base) {
     char* end = nullptr;
     const unsigned long found = std::strtoul(text.c_str(), &end, base);
     if (text.empty() || !std::isxdigit(static_cast<unsigned char>(text[0])) || (*end != '\0' && *end != ';'))
-      throw Error("malformed", "HTTP: got a length that is no number");
+      throw Error("malformed", "HTTP: expected a number as the length, got something else");
     return static_cast<std::size_t>(found);
   };
   const auto coding = response.headers.find("transfer-encoding");
   const auto length = response.headers.find("content-length");
   if (coding != response.headers.end() && lower(coding->second) == "chunked") {
     while (const std::size_t size = number(reader.line(max_head, deadline), 16)) {
-      refuse(size);
-      refuse(response.body.size() + size);
+      check_size(size);
+      check_size(response.body.size() + size);
       reader.read(response.body, size, deadline);
       reader.line(2, deadline);
     }
     read_headers(reader, deadline);
   } else if (length != response.headers.end()) {
     const std::size_t size = number(length->second, 10);
-    refuse(size);
+    check_size(size);
     reader.read(response.body, size, deadline);
   } else {
     reader.read_all(response.body, max_body, deadline);
@@ -212,7 +212,7 @@ inline void read_body(Reader& reader, Response& response, const Deadline& deadli
 inline std::string request_text(const Url& url, const std::string& path, const Headers& more) {
   std::string text = "GET " + path + " HTTP/1.1\r\nHost: " + url.authority() + "\r\n";
   for (const auto& [name, value] : more) {
-    if (value.find_first_of("\r\n") != std::string::npos) throw Error("invalid_input", name + ": got a line break");
+    if (value.find_first_of("\r\n") != std::string::npos) throw Error("invalid_input", name + ": expected no line break, got one");
     text += name + ": " + value + "\r\n";
   }
   return text + "\r\n";
@@ -222,7 +222,7 @@ inline void send_text(const Socket& socket, const std::string& text, const Deadl
   socket.send(reinterpret_cast<const std::uint8_t*>(text.data()), text.size(), deadline);
 }
 
-/// GET a JSON document, or throw what the server refused it with.
+/// GET a JSON document, or throw the error with which the server rejected it.
 inline Json get_json(const Url& url, const std::string& path, Headers headers, const Deadline& deadline) {
   headers["accept"] = "application/json";
   headers["connection"] = "close";

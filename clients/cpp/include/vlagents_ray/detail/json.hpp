@@ -15,7 +15,7 @@ constexpr int max_depth = 64;
 /// Parse UTF-8 JSON, or throw "malformed". nlohmann's parser needs no stack for depth; printing and comparing do.
 inline Json parse_json(const char* begin, std::size_t size) {
   const auto bounded = [](int depth, Json::parse_event_t, Json&) {
-    if (depth > max_depth) throw Error("malformed", "JSON: got more than 64 levels");
+    if (depth > max_depth) throw Error("malformed", "JSON: expected at most 64 levels, got more");
     return true;
   };
   try {

@@ -25,7 +25,7 @@ inline Observation prepared(const Observation& obs, int quality, Observation spa
     at = obs.cameras.count(at->first) == 0 ? copy.cameras.erase(at) : std::next(at);
   for (const auto& [name, image] : obs.cameras) {
     if (image.data.empty() || (!image.is_file() && image.data.size() != image.height * image.width * 3))
-      throw Error("invalid_input", "camera '" + name + "': want Image::rgb or Image::file");
+      throw Error("invalid_input", "camera '" + name + "': expected Image::rgb or Image::file");
     copy.cameras[name] = !image.is_file() && quality > 0 ? encode_jpeg(image, quality) : image;
   }
   copy.gripper = obs.gripper;
@@ -48,7 +48,7 @@ inline Json encode_observation(const Observation& obs, std::vector<View>& blobs)
     blobs.push_back({reinterpret_cast<const std::uint8_t*>(values.data()), values.size() * sizeof(float)});
   }
   if (obs.gripper) {
-    if (!std::isfinite(*obs.gripper)) throw Error("invalid_input", "gripper: got NaN or infinity, want a number from 0 to 1");
+    if (!std::isfinite(*obs.gripper)) throw Error("invalid_input", "gripper: expected a number from 0 to 1, got NaN or infinity");
     found["gripper"] = *obs.gripper;
   }
   if (!obs.info.is_null() && !obs.info.empty()) found["info"] = obs.info;
@@ -94,12 +94,12 @@ inline Request act_request(const Observation& obs) {
 inline Act decode_act(const Frame& reply) {
   const auto found = reply.header.find("act");
   if (found == reply.header.end() || !found->is_object() || !found->contains("action"))
-    throw Error("malformed", "got a reply to `act` without `act`");
+    throw Error("malformed", "expected `act` in the reply to `act`, got none");
   const Json* pointed = reference((*found)["action"]);
-  if (pointed == nullptr) throw Error("malformed", "got an action that is no reference");
+  if (pointed == nullptr) throw Error("malformed", "expected a reference as the action, got something else");
   const Array array = array_of(*pointed, reply.blobs);
   if (array.type != "<f4" || array.shape.empty() || array.shape.size() > 2 || array.bytes.empty())
-    throw Error("invalid_action", "got the action " + pointed->dump() + ", want <f4 and the shape [D] or [H, D]");
+    throw Error("invalid_action", "expected an action of type <f4 and shape [D] or [H, D], got " + pointed->dump());
   Act act;
   act.chunk = array.shape.size() == 2;
   act.rows = act.chunk ? array.shape[0] : 1;
@@ -107,7 +107,7 @@ inline Act decode_act(const Frame& reply) {
   act.values.resize(array.bytes.size() / sizeof(float));
   std::memcpy(act.values.data(), array.bytes.data(), array.bytes.size());
   for (const float value : act.values)
-    if (!std::isfinite(value)) throw Error("invalid_action", "got NaN or infinity in an action");
+    if (!std::isfinite(value)) throw Error("invalid_action", "expected finite numbers in an action, got NaN or infinity");
   const auto done = found->find("done");
   act.done = done != found->end() && done->is_boolean() && done->get<bool>();
   act.info = resolved(object_at(*found, "info"), reply.blobs);

@@ -85,7 +85,7 @@ class WebSocket {
     if (lower(response.headers["upgrade"]) != "websocket" ||
         response.headers["sec-websocket-accept"] != base64(sha1(key + "258EAFA5-E914-47DA-95CA-C5AB0DC85B11")) ||
         response.headers.count("sec-websocket-extensions") != 0)
-      throw Error("malformed", "got a handshake that is not one of this WebSocket; does a proxy in between answer?");
+      throw Error("malformed", "the answer to the handshake does not belong to this WebSocket; does a proxy in between answer?");
   }
 
   /// Send one binary message, in one frame.
@@ -105,14 +105,14 @@ class WebSocket {
       const int kind = first & 15;
       const bool last = (first & 128) != 0;
       std::uint64_t size = second & 127;
-      if ((first & 112) != 0 || (second & 128) != 0) throw refused("a compressed or masked frame");
-      if (kind >= 8 && (!last || size > 125)) throw refused("a control frame that is too long, or in fragments");
+      if ((first & 112) != 0 || (second & 128) != 0) throw rejected("a compressed or masked frame");
+      if (kind >= 8 && (!last || size > 125)) throw rejected("a control frame that is too long, or in fragments");
       if (size >= 126) {
         const int bytes = size == 126 ? 2 : 8;
         size = 0;
         for (int i = 0; i < bytes; ++i) size = size << 8 | reader_.byte(deadline);
       }
-      if (size > max_message - message.size()) throw Error("too_large", "WebSocket: got a message over 16 MiB");
+      if (size > max_message - message.size()) throw Error("too_large", "WebSocket: expected messages of at most 16 MiB, got a larger one");
       if (kind == close_ || kind == ping || kind == pong) {
         Bytes control;
         reader_.read(control, static_cast<std::size_t>(size), deadline);
@@ -121,7 +121,7 @@ class WebSocket {
         continue;
       }
       if (kind != (begun ? continuation : binary))
-        throw refused(kind == 1 ? "a text message" : "an unknown frame, or fragments out of order");
+        throw rejected(kind == 1 ? "a text message" : "an unknown frame, or fragments out of order");
       reader_.read(message, static_cast<std::size_t>(size), deadline);
       begun = !last;
       if (last) return message;
@@ -144,7 +144,7 @@ class WebSocket {
   static constexpr double pong_s = 5.0;
   static constexpr std::size_t most_head = 2 + 8 + 4;  // bytes before the message: kind, length and mask
 
-  static Error refused(const std::string& what) { return Error("malformed", "WebSocket: got " + what); }
+  static Error rejected(const std::string& what) { return Error("malformed", "WebSocket: unexpected: " + what); }
 
   Error closed(const Bytes& payload) {
     send_reply_to_close(payload);
@@ -174,7 +174,7 @@ class WebSocket {
     const std::size_t size = frame_.size() - most_head;
     if (size > max_message)
       throw Error("too_large",
-                  "got a message of " + std::to_string(size) + " bytes, want 16 MiB at most; send JPEG, or smaller images");
+                  "expected a message of at most 16 MiB, got " + std::to_string(size) + " bytes; send JPEG or smaller images");
     const std::size_t bytes = size < 126 ? 0 : size < 65536 ? 2 : 8;
     std::uint8_t* const payload = frame_.data() + most_head;
     std::uint8_t* const mask = payload - 4;
