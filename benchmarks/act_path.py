@@ -57,7 +57,7 @@ class Entry(NamedTuple):
 
     at_s: float  # of `time.perf_counter`
     file: str
-    class_name: str  # of the object whose method it is; "" for another function
+    class_name: str  # class name of the object whose method it is; "" for another function
 
 
 class PathCounter(CallCounter):

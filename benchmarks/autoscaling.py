@@ -61,9 +61,9 @@ class AutoscalingPlan:
     robots: int = 12
     hz: float = 10.0
     workers: int = 8
-    seconds: float = 25.0  # of a burst
+    seconds: float = 25.0  # seconds of a burst
     alone_s: float = 5.0  # of a single robot
-    policy_ms: float = 40.0  # of a batch
+    policy_ms: float = 40.0  # policy of a batch
     batch: int = 2  # so that one replica gives 50 actions a second
     step_ms: float = 20.0
     steps: int = 50

@@ -1,5 +1,5 @@
-"""Round trips of the clients in other languages beside those of the Python client, in turns at one
-server.
+"""Round trips of the clients in other languages beside those of the Python client, interleaved at
+one server.
 
 Each client is a process, and all send the same raw pixels. Build the client in TypeScript first:
 `cd clients/typescript && npm ci && npm run build`. The one in C++ is compiled here, with the

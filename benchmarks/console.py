@@ -81,7 +81,7 @@ def use_cells(use: Mapping[str, Any]) -> list[str]:
 
 
 def show_use(found: Mapping[str, Any]) -> None:
-    """Print a row for each client: what an act uses of its process and of its server's
+    """Print a row for each client: the CPU time of one call in its process and in its server's
     processes.
     """
     rows = table("way", *USE_COLUMNS)

@@ -9,7 +9,7 @@ seed replays exactly. Checked at each command:
   also not from the measured pose after a stop;
 - no command after a stop or a pause until the operator at the robot has restarted it.
 
-`--relative` plays the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a
+`--relative` runs the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a
 violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
 
 `--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until
@@ -55,9 +55,9 @@ HZ = 50.0
 RUN_S = 3600.0  # a run of the control loop; the arm goes to its rest pose between two
 CHUNK = 50  # rows: 1 s
 INFERENCE_S = 0.03
-TIMEOUT_S = 10.0  # of a request
+TIMEOUT_S = 10.0  # timeout of a request
 FACTOR = 3.0  # a step above this multiple of the normal one is a jump
-_TURN = 2 * math.pi / (4 * HZ)  # of the path in a tick: one round takes 4 s
+_TURN = 2 * math.pi / (4 * HZ)  # turn of the path in a tick: one round takes 4 s
 _RADIUS = 0.5  # rad
 _SWAY = 0.0005  # rad, distance of the paths of two chunks
 _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
@@ -93,7 +93,7 @@ _EVERY_S = 45.0  # mean time between two faults
 
 
 class DayClock:
-    """Stands for the module `time` in those that run; it goes on by ticks, and its wall time may
+    """Stands for the module `time` in those that run; it advances by ticks, and its wall time may
     be set.
     """
 
@@ -131,7 +131,7 @@ class DayReport:
     # Ticks without the policy, by cause, in whole runs.
     held: dict[str, int] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
-    digest: str = ""  # of all commands
+    digest: str = ""  # digest of all commands
 
 
 class World:

@@ -25,8 +25,8 @@ class Driver(Protocol):
 class ProcessDriver(Driver, Protocol):
     """A driver whose client is another process."""
 
-    pid: int  # of the client, once it is ready
-    server_pid: int | None  # of the process that has started its server; None: this one
+    pid: int  # process id of the client, once it is ready
+    server_pid: int | None  # id of the process that has started its server; None: this one
 
 
 class ClientProcess(LineProcess):

@@ -22,11 +22,11 @@ from vlagents_ray.interface import Act, Obs
 
 TIMED_ENV = "benchmarks.environments:TimedEnv"  # its name for `make_env`
 SLEEPING_ENV = "benchmarks.environments:SleepingEnv"
-ACTION_DIM = 4  # of the latter
+ACTION_DIM = 4  # action dim of the latter
 
 
 class EpisodeTimes(NamedTuple):
-    """When an episode that was played to its end began and ended."""
+    """When an episode that was run to its end began and ended."""
 
     begun: float  # s of time.time(), before its reset
     ended: float  # after its last step

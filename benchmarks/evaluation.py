@@ -1,12 +1,12 @@
 """Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one
 machine.
 
-Each system plays the same episodes of one environment (`environments.TimedEnv`: same code, image
+Each system runs the same episodes of one environment (`environments.TimedEnv`: same code, image
 size, step limit, seeds and initial states) with a policy that does nothing behind its own server,
 by its own command, and keeps its results. A round runs each system once:
 
 - ours: `vlagents-ray eval`, which serves the policy for the length of the run;
-- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, its first
+- vlagents: `run-eval`, over shared memory. It runs one configuration in one process, its first
   variant here; the second splits the episodes into one configuration for each worker, each with its
   own process and server;
 - vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker;
@@ -84,12 +84,12 @@ class EvaluationPlan:
     """The episodes that all systems play."""
 
     episodes: int = 200  # in all
-    workers: int = 2  # 0: `vlagents-ray eval` plays in its own process
+    workers: int = 2  # 0: `vlagents-ray eval` runs in its own process
     rounds: int = 3
     size: int = 224  # pixels a side
     max_steps: int = 80  # nothing else ends an episode
     step_ms: float = 0.0  # additional CPU time of each env step
-    name: str = "tabletop"  # of the environment
+    name: str = "tabletop"  # name of the environment
     chunk: int = 1  # rows of an answer of ours
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ class Played(NamedTuple):
     """The figures of one command."""
 
     episodes_per_minute: float  # from the first reset to the last step
-    wall_s: float  # of the whole command
+    wall_s: float  # wall time of the whole command
     first_s: float | None = None  # from the start of the command to the first reset
     env_busy: float | None = None  # share of the workers' time, of ours alone
     policy_busy: float | None = None  # share of the replica's time, of ours alone
@@ -220,7 +220,7 @@ def alone(folder: Path) -> dict[str, str]:
 
 
 def our_run(plan: EvaluationPlan) -> Run:
-    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, plays
+    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, runs
     it itself.
     """
 
@@ -347,7 +347,7 @@ def main(
     ] = None,
 ) -> None:
     """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own
-    commands, in turns.
+    commands, interleaved.
     """
     with errors():
         plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms, env, chunk)

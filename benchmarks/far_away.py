@@ -45,7 +45,7 @@ class Row:
     longest_without_s: float
     spells: int  # stretches of ticks without an action of the policy
     spell_p50_s: float
-    age_p50_ms: float  # of the observation behind the executed actions of the policy
+    age_p50_ms: float  # median age of the observation behind the executed actions of the policy
     age_p99_ms: float
     step_p99: float  # distance of consecutive actions of the policy
     stops: int  # by the watchdog

@@ -30,10 +30,10 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdou
 HZ = 30.0
 CHUNK = 50  # rows: 1.7 s
 RESET_S, ACT_S = 10.0, 2.0  # time limits
-MAX_AGE_S = 3.0  # of the observation of an action that is executed
+MAX_AGE_S = 3.0  # max age of the observation of an action that is executed
 SILENCE_S = 2.0  # after which the watchdog stops the robot
-MAX_STEP = 0.2  # of the guard
-_TURN = 2 * np.pi / (4 * HZ)  # of the path in a tick: one round takes 4 s
+MAX_STEP = 0.2  # max step of the guard
+_TURN = 2 * np.pi / (4 * HZ)  # turn of the path in a tick: one round takes 4 s
 _SWAY = 0.03  # distance of the paths of two chunks
 _IMAGE = 224  # px
 # The player's options in each mode. With a deadline of 0, no tick waits for the network.

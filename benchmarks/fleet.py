@@ -79,12 +79,12 @@ class FleetPlan:
     row_ms: float = 8.06
     batch: int = 16
     warm: float = 10.0  # s before each measurement: all robots start at once
-    seconds: float = 20.0  # of each measurement
+    seconds: float = 20.0  # seconds of each measurement
     transport: str = "websocket"
     real_time_chunking: bool = False
     link: str | None = None  # rate of an emulated link, as `tc` takes it; None: no link
-    delay: str | None = None  # of the link, each way, as `tc` takes it; None adds none
-    python: Path = field(default=others.FOLDER / "bin" / "python")  # of the peers
+    delay: str | None = None  # delay of the link, each way, as `tc` takes it; None adds none
+    python: Path = field(default=others.FOLDER / "bin" / "python")  # python of the peers
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings as JSON values, from which `from_json` makes an equal plan."""
@@ -98,7 +98,7 @@ class FleetPlan:
         return cls(**{**settings, "kinds": kinds, "python": Path(settings["python"])})
 
     def fleet(self, robots: int) -> list[Kind]:
-        """Return the kind of each robot, in turns by their weights."""
+        """Return the kind of each robot, interleaved by their weights."""
         turn: list[Kind] = []
         for kind in self.kinds:
             turn += [kind] * kind.weight

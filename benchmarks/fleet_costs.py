@@ -43,7 +43,7 @@ from vlagents_ray.serve.queue.replica_pace import ReplicaPace, RobotPlan
 from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray.serve.scaling.autoscaling import MeasuredLoad
 
-_ROUNDS = 5  # of each measurement; the fastest one counts
+_ROUNDS = 5  # rounds of each measurement; the fastest one counts
 _STATS = ("utilisation", "waiting", "sessions", "slo_load", "slo_robots", "late_robots")
 _CONNECTIONS = 2000
 _CHECKED = 400  # replicas whose health one proxy checks

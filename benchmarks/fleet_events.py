@@ -35,7 +35,7 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray_cluster.tune.line_process import LineProcess
 from vlagents_ray_learn import Publisher
 
-_PARAMETERS = 30_000_000  # of the pushed model
+_PARAMETERS = 30_000_000  # parameters of the pushed model
 _AHEAD_S = 1.0
 _LATE_S = 60.0
 _LOOK_S = 1.0  # time before the next event at which sessions are counted
@@ -72,7 +72,7 @@ class EventPlan:
     robots: int = 48
     joining: int = 16  # robots that come at once
     hz: float = 10.0
-    rows: int = 50  # of an answer
+    rows: int = 50  # rows of an answer
     base_ms: float = 29.3
     row_ms: float = 8.06
     replicas: int = 2
@@ -118,7 +118,7 @@ def measure_events(
         joining = start_robots(stack, [robot] * plan.joining)
         begin = time.monotonic() + _AHEAD_S
         app = document.applications[0].name
-        sessions: list[list[int]] = []  # of the replicas, at the end of each event
+        sessions: list[list[int]] = []  # sessions of the replicas, at the end of each event
         moments = [_SETTLE_S + number * plan.gap_s for number in range(4)]
         end_s = moments[-1]
         _send(running, begin, begin + end_s)

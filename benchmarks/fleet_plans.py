@@ -3,7 +3,7 @@
 
 `python -m benchmarks.fleet_plans` measures ten fleets: each model is served with the replicas,
 batches and shares of a GPU of the plan, by a policy that takes the time of the cost curve without
-computing, and each robot runs with two cameras in a process of its own kind, as in
+computing, and each robot runs with two cameras in a separate process kind, as in
 `benchmarks.fleet`. `--files` measures files of fleets instead. `--loads` measures nothing: it
 simulates one replica with as many robots as different loads allow, from which the default of
 `max_load` was chosen.

@@ -1,10 +1,9 @@
 """Robots that execute the chunks of a policy at their rate: `python -m benchmarks.fleet_robots
 JSON`.
-
-The process connects its robots, and writes "ready". Each line that it then reads is a run,
+ The process connects its robots, and writes "ready". Each line that it then reads is a run,
 {"begin": s, "counted": s, "end": s} of `time.monotonic`; at the end it writes what happened at each
-robot's ticks from `counted` on. A robot whose policy is late holds still at that tick, and goes on
-at the next one: the load does not slow down with the server.
+robot's ticks from `counted` on. A robot whose policy is late holds still at that tick, and
+continues at the next one: the load does not slow down with the server.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Robot:
     hz: float
     chunk: int  # rows of an answer
     rows: int | None = None  # rows of an answer that it executes at most; None: all
-    way: str = "websocket"  # of our client; else "openpi", "vlagents", "ray serve"
+    way: str = "websocket"  # way of our client; else "openpi", "vlagents", "ray serve"
     states_slack: bool = True  # whether the server learns how long the answer can wait
     real_time_chunking: bool = False
     age_ms: float | None = None  # largest age of an action in its SLO
@@ -159,7 +158,7 @@ class RunningRobot:
             horizon=robot.rows,
             real_time_chunking=robot.real_time_chunking,
             timeout_s=TIMEOUT_S,
-            # No arm moves, but the player refuses what does not fit the policy's actions.
+            # No arm moves, but the player rejects what does not fit the policy's actions.
             safe="zero" if is_relative else "hold",
         )
         self._player = ChunkPlayer(agent, settings)
@@ -200,7 +199,7 @@ class RunningRobot:
                 "failed": str(error),
             }
 
-        # A robot that still waits for its first answer holds, too.
+        # A robot that still waits for its first answer holds.
         waited_s = max(0.0, min(time.monotonic(), end) - counted)
         ticks = starved = round(waited_s * robot.hz)
         pacer = Pacer(robot.hz)

@@ -1,4 +1,4 @@
-"""Runs of the robots of `benchmarks.fleet_robots`, in processes of their own, and their figures."""
+"""Runs of the robots of `benchmarks.fleet_robots`, in separate processes, and their figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ROBOTS_A_PROCESS = 16
 class RobotsRun:
     """The figures of robots, and the CPU time that they and their servers took, s."""
 
-    figures: Sequence[Mapping[str, Any]]  # of each robot
+    figures: Sequence[Mapping[str, Any]]  # figures of each robot
     client_cpu_s: float
     server_cpu_s: float
 
@@ -35,7 +35,7 @@ class RobotsRun:
 def run_robots(
     fleet: Sequence[Robot], warm: float, seconds: float, prefix: Sequence[str] = ()
 ) -> RobotsRun:
-    """Run robots in processes of their own, all of which begin at once.
+    """Run robots in separate processes, all of which begin at once.
 
     Args:
         fleet: The robots.

@@ -40,7 +40,7 @@ TRANSPORT_S = 0.005
 # (docs/measured_gpu.md), but nothing changes meanwhile.
 START_S = 20.0
 MORNING_S = 60.0  # within which all robots start
-STEADY_S = 15.0  # after which something happens to robots that have started within 5 s
+STEADY_S = 15.0  # time of the event; all robots have started within 5 s
 REPAIR_S = 30.0  # after which lost machines are back
 UPDATED_AT_ONCE = 0.2  # share of the replicas: Ray Serve's rolling_update_percentage
 DRAIN_S = 5.0  # within which the sessions of a leaving replica have moved
@@ -71,13 +71,13 @@ class Outcome:
     """What the robots got from the event of a scenario on."""
 
     scenario: str
-    share: float  # of ticks in time
-    worst_share: float  # of the worst second
+    share: float  # share of ticks in time
+    worst_share: float  # share of the worst second
     in_time_s: float  # after the event, until at least 98 % of ticks are in time in each second
     all_in_time_s: float  # until at least 98 % of the further ticks of each robot are in time
     late_robots: int  # with less than 98 % of all their ticks in time
-    moves: int  # of sessions
-    most_sessions: int  # of one replica, at the end
+    moves: int  # moves of sessions
+    most_sessions: int  # largest number of sessions of one replica, at the end
     requests: int
     cpu_s: float
 

@@ -36,7 +36,7 @@ from vlagents_ray.serve.launch.server import Server, running_server
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 POLICY = "benchmarks.live:Measured"  # its `reset` returns the id of the replica's process
-TRANSPORTS = ("websocket", "http", "shm")  # of clients outside of Ray
+TRANSPORTS = ("websocket", "http", "shm")  # transports of clients outside of Ray
 CURVES = ("sessions", "replicas")
 _PROCESSES = 4  # shared by the robots
 _AHEAD_S = 0.5  # by which the clients' processes know when to begin
@@ -50,11 +50,11 @@ class GrowthPlan:
     """The settings of `measure_growth`."""
 
     robots: int = 64
-    hz: float = 10.0  # of each robot
+    hz: float = 10.0  # rate of each robot
     sessions: Sequence[int] = (1, 4, 16, 64, 256, 1000)
     replicas: Sequence[int] = (1, 2, 4, 8)
     acts_per_s: float = 50.0  # of all sessions of a point of a curve
-    seconds: float = 20.0  # of each measurement
+    seconds: float = 20.0  # seconds of each measurement
     transport: str = "websocket"
 
 

@@ -1,5 +1,5 @@
 """Cost of a child process behind the replica: `act` of a policy that does nothing, in either
-process, in turns.
+process, interleaved.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 
 _NETWORK = "198.18.0."  # RFC 2544's, for tests of networks
 _TOOLS = ("ip", "tc", "unshare", "nsenter", "setpriv", "mount")
-_PORT = 6379  # of Ray's head, its default: each host has all ports
+_PORT = 6379  # port of Ray's head, its default: each host has all ports
 _BEGIN_S = 10.0
 _RAY_S = 300.0  # an evaluation on four workers took more than 120 s on a busy machine
 # The first process of a host: ends nothing, and waits for orphans, which would stay zombies.
@@ -51,7 +51,7 @@ class Host:
 
     number: int
     folder: Path  # outside, for its private files
-    pid: int  # of its first process, in the outer namespace
+    pid: int  # process id of its first process, in the outer namespace
     switch: int  # of the switch's process
     # Variables of its processes, in addition to this process's.
     environment: dict[str, str] = field(default_factory=dict)

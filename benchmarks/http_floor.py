@@ -1,6 +1,6 @@
 """HTTP with JPEG against its floor: a bare application that answers 200, with coded images.
 
-In one run, in turns: our HTTP and WebSocket clients, vlagents' JPEG client, and the bare
+In one run, interleaved: our HTTP and WebSocket clients, vlagents' JPEG client, and the bare
 application, once directly and once behind an HAProxy with the settings of a server. The bare
 application only decodes the frame. Its client only encodes one, and posts it by `http.client`. So a
 round trip to it is the least that a request with these images takes on that way.

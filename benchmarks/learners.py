@@ -92,8 +92,8 @@ class Sizes:
     """The amount of work of each learner and of the evaluations."""
 
     recorded: int = 800  # episodes that `dagger` and `cloning` run
-    steps: int = 600  # of the optimizer, in `dagger` and `cloning`
-    iterations: int = 20  # of `grpo` and `ppo`
+    steps: int = 600  # steps of the optimizer, in `dagger` and `cloning`
+    iterations: int = 20  # iterations of `grpo` and `ppo`
     rollouts: int = 512  # episodes of an iteration
     held_out: int = 500  # episodes of the tabletop
     metaworld: int = 25  # episodes of each task of Meta-World; 0: none

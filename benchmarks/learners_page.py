@@ -28,7 +28,7 @@ NAMES = {
     "grpo": "GRPO",
     "ppo": "PPO",
 }
-KINDS = ("demonstrations", "rollouts", "interventions")  # of episodes
+KINDS = ("demonstrations", "rollouts", "interventions")  # kinds of episodes
 # The 97.5 % quantiles of Student's t-distribution, from 1 degree of freedom on.
 _T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
@@ -38,15 +38,15 @@ class LearnerRow:
     """The figures of all runs of a learner with the same number of optimizer steps."""
 
     learner: str
-    steps: int | None  # of the optimizer, if they are a setting
+    steps: int | None  # steps of the optimizer, if they are a setting
     seeds: tuple[int, ...]
     episodes: Mapping[str, float]  # by kind, means of the runs
     cpu_s: float | None  # mean of the runs whose CPU time was measured
     cpu_runs: int  # their number
-    success: tuple[float, ...]  # of each run, in [0, 1]
-    gains: tuple[float, ...]  # of each run over the policy before it
-    pairs: Pairs | None  # of the episodes of a single run; None if there are several runs
-    largest_p: float | None  # of McNemar's tests of the runs; None if a run has none
+    success: tuple[float, ...]  # success of each run, in [0, 1]
+    gains: tuple[float, ...]  # gains of each run over the policy before it
+    pairs: Pairs | None  # pairs of the episodes of a single run; None if there are several runs
+    largest_p: float | None  # largest p of McNemar's tests of the runs; None if a run has none
     metaworld: tuple[int, int] | None  # solved episodes and all, of all runs that were evaluated
 
 

@@ -93,7 +93,7 @@ class Turn(NamedTuple):
     """The robots' figures for one turn of one setting."""
 
     acts_per_s: float  # of the saturated robot
-    cpu_ms: float  # of the replica's process, for each act of any robot
+    cpu_ms: float  # CPU time of the replica's process, for each act of any robot
     saturated_ms: list[float]
     paced_ms: list[float]  # of those of 50 Hz
     messages_per_s: float  # of all viewers

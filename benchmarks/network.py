@@ -16,7 +16,7 @@ Span = tuple[float, float, str]  # begin and end, µs, and the name of a kernel
 
 _SHOWN = 5  # gaps
 _CORE = "core "  # begin of the names of the profiler's records of cores
-_NAME_CHARACTERS = 90  # of a kernel
+_NAME_CHARACTERS = 90  # number of characters of a kernel
 # In torch's warning; its debug mode warns of itself in other words.
 _WAIT = "called a synchronizing CUDA operation"
 
@@ -29,7 +29,7 @@ class NetworkTimer:
 
     def __init__(self) -> None:
         self._spans: list[tuple[Any, Any]] | None = None  # None unless `measure` runs
-        self._names: set[str] = set()  # of the cores
+        self._names: set[str] = set()  # names of the cores
         self._is_annotating = False  # whether `kernels` runs
         self._inside = False  # whether a core runs; one may call another
 

@@ -1,8 +1,8 @@
 """Overhead of an evaluation over the bare environments: steps a second, in alternating rounds.
 
 A bare round steps the environments in as many processes as the evaluation has workers, with zeros
-as actions and no policy, server or Ray. An evaluated round plays the same episodes with a served
-`noop` policy. Both count the steps made while all workers were playing, with the gaps between
+as actions and no policy, server or Ray. An evaluated round runs the same episodes with a served
+`noop` policy. Both count the steps made while all workers were running, with the gaps between
 episodes, but without the creation of environments and the wait for the first and the last worker.
 CPU time is that of the same span: of all bare processes, or of all processes of the evaluation
 (driver, workers, replica, HAProxy and Ray's daemons).

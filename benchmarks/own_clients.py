@@ -185,7 +185,7 @@ class ActorDriver:
     """A client in a Ray actor, as rollouts are."""
 
     actor: Any
-    pid: int = 0  # of the actor's process, once it is ready
+    pid: int = 0  # process id of the actor's process, once it is ready
     server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class PlacementPlan:
     """The robots and the replicas."""
 
     replicas: int = 8
-    robots: int = 36  # of each kind, for each replica: a load of 0.86
+    robots: int = 36  # robots of each kind, for each replica: a load of 0.86
     begin_within_s: float = 60.0
     seconds: float = 120.0
 
@@ -41,10 +41,10 @@ class PlacementPlan:
 class Placement:
     """What the robots got."""
 
-    share: float  # of their ticks in time
+    share: float  # share of their ticks in time
     robots_in_time: int  # with at least 98 % of their ticks in time
     robots: int
-    largest_load: float  # of a replica at the end, as a multiple of the mean load
+    largest_load: float  # largest load of a replica at the end, as a multiple of the mean load
     moves: int
 
 

@@ -53,9 +53,9 @@ from vlagents_ray_cluster.tune.measured_policy import (
 class PolicyPlan:
     """The settings of `measure_policy`."""
 
-    args: ServerArgs  # of a deployment file
+    args: ServerArgs  # arguments of a deployment file
     batches: Sequence[int] = (1, 8)
-    seconds: float = 2.0  # of each measurement
+    seconds: float = 2.0  # seconds of each measurement
     rounds: int = 3  # in which all measurements take turns
     side: int = 224  # px, of images if the policy takes any size
     # Sizes of the parts of the state that the policy leaves open.

@@ -41,7 +41,7 @@ benchmarks.report` writes this page.
 # Beside the page.
 PICTURE = Path("pictures", "league.svg")
 THROUGHPUT_PICTURE = Path("pictures", "throughput.svg")
-Results = Mapping[str, Any]  # of `collect`
+Results = Mapping[str, Any]  # results of `collect`
 
 ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"

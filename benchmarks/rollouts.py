@@ -1,5 +1,5 @@
 """Steps a second of `Rollouts` against a plain loop of the same environments and policy in one
-process, in turns.
+process, interleaved.
 
 The loop is a learner's first program: it steps environments one after another, calls the policy
 once for all, and collects arrays. `Rollouts` steps as many environments in workers, with a server
@@ -73,7 +73,7 @@ def loop(
     agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool
 ) -> float:
     """Return the steps a second of `episodes` episodes in this process, whose arrays are kept
-    until all are played.
+    until all are run.
     """
     envs = [Tabletop(**options) for _ in range(num_envs)]
     seeds, steps, begun = itertools.count(), 0, time.perf_counter()
@@ -113,9 +113,7 @@ class RolloutComparison:
 
     def __post_init__(self) -> None:
         if unknown := set(self.policies) - set(_POLICIES):
-            raise ConfigError(
-                f"policies: expected only {list(_POLICIES)}, got {sorted(unknown)}"
-            )
+            raise ConfigError(f"policies: expected only {list(_POLICIES)}, got {sorted(unknown)}")
         if odd := [envs for envs in self.envs if envs % min(envs, self.workers)]:
             raise ConfigError(
                 f"--envs: expected multiples of the {self.workers} workers, or 1, got {odd}"

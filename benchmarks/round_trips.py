@@ -138,7 +138,7 @@ def measure(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure our clients, and others by name with their own servers, in turns."""
+    """Measure our clients, and others by name with their own servers, interleaved."""
     others = others or {}
     drivers: dict[str, ProcessDriver] = {}
     with contextlib.ExitStack() as stack:

@@ -57,7 +57,7 @@ def main(
     out_file: Out = None,
 ) -> None:
     """Measure round trips and CPU time of acts on this machine: every transport, and other
-    policy servers, in turns.
+    policy servers, interleaved.
     """
     with errors():
         origin = measured_on("python -m benchmarks.rtt")

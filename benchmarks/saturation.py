@@ -49,13 +49,13 @@ class Load:
     """What the workers do."""
 
     workers: int = 1000
-    steps: int = 250  # of an episode
+    steps: int = 250  # steps of an episode
     episode_s: float = 30.0
     chunk: int = 8  # rows of an answer, all executed
     act_ms: float = 60.0  # of a batch
     batch: int = 16
     replicas: int = 16  # one a GPU
-    cameras: int = 2  # of 224 x 224, in the transitions of a learner
+    cameras: int = 2  # cameras of 224 x 224, in the transitions of a learner
     mbit: float = 10_000.0  # Mbit/s of a node's link
 
     @property
@@ -69,7 +69,7 @@ class Part:
     """A part of the cluster: its load as a share of its capacity is `base` + `each` x workers."""
 
     name: str
-    unit: str  # of the capacity
+    unit: str  # unit of the capacity
     base: float
     each: float
 

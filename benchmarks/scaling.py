@@ -3,7 +3,7 @@
 Environment and policy sleep, so that many workers run on few cores and only the overhead is
 measured. On clusters of one to three hosts (`benchmarks.hosts`), or on a running one, evaluations
 with increasing numbers of workers take turns with one of a single worker; the rate is that while
-all were playing, so that their start does not count. Every node has a replica for each of its
+all were running, so that their start does not count. Every node has a replica for each of its
 workers, so that none waits for another's batch. Links between the hosts have the given rate and
 delay, and the bytes that hosts send are counted, from the begin of an evaluation to its end. On the
 first cluster, all workers also share one replica a node, with single actions and with chunks.
@@ -41,7 +41,7 @@ from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 # applications: a replica a worker; one a node, acts and chunks.
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"
 CHUNK = 8  # rows
-IMAGE_BYTES = 224 * 224 * 3  # of each act's observation
+IMAGE_BYTES = 224 * 224 * 3  # image bytes of each act's observation
 _START_S = 300.0
 _PLAY_S = 600.0
 _LATE_S = 1.0  # longest delay between the starts of two workers
@@ -61,10 +61,10 @@ class ScalingPlan:
     rounds: int = 3
     step_ms: float = 20.0
     policy_ms: float = 50.0
-    steps: int = 50  # of an episode
+    steps: int = 50  # steps of an episode
     seconds: float = 8.0  # in which all workers play together, about
     mbit: float = 1000.0  # Mbit/s of a link between two hosts, each way
-    delay_ms: float = 5.0  # of such a link, each way
+    delay_ms: float = 5.0  # delay of such a link, each way
 
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
@@ -196,7 +196,7 @@ def row(
     """Compute medians over rounds; `single` has the episodes of one worker in the same rounds.
 
     Linear is that many times the single worker of the round; with chunks, which no single worker
-    played, the rate that the sleeps alone allow.
+    run, the rate that the sleeps alone allow.
     """
     rates = [one.rate for one in played]
     sent = [one.sent_bytes / one.acts for one in played if one.sent_bytes is not None]

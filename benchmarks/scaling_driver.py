@@ -40,7 +40,7 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 NEAR = ("shm", "plasma", "local")  # transports within a node
-DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # daemons of this node
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class ScalingRound:
     """An evaluation to play."""
 
     workers: int
-    episodes: int  # of each worker
+    episodes: int  # episodes of each worker
     steps: int
     step_ms: float
     app: str | None = None  # None: a policy in each worker's own process, which takes no time
@@ -75,19 +75,19 @@ class ScalingRound:
 class PlayedEpisodes(NamedTuple):
     """The figures of a `ScalingRound`."""
 
-    # While all workers were playing; None with a policy in their own processes.
+    # While all workers were running; None with a policy in their own processes.
     episodes_per_minute: float | None
-    wall_s: float  # of the whole evaluation, start of the workers included
+    wall_s: float  # wall time of the whole evaluation, start of the workers included
     transports: list[str]
     failures: int  # attempts
     # From the first recorded episode to the last:
     episodes: int
     span_s: float
-    busy_s: float  # that workers were playing, added up
+    busy_s: float  # that workers were running, added up
     driver_s: float  # CPU time of this process
     daemons_s: dict[str, float]  # and of Ray's on this node
     near: float = 1.0  # share of the workers whose observations do not leave their node
-    acts: int = 1  # of all recorded episodes
+    acts: int = 1  # acts of all recorded episodes
     # By all hosts to others, start of the workers included; None: not counted.
     sent_bytes: int | None = None
 
@@ -119,7 +119,7 @@ class ScalingLedger(Progress):
 
 def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
     """Play a round; `out` is a new folder. Raises `EnvFailed` if its workers were never all
-    playing.
+    running.
     """
     policy = PolicyConfig(name="noop", url=None if one.app is None else f"serve://{one.app}")
     options: dict[str, Any] = {"step_ms": one.step_ms, "max_steps": one.steps, "size": one.size}

@@ -35,7 +35,7 @@ from vlagents_ray.slo import SHARE
 
 PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled: s
 FRESH = RobotNeed(hz=10.0, rows=8, age_s=0.2)  # a replica of pi0 serves seven such robots
-_STEP_S = 1.0  # of virtual time
+_STEP_S = 1.0  # step of virtual time
 _WINDOW_S = 10  # over which a robot's share is computed
 
 
@@ -46,7 +46,7 @@ class SimulatedFleet:
     need: RobotNeed = FRESH
     costs: CostCurve = PI0
     max_batch_size: int = 16
-    start_s: float = 30.0  # of a replica
+    start_s: float = 30.0  # start of a replica
     # From the start of a replica until its share of the sessions has moved to it: it tells the
     # others that it has started, and their clients reconnect after their next answers.
     move_s: float = 2.0
@@ -137,7 +137,7 @@ def simulate(
     ready_at = [0.0]  # when each replica holds its share of the robots
     reports: list[_Report] = []
     reported_robots = 0
-    shares: list[float] = []  # of ticks missed, in the last seconds
+    shares: list[float] = []  # shares of ticks missed, in the last seconds
     trace = []
     now = 0.0
     while now < seconds:

@@ -4,7 +4,7 @@ episodes.
 Images are small and steps few, so that the work around an episode is measured. The gap is the time
 between an episode's last step and the next one's reset in the same worker: the result, its way to
 the driver, the database, and the next job. The youngest worker is killed at intervals; the eldest
-plays from the first episode to the last, and its memory and the driver's are sampled.
+runs from the first episode to the last, and its memory and the driver's are sampled.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class SoakWatcher:
                 since = time.monotonic()
 
     def _kill(self) -> bool:
-        """Kill the youngest worker, once all are playing."""
+        """Kill the youngest worker, once all are running."""
         playing = [pid for pid in self._seen if is_worker(pid)]
         if len(playing) < self._soak.workers:
             return False
@@ -335,7 +335,7 @@ def main(
     out_file: Out = None,
 ) -> None:
     """Play many short episodes while workers are killed: check memory, overhead, and that each
-    is played once.
+    is run once.
     """
     with errors():
         found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)

@@ -1,6 +1,6 @@
 """Does what makes a policy fast, or carries its images and actions, cost success?
 
-The reference policy plays the same seeds of the tabletop in each way of serving: eager and without
+The reference policy runs the same seeds of the tabletop in each way of serving: eager and without
 Ray, which is the standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with
 JPEG; with each way of executing chunks, at delays; with LoRA merged and apart; after a push; behind
 `upstream` by each protocol. A paired test (McNemar, adjusted by Holm for all ways) compares each
@@ -48,9 +48,9 @@ STANDARD = "eager, in this process"
 APP = "reference"
 CHUNK, EXECUTE = 8, 4  # rows
 TOGETHER = 16  # episodes of a batch
-QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
+QUALITIES = (30, 50, 70, 85, 95)  # qualities of JPEG; 85 is the client's
 DELAYS = (0.0, 0.05, 0.15)  # s
-HZ = 20.0  # of the clock at those delays: none, one and three ticks
+HZ = 20.0  # rate of the clock at those delays: none, one and three ticks
 # What is executed meanwhile: nothing, the old plan, or what the new one continues.
 LATE: dict[str, dict[str, Any]] = {
     "stop and wait": {"meanwhile": "zero"},
@@ -101,7 +101,7 @@ class Way:
     """A way of serving the reference policy."""
 
     name: str
-    config: dict[str, Any] = field(default_factory=dict)  # of the policy
+    config: dict[str, Any] = field(default_factory=dict)  # config of the policy
     adapter: bool = False  # acts with the adapter
     merged: bool = False  # the checkpoint has the adapter in its weights
     transport: TransportName | None = None  # None: the policy is in this process

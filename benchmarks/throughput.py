@@ -66,7 +66,7 @@ class ThroughputPlan:
     num_gpus: float = 0  # that Ray gives to the replica
     batch: int = 16
     clients: Sequence[int] = (1, 2, 4, 8, 16, 32)  # the last, the most, is measured in each round
-    seconds: float = 2.0  # of each measurement
+    seconds: float = 2.0  # seconds of each measurement
     rounds: int = 3
     robot_seconds: float = 10.0
     transports: Sequence[str] = DEFAULT_TRANSPORTS

@@ -1,5 +1,5 @@
 """TorchRL's own VLA recipe, GRPO on its toy environment, with its inference server and with this
-one, in turns.
+one, interleaved.
 
 The recipe is `sota-implementations/vla_grpo` of a checkout of TorchRL (github.com/pytorch/rl),
 copied to a temporary folder; with this server, its `utils.py` has one more line. Success is that of

@@ -1,4 +1,5 @@
-"""Overhead of `upstream` over another policy server: one `act`, directly and through us, in turns.
+"""Overhead of `upstream` over another policy server: one `act`, directly and through us,
+interleaved.
 
 The server has openpi's protocol and answers at once, so that only the transport takes time. It is
 called like openpi's own client does, by the policy `upstream` as from our batch queue, and through

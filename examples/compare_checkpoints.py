@@ -1,11 +1,11 @@
 """Compare two checkpoints: is the later one better, or was it luck?
 
 Both play the same episodes; the decisive ones are those that only one checkpoint solves. `python
-compare_checkpoints.py` plays 2 x 40 episodes in this process, in seconds, and prints the difference
+compare_checkpoints.py` runs 2 x 40 episodes in this process, in seconds, and prints the difference
 with its interval and McNemar's test, for each environment and for all. The checkpoints are
 simulated: an expert whose hand drifts less after longer training.
 
-`vlagents-ray eval` plays your own checkpoints, and the same lines compare them
+`vlagents-ray eval` runs your own checkpoints, and the same lines compare them
 (docs/tutorials/checkpoints.md). `vlagents-ray merge` combines results of different runs in one
 folder.
 """

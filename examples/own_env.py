@@ -48,7 +48,7 @@ class CraneEnv(EvalEnv):
 
     @property
     def contract(self):
-        """The observations and actions: a policy that does not fit is refused before the first
+        """The observations and actions: a policy that does not fit is rejected before the first
         step.
         """
         return Contract(

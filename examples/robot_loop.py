@@ -1,7 +1,7 @@
 """A robot's loop: a steady rate, a guard that checks every action before the arm executes it, and a
 watchdog.
 
-The arm is simulated, and the policy draws joint targets at random. So the guard refuses distant
+The arm is simulated, and the policy draws joint targets at random. So the guard rejects distant
 targets, and the arm holds its pose at those ticks. In two terminals:
 
     vlagents-ray serve random --set chunk=10 --set low=-0.3 --set high=0.3

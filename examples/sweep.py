@@ -1,11 +1,11 @@
 """Evaluate a sweep over the rotation of a camera from its calibration and the noise of actions.
 
 Two policies differ in an option of their resets, and five suites in an option of the environment:
-ten cases, all on the same seeds. `python sweep.py`, in the folder of this file, plays them in this
+ten cases, all on the same seeds. `python sweep.py`, in the folder of this file, runs them in this
 process, in seconds, with the policy and the environment of own_policy.py and own_env.py; run again,
 it continues an interrupted sweep.
 
-As a file, the same plan is played by `vlagents-ray eval FILE` with a served policy and many
+As a file, the same plan is run by `vlagents-ray eval FILE` with a served policy and many
 workers: examples/evaluations/sweep.yaml sweeps over the checkpoints of a training run,
 examples/evaluations/realtime.yaml over latencies.
 """

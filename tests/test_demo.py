@@ -1,4 +1,4 @@
-"""The recorded session of the docs: its data are what the policy does, and its page plays them."""
+"""The recorded session of the docs: its data are what the policy does, and its page runs them."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def said(
     finally:
         for module in set(sys.modules) - before:
             if Path(getattr(sys.modules[module], "__file__", None) or "/").parent == folder:
-                del sys.modules[module]  # the next test has a copy of its own
+                del sys.modules[module]  # the next test has a separate copy
     return capsys.readouterr().out
 
 

@@ -159,7 +159,7 @@ def test_a_robot_has_the_command_that_drives_it(robot: Path) -> None:
 
 
 def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
-    # The interpreter's start, too.
+    # The interpreter's start.
     code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"
     # Beside others that want the caches, it takes longer.
     assert any(float(run(robot, code)) < 0.5 for _ in range(10))

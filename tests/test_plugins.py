@@ -62,7 +62,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
     monkeypatch.syspath_prepend(tmp_path)
     for module in [name for name in sys.modules if name.partition(".")[0] == "lab_policies"]:
-        monkeypatch.delitem(sys.modules, module)  # of another test's folder
+        monkeypatch.delitem(sys.modules, module)  # it may come from the folder of another test
     yield write
     registry._installed_entry_points.cache_clear()
 

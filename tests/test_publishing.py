@@ -72,7 +72,7 @@ def test_the_makefile_holds_ray_at_the_versions_of_a_server() -> None:
 
 
 def test_the_flood_table_is_played_whole_each_night() -> None:
-    """`make integrations` plays a part of its rows, for too short a time for p99."""
+    """`make integrations` runs a part of its rows, for too short a time for p99."""
     table = "tests/serve/test_flood.py"
     settings = set(re.findall(r"VLAGENTS_FLOOD_[A-Z]+", (ROOT / table).read_text()))
     assert settings == {"VLAGENTS_FLOOD_ALL", "VLAGENTS_FLOOD_SECONDS"}

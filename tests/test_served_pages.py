@@ -38,7 +38,7 @@ _SERVED = [
     for block in blocks(page.read_text())
     if block.server
 ]
-# Of examples/: a loop in which the guard refuses the random policy's actions, and the notebook.
+# Of examples/: a loop in which the guard rejects the random policy's actions, and the notebook.
 _LOOP = (
     "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* a step of at most "
     "max_step' said"

@@ -26,7 +26,7 @@ CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame
 STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
 _JOINTS = "joints"  # the only part of `observation.state` if nothing else is known
-Centre = float | tuple[float, float, float]  # of an angle, or of a rotation vector, rad
+Centre = float | tuple[float, float, float]  # centre of an angle, or of a rotation vector, rad
 _TURN = 2 * math.pi
 _USUAL = {"joints": "rad", "xyzrpy": "m+rad"}
 _SLACK = 1e-3  # rad: float32 angles may slightly exceed pi
@@ -36,7 +36,7 @@ _SLACK = 1e-3  # rad: float32 angles may slightly exceed pi
 class DatasetContract:
     """The meaning of the numbers and images of a dataset."""
 
-    contract: Contract  # of a policy that is trained on the dataset
+    contract: Contract  # contract of a policy that is trained on the dataset
     # The concatenated parts of `observation.state`; "gripper" is `Obs.gripper`.
     state: tuple[str, ...] = ()
     cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera

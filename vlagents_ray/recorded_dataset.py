@@ -84,7 +84,7 @@ class RecordedSession:
     """The episodes of one session in order; in a public dataset, a single episode."""
 
     episodes: tuple[RecordedEpisode, ...]
-    options: Mapping[str, Any]  # of the reset
+    options: Mapping[str, Any]  # options of the reset
 
 
 class RecordedDataset:
@@ -157,7 +157,7 @@ class RecordedDataset:
             return [RecordedSession((episode,), {}) for episode in episodes]
 
         by_session: dict[int, list[RecordedEpisode]] = {}
-        options: dict[int, str] = {}  # of the session's first reset
+        options: dict[int, str] = {}  # options of the session's first reset
         for episode in episodes:
             columns = self.columns(episode, [SESSION, "reset"])
             session = columns[SESSION][0]

@@ -65,7 +65,7 @@ class RegistryEntry:
     extra: str | None = None  # extra of its distribution that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
-    tasks: str = "/<task>"  # of an environment or a robot: the pattern after its name
+    tasks: str = "/<task>"  # tasks of an environment or a robot: the pattern after its name
     deployment: str | None = None  # file of deployments/ with its settings; None: its own name
     weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
     # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page

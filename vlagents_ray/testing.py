@@ -566,7 +566,7 @@ class _Rollout:
     instruction: str
     observations: list[Obs]  # the env's own objects
     copies: list[Obs]  # copies of them, made immediately
-    outcomes: list[Any]  # of each step: reward, terminated, truncated and success
+    outcomes: list[Any]  # outcomes of each step: reward, terminated, truncated and success
 
 
 @dataclass(slots=True)

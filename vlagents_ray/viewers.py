@@ -52,7 +52,7 @@ class ViewerFrame:
     change later.
     """
 
-    tick: int  # of the episode
+    tick: int  # tick of the episode
     time: float  # s since 1970, of the observation
     cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
     # (D,) float32; the gripper is a part.

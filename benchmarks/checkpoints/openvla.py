@@ -34,7 +34,7 @@ _SENTENCES = (
 class PrismaticSize:
     """An OpenVLA smaller than the published one."""
 
-    text: dict[str, Any]  # of the language model's config
+    text: dict[str, Any]  # text of the language model's config
     backbones: tuple[str, str]  # models of timm
     side: int = _SIDE  # px, of their images
 

@@ -22,9 +22,9 @@ _SPARE_TOKENS = 8
 class Pi0Size:
     """A π0 smaller than the published one."""
 
-    width: int  # of the language model and of the vision tower
+    width: int  # width of the language model and of the vision tower
     expert_width: int
-    layers: int  # of the language model and of the expert
+    layers: int  # layers of the language model and of the expert
     vision_layers: int
     patch: int = _PATCH  # px
 

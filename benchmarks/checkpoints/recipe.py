@@ -16,7 +16,7 @@ class Recipe:
     family: str
     folder: Path  # absolute; it exists
     size: SizeName
-    dtype: str  # of the weights
+    dtype: str  # dtype of the weights
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,10 +24,10 @@ _LARGEST_BATCH = 32
 class Family:
     """A family of policies."""
 
-    module: str  # of this folder
+    module: str  # module of this folder
     environment: str  # the name of its requirements: `vlagents-ray venv create NAME`
-    packages: tuple[str, ...]  # of that environment
-    dtypes: tuple[str, ...] = ("bfloat16", "float32")  # of the weights, the usual one first
+    packages: tuple[str, ...]  # packages of that environment
+    dtypes: tuple[str, ...] = ("bfloat16", "float32")  # dtypes of the weights, the usual one first
 
 
 FAMILIES = {

@@ -26,7 +26,7 @@ _TYPES = {
     "int32": "I32",
     "bool": "BOOL",
 }
-_SPREAD = 0.1  # of scales around 1, and of biases around 0
+_SPREAD = 0.1  # spread of scales around 1, and of biases around 0
 
 
 @contextmanager

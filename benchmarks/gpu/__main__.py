@@ -1,7 +1,7 @@
 """What only a GPU can show: `make gpu`, in two runs of at most seven minutes each. It needs neither
 Ray nor a network.
 
-Each step runs in a process of its own within a time limit, so that a crash costs one step. The
+Each step runs in a separate process within a time limit, so that a crash costs one step. The
 limits of a run fit into its time, and its plan is printed first; further steps are taken while time
 is left. After each step, the folder `--out` has what was found so far: gpu.json, gpu.md with
 tables, and gpu.log with the output of all steps. The exit status is 0 if all criteria were met.

@@ -18,8 +18,8 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.registry import require
 
-_ROWS = 512  # of a square matrix, whose sums are kernels of some microseconds
-_OPERATIONS = 2000  # of each graph, about a fifth of those of π0
+_ROWS = 512  # rows of a square matrix, whose sums are kernels of some microseconds
+_OPERATIONS = 2000  # operations of each graph, about a fifth of those of π0
 _CAPTURES = 5
 
 

@@ -1,4 +1,4 @@
-"""The fleet experiment with π0 itself, without Ray: robots in processes of their own, whose ticks
+"""The fleet experiment with π0 itself, without Ray: robots in separate processes, whose ticks
 come whatever the policy does.
 """
 
@@ -15,7 +15,7 @@ from benchmarks.gpu.lab import Lab
 from benchmarks.policy import BareAndQueued
 from vlagents_ray.serve.fleet import CostCurve, RobotNeed, most_robots
 
-SHORT_ROWS = 8  # of an answer, that robots with short chunks execute
+SHORT_ROWS = 8  # short rows of an answer, that robots with short chunks execute
 # Rate, whether robots execute whole chunks, and numbers of robots, as shares of those that the
 # measured batches serve by arithmetic.
 FLEETS: Sequence[tuple[float, bool, Sequence[float]]] = (
@@ -23,7 +23,7 @@ FLEETS: Sequence[tuple[float, bool, Sequence[float]]] = (
     (5.0, False, (0.9,)),
     (10.0, True, (0.9,)),
 )
-LEAST_SHARE = 0.98  # of the ticks of a fleet that must have an action in time
+LEAST_SHARE = 0.98  # smallest share of the ticks of a fleet that must have an action in time
 
 
 def fleet(lab: Lab) -> None:

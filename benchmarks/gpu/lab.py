@@ -34,7 +34,7 @@ from vlagents_ray.testing import random_observation
 
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
 INSTRUCTION = "pick up the cube"
-SECONDS = 430.0  # of a run: two fit into the quarter of an hour for which machines are lent
+SECONDS = 430.0  # seconds of a run: two fit into the quarter of an hour for which machines are lent
 LATE_S = 120.0
 PUBLISHED = (  # by others, for comparison
     (
@@ -59,7 +59,7 @@ class Plan:
     dry: bool = False
     seconds: float = SECONDS  # for all steps together
     rows: tuple[int, ...] = (1, 8)  # batch sizes that are compiled
-    commit: str = ""  # of the code, where the checkout itself does not state it
+    commit: str = ""  # commit of the code, where the checkout itself does not state it
     patience: float = 1.0  # factor of the limits of steps
 
     def checkpoint(self, family: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Robots in processes of their own, that send photographs and act again at each answer."""
+"""Robots in separate processes, that send photographs and act again at each answer."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def act_together(pipes: Sequence[Any], seconds: float) -> dict[str, Any]:
 
 
 def _drive(pipe: Any, url: str, contract: Contract | None, seed: int) -> None:
-    """Act for the times that the pipe brings, until it is closed; a process of its own."""
+    """Act for the times that the pipe brings, until it is closed; a separate process."""
     die_with_parent()
     from vlagents_ray.client import RemoteAgent
 

@@ -38,7 +38,7 @@ _STACKS_S = (
 
 
 def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) -> None:
-    """Run a step, as a process in a group of its own."""
+    """Run a step, as a process in a separate group."""
     die_with_parent()
     os.setsid()
     log = os.open(plan.out / "gpu.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT)

@@ -97,7 +97,7 @@ def _together(lab: Lab, pipes: Sequence[Any]) -> dict[str, float]:
 
 
 def _serve(pipe: Any, config: dict[str, Any], size: int, environment: Mapping[str, str]) -> None:
-    """Load π0, and answer questions until the pipe is closed; a process of its own."""
+    """Load π0, and answer questions until the pipe is closed; a separate process."""
     die_with_parent()
     os.environ |= environment
     from benchmarks.policy import BareAndQueued

@@ -1,4 +1,4 @@
-"""The steps. Each runs in a process of its own, and finds figures and criteria in a `Lab`."""
+"""The steps. Each runs in a separate process, and finds figures and criteria in a `Lab`."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _H100_TFLOPS = 600
 GRAPH_ROWS = (1, 2, 4, 8, 16, 32)  # batch sizes with CUDA graphs
 WORDS = 200  # tokens of an instruction of π0.5
 _MOST_PLACES = 8  # rows of the batches that are looked into
-PUSHES = 20  # of a learner that makes new tensors for each
+PUSHES = 20  # pushes of a learner that makes new tensors for each
 
 
 def facts(lab: Lab) -> None:

@@ -25,7 +25,7 @@ BEGIN, END = "<!-- gpu -->", "<!-- /gpu -->"
 _ORIGIN = ("date", "commit", "command", "gpu", "versions")
 _SHOWN_VERSIONS = ("torch", "transformers", "torchao")
 _LEAST_DATE = "0000-00-00"
-_KERNELS = 10  # of each core that the page shows; `latest.json` has 25
+_KERNELS = 10  # kernels of each core that the page shows; `latest.json` has 25
 
 _CURVE = {
     "rows": "rows",

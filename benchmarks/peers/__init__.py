@@ -68,7 +68,7 @@ class PeerClient:
     distributions: tuple[str, ...]  # that must be installed
     environment: str = ""  # or `TORCH`
     several: bool = True  # whether its server has several clients at once
-    server: bool = True  # whether its server is a process of its own
+    server: bool = True  # whether its server is a separate process
     one_process: bool = False  # whether all its clients must be in one process
     # Whether its idle server takes whole cores, so that it is stopped between turns.
     polls: bool = False

@@ -131,7 +131,7 @@ class Target:
     arrays: Mapping[str, np.ndarray]
     mode: str
     policy: Policy
-    clients: int  # of this process
+    clients: int  # clients of this process
 
     @property
     def cameras(self) -> dict[str, np.ndarray]:
@@ -204,7 +204,7 @@ def run(
 
     Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that
     makes calls in its turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that
-    make load; `evaluate HOST PORT PLAN`, which writes a line when all its episodes are played and
+    make load; `evaluate HOST PORT PLAN`, which writes a line when all its episodes are run and
     all its processes have ended. POLICY and PLAN are JSON. Without `serve`, the clients' process
     starts its server. `end` ends what the server's process has started, if that does not end with
     it.

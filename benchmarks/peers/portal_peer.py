@@ -1,4 +1,4 @@
-"""portal: its `BatchServer`, with the batching in a process of its own, its default, and its
+"""portal: its `BatchServer`, with the batching in a separate process, its default, and its
 `Client`.
 
 It waits until a batch is full, however long that takes, so there is a method for each size, and

@@ -1,4 +1,4 @@
-"""The recording that index.html plays: `python docs/demo/record.py` plays the reference policy, and
+"""The recording that index.html runs: `python docs/demo/record.py` runs the reference policy, and
 writes session.js.
 
 The policy is served, and asked over a WebSocket, as by a robot. Each act returns a chunk of eight
@@ -63,7 +63,7 @@ def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
             total, *stages = [
                 round(timing.get(stage, 0.0), 3) for stage in ("round_trip_ms", *STAGES)
             ]
-            # All digits that float32 has, so that the actions, played again, give the same states.
+            # All digits that float32 has, so that the actions, run again, give the same states.
             rows = [[float(f"{number:.9g}") for number in row] for row in act.rows()]
             acts.append(
                 {"step": len(states) - 1, "round_trip_ms": total, "ms": stages, "rows": rows}

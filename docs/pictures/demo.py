@@ -39,7 +39,7 @@ EXECUTE = 4  # rows of each chunk
 # As in deployments/reference.yaml, but with all rows of a chunk. Its path is that of a checkout.
 POLICY = {"checkpoint": "examples/reference/checkpoint", "embodiment": "tabletop"}
 ROBOTS = {"stack": 7, "pick_place": 3, "slide": 5, "lift": 11}  # task: seed; the first is filmed
-STILL_MS = 1900  # of each part of the report
+STILL_MS = 1900  # still of each part of the report
 PAPER, INK, SOFT, ACCENT = "#ffffff", "#1b1f24", "#59636e", "#0060a8"
 SERVE = ("Serve a policy to many robots", "vlagents-ray serve deployments/reference.yaml")
 EVALUATE = ("Evaluate its checkpoints", "vlagents-ray eval examples/evaluations/compare.yaml")

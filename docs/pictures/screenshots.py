@@ -1,5 +1,5 @@
 """The pictures of the live page and of the report: `python -m docs.pictures.screenshots` serves the
-reference policy to two simulated robots, plays docs/evaluation/picture.yaml, and photographs both
+reference policy to two simulated robots, runs docs/evaluation/picture.yaml, and photographs both
 pages in light and dark. Chromium is needed.
 """
 
@@ -33,7 +33,7 @@ PARTS = {
     "failures": "Failures",
 }
 LIVE_WIDTH = 840  # px: two cards side by side
-CALLS = 4  # of each robot before the live page is photographed
+CALLS = 4  # calls of each robot before the live page is photographed
 # A video that is not loaded shows a spinner.
 _VIDEOS = """Promise.all([...document.querySelectorAll("video")].slice(0, 8).map((video) => {
   video.controls = false;

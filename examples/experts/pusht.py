@@ -1,4 +1,4 @@
-"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and plays
+"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and runs
 the best.
 """
 

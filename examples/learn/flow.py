@@ -7,7 +7,7 @@ pixels.
 
 An action of the learner is an action chunk, with the log-probability of its random steps
 (Flow-SDE). Policy, rollouts and learner share this process, without Ray; with --max-lag the policy
-is served, and a worker plays while the learner learns. docs/tutorials/learn.md explains it. It
+is served, and a worker runs while the learner learns. docs/tutorials/learn.md explains it. It
 needs torch, pyarrow and a checkout.
 """
 
@@ -64,7 +64,7 @@ CHECKPOINT = Path(__file__).parents[2] / "examples" / "reference" / "checkpoint"
 ENV = ROBOT = "tabletop"
 ENV_OPTIONS: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
 EXECUTE = 4  # rows of a chunk
-TICKS = 40  # of an episode of the training; with fewer, too few are solved at first
+TICKS = 40  # ticks of an episode of the training; with fewer, too few are solved at first
 NUM_ENVS = 64  # that act in one batch
 # Ticks of the evaluations: the policy is to become faster, and to stay as reliable.
 SHORT, LONG = 32, 80
@@ -73,7 +73,7 @@ TRAINING = 20_000_000  # first seed of the training's episodes; those of the eva
 HEAD = ("noisy", "when", "why", "blocks", "result")
 NOISE = 0.6  # of the random steps; larger deviations change the reward by more, and so say more
 DISCOUNT = 0.96  # per tick
-CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
+CLIP = 0.2  # clip of PPO's ratio (arXiv 1707.06347)
 BATCH = 1024  # acts
 RATE, VALUE_RATE = 2e-4, 1e-3  # of AdamW, for the flow and for the value
 
@@ -90,7 +90,7 @@ class FlowPlan(BaseModel):
     out: Path
     seed: Seed = 0
     iterations: Count = 20
-    episodes: Count = 512  # of an iteration
+    episodes: Count = 512  # episodes of an iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
     epochs: Count = 2  # times that an iteration learns from each act
     max_lag: Retries | None = None  # versions; None: episodes and learner wait for each other
@@ -130,7 +130,7 @@ class FlowLearner:
         flow, value = list(self._trained.values()), list(self._value.parameters())
         groups = [{"params": flow, "lr": RATE}, {"params": value, "lr": VALUE_RATE}]
         self._optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
-        self.version = 0  # of the weights: how often it learned
+        self.version = 0  # version of the weights: how often it learned
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the trained values by name, for a partial push."""

@@ -18,7 +18,7 @@ from vlagents_ray.interface import Obs
 
 # Gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
 DISCOUNT, TRACE = 0.98, 0.95
-_CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
+_CLIP = 0.2  # clip of PPO's ratio (arXiv 1707.06347)
 _RATE, _LOOK_RATE = 2e-3, 1e-2  # learning rates of the network, and of its choice of colours
 _PPO = 0.01  # weight of PPO's loss beside the teacher's advice
 

@@ -24,7 +24,7 @@ STATE = 4  # of the robot's own state: x, y, z, gripper
 INPUTS = 3 * BINS + STATE + len(WORDS)  # numbers of an input
 _LOOKS = 3  # places that the network looks at
 FEATURES = _LOOKS * 9 + STATE  # numbers that the heads of a network get
-_ROWS = 16  # of a pass
+_ROWS = 16  # rows of a pass
 _METRES = 5.0  # units of the robot's position per m
 
 

@@ -39,8 +39,8 @@ HERE = str(Path(__file__).parent.absolute())
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 TEACHER = "teacher"
-FAILURES = 10  # of the policy's server, in one iteration, after which the run ends
-# First seeds: no episode is both played for training and evaluated.
+FAILURES = 10  # failures of the policy's server, in one iteration, after which the run ends
+# First seeds: no episode is both run for training and evaluated.
 HELD_OUT, TRAINING = 10_000_000, 20_000_000
 
 
@@ -57,11 +57,11 @@ class LearnPlan(BaseModel):
     methods: list[Method] = Field(default=["bc", "rpd", "ppo"], min_length=1)
     out: Path = Path("runs/learn")
     resume: bool = False  # continue an interrupted or killed run
-    seed: Seed = 0  # of the networks, and of the training's episodes
+    seed: Seed = 0  # seed of the networks, and of the training's episodes
     demonstrations: Count = 48  # episodes of the teacher
-    clone_steps: Count = 2000  # of the optimizer
-    iterations: Count = 10  # of each method
-    episodes: Count = 32  # of the student in each iteration
+    clone_steps: Count = 2000  # clone steps of the optimizer
+    iterations: Count = 10  # iterations of each method
+    episodes: Count = 32  # episodes of the student in each iteration
     groups: Count = 8  # episodes from one start state, in "grpo"
     # Steps of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20.
     steps: Count | None = None

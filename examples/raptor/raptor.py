@@ -64,7 +64,7 @@ class Raptor(TrainableAgent):
         return [Act(action) for action in self._dense("2/%s", hidden)]
 
     def _dense(self, name, inputs):
-        """Multiply vector by vector, so that an action is the same to the bit in any batch."""
+        """Multiply vector by vector, so that an action is bit-identical in any batch."""
         return (self.weights[name % "weights"] @ inputs[..., np.newaxis])[..., 0] + self.weights[
             name % "biases"
         ]

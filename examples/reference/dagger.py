@@ -2,7 +2,7 @@
 
 Options: `python examples/reference/dagger.py record --help`, and `demonstrate --help`.
 
-The policy plays the tabletop until the expert takes over, at a tick drawn by the seed, as soon as
+The policy runs the tabletop until the expert takes over, at a tick drawn by the seed, as soon as
 the gripper is open, so that it drops nothing. What it then shows are states that the policy reaches
 (DAgger, arXiv 1011.0686; with an expert that takes over: HG-DAgger, arXiv 1810.02890). Episodes
 that the policy solves before are not recorded.
@@ -29,7 +29,7 @@ from vlagents_ray.policies.reference import Reference
 TAKE_OVER = 20  # ticks within which the expert may; an episode of a success has 31
 OPEN = 0.9  # opening of a gripper that holds nothing
 EXECUTE = 4  # rows of a chunk, as in the evaluation
-HZ = 20  # of the tabletop
+HZ = 20  # rate of the tabletop
 # Pushes aside in demonstrations, in turn: those of demonstrations/tabletop.yaml.
 DISTURBANCES = (0.5, 1.0)
 app = typer.Typer(pretty_exceptions_enable=False)
@@ -47,7 +47,7 @@ def correct(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int) -> boo
     episode, led, solved = dataset.begin(env.instruction, env.contract.action), False, False
     for tick in range(env.max_steps):
         if not led and tick >= due and (obs.gripper or 0.0) > OPEN:
-            # The gripper hides an object; the policy goes on.
+            # The gripper hides an object; the policy continues.
             with contextlib.suppress(InvalidObservation):
                 expert.reset(obs, env.instruction)
                 led = True

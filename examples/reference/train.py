@@ -51,7 +51,7 @@ RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW from nothing, and the largest no
 WARM_UP = 200  # steps, after which the rate falls as a cosine
 # Weight of the error of the places of objects, which teaches early what words mean in images.
 OBJECTS = 1.0
-AVERAGE = 0.999  # of the weights, per step; these are what is saved
+AVERAGE = 0.999  # average of the weights, per step; these are what is saved
 MADE = "training.json"
 KEEP_EVERY = 500  # steps between two kept states
 SHOWN_EVERY = 100  # steps between two lines of the log

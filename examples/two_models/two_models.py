@@ -37,7 +37,7 @@ SUBTASKS = {  # the pose in which each one is done, rad
     "lift the cup": [0.6, 0.6, 0.0],
     "carry it to the shelf": [-0.6, 0.6, 0.0],
 }
-ROWS = 10  # of a chunk of the policy
+ROWS = 10  # rows of a chunk of the policy
 STEP = 0.06  # rad, that a joint moves in a row
 CONTRACT = Contract(
     state={"joints": StateSpec(3, "rad")},

@@ -1,4 +1,4 @@
-"""Whole evaluations against the peers': everybody plays the same, and whoever did not is found
+"""Whole evaluations against the peers': everybody runs the same, and whoever did not is found
 out.
 """
 

@@ -181,7 +181,7 @@ def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[Non
                 with near.start(
                     ["ssh", *options, "-i", str(folder / "user"), "-p", "2222", f"{USER}@{address}"]
                 ) as ssh:
-                    assert ssh.wait(60) == 0  # it goes on behind
+                    assert ssh.wait(60) == 0  # it continues behind
                 yield
             finally:
                 sshd.terminate()

@@ -1,4 +1,4 @@
-"""The steps of `make gpu` run in processes of their own, and the report says what each found, or
+"""The steps of `make gpu` run in separate processes, and the report says what each found, or
 why it ended.
 """
 

@@ -62,7 +62,7 @@ def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
         # The best, as a busy machine slows down some rounds.
         assert best_of_four > 1.5 * best_of_one
         assert len(one["rounds"][way]) == 5
-    # A sleep is never shorter than it was asked to be.
+    # A sleep is never shorter than its argument.
     assert one["bare"]["actions_per_s"] < 1000 / 11
     assert one["queued"]["round_trip_ms"] > 11
     assert one["queued"]["mean_batch"] == pytest.approx(1)

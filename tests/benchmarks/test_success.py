@@ -1,4 +1,4 @@
-"""The benchmark of success plays every kind of way, and finds what must be equal to be equal."""
+"""The benchmark of success runs every kind of way, and finds what must be equal to be equal."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_ways_in_this_process(tmp_path: Path) -> None:
         == 0
     )
     again = played(tmp_path, "again")["again"]
-    assert again == rows["again"]  # nothing was played again
+    assert again == rows["again"]  # nothing was run again
 
 
 @pytest.mark.integration

@@ -348,7 +348,7 @@ def test_after_an_interrupt_nothing_leads_back_to_what_was_commanded_before_it(
     assert play(player, range(3)) == [0, 0.1, 0.2]
     player.interrupt()
     pose.at = 0.9
-    assert player.act(obs(3)).action.tolist() == pytest.approx([0.9, 0.9])  # as home is refused
+    assert player.act(obs(3)).action.tolist() == pytest.approx([0.9, 0.9])  # as home is rejected
     player.interrupt()
     pose.at = 5.0  # beyond the limits, so that no action is right
     with pytest.raises(InvalidAction, match="above the limit 1"):

@@ -34,7 +34,7 @@ class Answers(Agent):
 
     def __init__(self, rows: int) -> None:
         self.rows = rows
-        self.infos: list[dict[str, Any]] = []  # of the observations of its requests
+        self.infos: list[dict[str, Any]] = []  # infos of the observations of its requests
         self.answer_info: dict[str, Any] = {}
         self.failure: Exception | None = None
         self.options: dict[str, Any] = {}

@@ -66,7 +66,7 @@ class Row:
 
     words: list[str]  # {file} is the file
     document: dict[str, Any]  # the content of the file
-    prefix: str = ""  # of `SETTINGS` in what --set changes
+    prefix: str = ""  # prefix of `SETTINGS` in what --set changes
     command: typer.Typer = app
 
 

@@ -161,7 +161,7 @@ def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(
 def run(
     body: str, leave_s: float = 30, lost: str = "0.05, Lost"
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command with this body in a process of its own; with another period, Ray is well for
+    """Run a command with this body in a separate process; with another period, Ray is well for
     so long.
     """
     code = COMMAND.format(body=body, leave_s=leave_s).replace("0.05, Lost", lost)

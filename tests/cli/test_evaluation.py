@@ -44,7 +44,7 @@ WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
 
 def said(*words: str) -> str:
-    """What the command says that is refused before anything starts."""
+    """What the command says that is rejected before anything starts."""
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 2, done.output
     return " ".join(done.stderr.split())

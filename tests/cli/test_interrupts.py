@@ -15,7 +15,7 @@ import pytest
 from eval_fakes import wait_for
 from ray_processes import START_S
 
-END_S = 120.0  # of a command that has been interrupted
+END_S = 120.0  # end of a command that has been interrupted
 EPISODES, HANGS_AFTER = 4, 2
 MODULE = f"""
 import pathlib, threading

@@ -17,7 +17,7 @@ from vlagents_ray import Act, Agent, Obs
 
 PAGE = Path(__file__).parents[2] / "docs" / "clients" / "gr00t.md"
 INSTRUCTION = "pick up the apple and place it on the plate"
-WIDTHS = {  # of an action of the template's server, by the comment of its `policy_server.py`
+WIDTHS = {  # widths of an action of the template's server, by the comment of its `policy_server.py`
     "left_wrist_eef_9d": 9,
     "right_wrist_eef_9d": 9,
     "left_hand": 7,

@@ -113,7 +113,7 @@ def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(begun: Begun) -
 
 
 def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
-    """Act until the second replica has the session, which goes on; return what it drew."""
+    """Act until the second replica has the session, which continues; return what it drew."""
     drawn = []
     while not len(served.engines[1].sessions):
         act = agent.act(obs(len(drawn) % 200))
@@ -126,7 +126,7 @@ def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
 def test_a_session_stays_where_it_is_until_another_replica_has_answered(
     look_up: str, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A replica that sends it away goes on answering, while the load balancer may be gone."""
+    """A replica that sends it away continues answering, while the load balancer may be gone."""
     served, agent = begun(2, timeout_s=5.0, seed=3)
     connect, tried, back = InProcess.connect, threading.Semaphore(0), threading.Event()
 
@@ -557,7 +557,7 @@ def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that
     waits: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     """It was: the first late answer on a new connection, which is slow to begin with, threw that
-    away, too.
+    away.
     """
     _, agent = begun(1, timeout_s=2.0)
     late, lost = DeadlineExceeded("no answer"), ConnectionLost("gone")

@@ -1,4 +1,4 @@
-"""A policy that stalls, and where the robot goes on afterwards. Time is counted in ticks; no
+"""A policy that stalls, and where the robot continues afterwards. Time is counted in ticks; no
 clock is read.
 """
 
@@ -160,7 +160,7 @@ def check_recovery(run: Run, stall: int) -> None:
     resumed = run.fresh + int(np.argmin(still[run.fresh :]))
     assert not still[resumed]
     assert (resumed - run.fresh) / HZ <= 0.5
-    assert still[resumed:].mean() < 0.1  # and goes on moving
+    assert still[resumed:].mean() < 0.1  # and continues moving
 
 
 @pytest.mark.parametrize("killed", [False, True])

@@ -65,7 +65,7 @@ class Visit:
     """One WebSocket."""
 
     socket: ServerConnection
-    number: int  # of the server's WebSockets, from 0
+    number: int  # number of the server's WebSockets, from 0
     requests: list[Request] = field(default_factory=list)
 
     def request(self) -> Request:
@@ -488,7 +488,7 @@ def test_errors_of_the_server_have_its_code(server: Replica, programs: Path) -> 
     with CppClient(programs, server.url) as client:
         client.reset()
         assert refused(client, obs={"gripper": 1e300}).code == "invalid_observation"
-        assert client.act(info={"value": 4})["values"][0] == 4  # the session goes on
+        assert client.act(info={"value": 4})["values"][0] == 4  # the session continues
         assert (
             refused(client, obs={"cameras": {"front": {"rgb": 0, "height": 0, "width": 9}}}).code
             == "invalid_input"

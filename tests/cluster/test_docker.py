@@ -64,7 +64,7 @@ STAGES = [line.stage for line in LINES if line.word == "FROM"]
 TARGETS = [
     line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"
 ] + STAGES[-1:]
-LOCKS = {  # of the stages that install
+LOCKS = {  # locks of the stages that install
     line.stage: found[1]
     for line in LINES
     if (found := re.search(r"source=(\S+/locks/[^,]+)", line.flags.get("mount", "")))

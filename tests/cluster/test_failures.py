@@ -53,8 +53,8 @@ except VLAgentsError as error:
 def cluster_of(
     head: Host, nodes: Sequence[tuple[Host, int, bool]], run: Evaluation, **environment: str
 ) -> Iterator[RayCluster]:
-    """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is
-    to be played there.
+    """A head that runs nothing, and nodes with so many workers, and perhaps a replica; `run` is
+    to be run there.
     """
     shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
     with ray_cluster([head], cpus=0, environment=shared) as cluster:

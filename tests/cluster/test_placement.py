@@ -19,7 +19,7 @@ from benchmarks.hosts import Host, RayCluster, hosts, ray_cluster
 pytestmark = pytest.mark.hosts
 
 PLACED = [sys.executable, "-m", "placement_commands"]
-CPUS = 2  # of each node, each of which has room for as many workers
+CPUS = 2  # cpus of each node, each of which has room for as many workers
 STORE = {"object_store_memory": "200000000"}
 
 

@@ -88,7 +88,7 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 @pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PlugCharger-v1"])
 def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None:
-    """PegInsertionSide draws its geometry anew; PlugCharger's contacts survive a reset without
+    """PegInsertionSide draws its geometry again; PlugCharger's contacts survive a reset without
     reconfiguration.
     """
     rng = np.random.default_rng(0)

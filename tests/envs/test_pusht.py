@@ -21,7 +21,7 @@ pytestmark = pytest.mark.sim
 NAME = "pusht"
 # Where the agent is and, as `reset_to_state` takes it, the block: 84.6 % of the target is covered.
 BESIDE = [333.0, 236.0, 230.0, 239.0, math.pi / 4]
-PUSHING = Always(270.0, 251.0)  # to the left, with the block
+PUSHING = Always(270.0, 251.0)  # a target that pushes the block to the left
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ class Collected(Consumer):
 
 
 def driver_of(config: EvalConfig, consumer: Consumer) -> tuple[Driver, list[Job]]:
-    """A driver whose queue is empty, as if all its jobs were being played."""
+    """A driver whose queue is empty, as if all its jobs were being run."""
     plan = resolve(config)
     return Driver(plan, [], consumer), plan_jobs(plan.cases)
 

@@ -163,7 +163,7 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
             waiting = [job for one in self._workers for job in one.jobs]
             reports = [*super().wait(timeout_s)]
             if waiting and waiting[0].key.episode == 2:
-                # It arrives here, too.
+                # It arrives here.
                 threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGTERM)).start()
                 if cluster_is_lost:
                     raise ClusterLost("no head")

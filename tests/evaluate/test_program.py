@@ -140,7 +140,7 @@ def watched(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Result
     return Results.load(played(tmp_path / "out", resume=True, **settings).out)
 
 
-# Each plays, makes a change, and plays on.
+# Each runs, makes a change, and runs on.
 CONTINUATIONS = [resumed, merged, watched]
 NAMED = [name for name in FILES if not name.endswith("__init__.py")]
 
@@ -284,7 +284,7 @@ STATED: dict[str, Any] = {
     "contract": {"control_hz": 20},
 }
 COMMANDS = [resumed_as_stated, merged_as_stated, compared, reported]
-# What `--resume` refuses about an environment: the change, and the name that a message has for it.
+# What `--resume` rejects about an environment: the change, and the name that a message has for it.
 OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
     "its code": (lambda: edit("prog_parts/sea.py"), "prog_parts/sea.py was"),
     "a file of its settings": (lambda: edit("chart.txt"), "chart.txt was"),

@@ -1,4 +1,4 @@
-"""Evaluations in processes of their own, with a Ray of their own, stopped from outside."""
+"""Evaluations in separate processes, with a Ray of their own, stopped from outside."""
 
 from __future__ import annotations
 

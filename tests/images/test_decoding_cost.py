@@ -41,7 +41,7 @@ def decode_or_refuse(file: bytes) -> None:
 
 
 def cpu_s(file: bytes) -> float:
-    """The shortest time of this thread's CPU in which a file is decoded or refused."""
+    """The shortest time of this thread's CPU in which a file is decoded or rejected."""
     times = []
     for _ in range(ROUNDS):
         begun = time.thread_time()
@@ -98,7 +98,7 @@ def test_decoding_takes_no_longer_than_its_estimate(name: str, speed: float) -> 
     try:
         structure = read_structure(file, PIXELS)
     except (MalformedMessage, MessageTooLarge):
-        return  # refused before anything is decoded
+        return  # rejected before anything is decoded
     assert cpu_s(file) < FACTOR * max(1.0, speed) * structure.decoding_s
 
 
@@ -233,7 +233,7 @@ def test_jpegs_of_other_encoders_are_decoded(options: dict[str, object], grey: b
 
 
 def test_the_files_are_what_their_names_say() -> None:
-    """So that the tests do not pass because each is refused for another reason."""
+    """So that the tests do not pass because each is rejected for another reason."""
     decoded = set()
     for name, make in FILES.items():
         with contextlib.suppress(MalformedMessage, MessageTooLarge):

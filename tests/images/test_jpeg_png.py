@@ -1,4 +1,4 @@
-"""JPEG keeps as much as the peers', PNG keeps everything, and broken files are refused by name."""
+"""JPEG keeps as much as the peers', PNG keeps everything, and broken files are rejected by name."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_damaged_png_is_refused_or_harmless(data: st.DataObject) -> None:
     try:
         jpeg_png.decode(bytes(file), max_pixels=4096)
     except (MalformedMessage, MessageTooLarge):
-        return  # refused by name; anything else fails the test
+        return  # rejected by name; anything else fails the test
 
 
 def test_a_png_that_declares_too_much_or_unpacks_to_more_than_that_is_refused() -> None:

@@ -118,7 +118,7 @@ class Target:
     path: str  # empty: the replica's own port for WebSockets
     seeds: list[bytes]
     pixel: Callable[[bytes], float]  # in the answer to the last seed
-    content_type: str = ""  # of an HTTP body; empty: it is a WebSocket
+    content_type: str = ""  # content type of an HTTP body; empty: it is a WebSocket
     greeting: bool = False  # the server speaks first
     trees: list[dict[str, Any]] = field(default_factory=list)  # messages before they were encoded
     encode: Callable[[Any], bytes] = openpi_codec.encode
@@ -256,7 +256,7 @@ TARGETS = [
 
 
 def attack(target: Target, server: Server, frames: int, seed: int) -> None:
-    """Send so many; raises if the server hangs, tells of an internal error, or then refuses what
+    """Send so many; raises if the server hangs, tells of an internal error, or then rejects what
     is right.
     """
     choose = random.Random(seed)

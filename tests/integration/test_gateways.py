@@ -78,7 +78,7 @@ def robots(port: int, *modes: str, version: Sequence[Path] = ()) -> Iterator[lis
 
 
 def at_once(*calls: Callable[[], object]) -> list[object]:
-    """What each of the calls returns, each made by a thread of its own."""
+    """What each of the calls returns, each made by a separate thread."""
     results: dict[int, object] = {}
 
     def run(number: int) -> None:

@@ -30,7 +30,7 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
 REPLICAS = 2
-ROBOTS = 4  # of each route
+ROBOTS = 4  # robots of each route
 TIMEOUT_S = 60.0
 FROZEN_S = 12.0  # time after which a frozen replica continues
 FRAME = np.zeros((8, 8, 3), np.uint8)
@@ -66,7 +66,7 @@ class Robot:
     agent: RemoteAgent
     name: str
     pid: int = 0  # the process of its replica
-    number: int = 0  # of the latest observation
+    number: int = 0  # number of the latest observation
     answered: list[float] = field(default_factory=list)  # time.monotonic(), s
     # The observations on which a resumed session has acted: their first answers were lost.
     resumed: set[int] = field(default_factory=set)

@@ -1,4 +1,4 @@
-"""An evaluation's results depend on its plan, and on nothing of how it was played."""
+"""An evaluation's results depend on its plan, and on nothing of how it was run."""
 
 from __future__ import annotations
 

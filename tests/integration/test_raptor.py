@@ -60,7 +60,7 @@ def client(server: Server, transport: TransportName, **options: Any) -> RemoteAg
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_each_transport_carries_the_reference(server: Server, transport: TransportName) -> None:
-    # All of them in process: tests/policies/test_raptor.py.
+    # tests/policies/test_raptor.py tests all of them in one process.
     inputs, wanted = (rows[:150] for rows in reference())
     agents = [client(server, transport) for _ in range(2)]
     for agent in agents:

@@ -25,7 +25,7 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
 # At the least; more, until sessions of every transport were hit. With VLAGENTS_KILLS=12
-# VLAGENTS_FREEZES=4 and nothing else on the machine, what is promised of times is looked at, too.
+# VLAGENTS_FREEZES=4 and nothing else on the machine, what is promised of times is looked at.
 LEAST = {
     signal.SIGKILL: int(os.environ.get("VLAGENTS_KILLS", "1")),
     signal.SIGSTOP: int(os.environ.get("VLAGENTS_FREEZES", "1")),
@@ -185,7 +185,7 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
     """What the clients saw and what the replicas did, held against each other.
 
     `frozen` are the times at which replicas were: each may have taken a batch just before, and
-    executes it when it goes on.
+    executes it when it continues.
     """
     begun: dict[tuple[str, int], list[tuple[float, int]]] = {}
     for file in ledger.iterdir():

@@ -26,7 +26,7 @@ from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 HZ = 50.0
 ROWS = 50
 PATIENCE_S = 300.0
-ATTEMPTS = 5  # of what a machine that stands still for a second spoils
+ATTEMPTS = 5  # attempts of what a machine that stands still for a second spoils
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
@@ -96,7 +96,7 @@ def address() -> str:
 def server(
     address: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[contextlib.ExitStack]:
-    """What has the server at `address` running, and may be closed."""
+    """The context in which the server at `address` runs; closing it stops the server."""
     with contextlib.ExitStack() as running:
         running.enter_context(
             serving("served_agents:Ticking", tmp_path_factory.mktemp("log") / "log", address)

@@ -33,7 +33,7 @@ def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
                 obs, _, terminated, truncated, info = env.step(expert.act(obs))
                 successes.append(info["success"])
                 assert not terminated
-            assert len(successes) == env.max_steps == 50  # the env goes on after success
+            assert len(successes) == env.max_steps == 50  # the env continues after success
             assert successes[-1], f"seed {seed}"
 
 

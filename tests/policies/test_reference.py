@@ -59,7 +59,7 @@ ROBOTS = {
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
-SUMMED = 2e-3  # how far a sum of 5 log-probabilities may be off, in float32
+SUMMED = 2e-3  # largest error of a sum of 5 log-probabilities, in float32
 
 
 @pytest.fixture(scope="module")

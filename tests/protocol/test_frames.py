@@ -43,7 +43,7 @@ from vlagents_ray.protocol.messages import (
 
 
 def decode_request(frame: Buffer, limits: MessageLimits = DEFAULT_LIMITS) -> Request:
-    """The only request of a frame; raises why it is refused."""
+    """The only request of a frame; raises why it is rejected."""
     [request] = read_requests(frame, Budget(limits))
     if isinstance(request, Reply):
         assert request.error is not None

@@ -271,10 +271,10 @@ def test_names_forge_no_line_in_a_log() -> None:
 
 
 class WritersAndReaders(RuleBasedStateMachine):
-    """One connection with four layouts at most, whose messages may be lost or refused on either
+    """One connection with four layouts at most, whose messages may be lost or rejected on either
     side.
 
-    As in `ShmTransport`, a client whose message was not sent, or was refused before it was read,
+    As in `ShmTransport`, a client whose message was not sent, or was rejected before it was read,
     begins its layouts again, while the server remembers those that it has read.
     """
 

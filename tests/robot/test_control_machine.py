@@ -166,7 +166,7 @@ class Machine(RuleBasedStateMachine):
         """Compare an action with the model."""
         value = float(action[0])
         humans = value == HUMANS
-        # The guard refuses a wild one, and a safe one takes its place.
+        # The guard rejects a wild one, and a safe one takes its place.
         accepted = self.engaged and not self.wild
         self.humans += accepted
         if self.commanded_stop or self.barked:

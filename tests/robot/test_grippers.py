@@ -109,7 +109,7 @@ class Grasping(Agent):
         self._spec = spec
         self._random = np.random.default_rng(seed)
         self._change = largest_change
-        self.rows = np.zeros((0, spec.dim or 0), np.float32)  # of all answers
+        self.rows = np.zeros((0, spec.dim or 0), np.float32)  # rows of all answers
         self._gripper = np.array([OPEN, CLOSED, OPEN][: len(spec.gripper_columns(spec.dim or 0))])
 
     def act(self, obs: Obs) -> Act:

@@ -1,4 +1,4 @@
-"""The guard: what it refuses, and what passes as it is."""
+"""The guard: what it rejects, and what passes as it is."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def executed(
     delta: bool,
     chunk: int | None = None,
 ) -> tuple[float, int]:
-    """Return the share of a run's ticks that were rows of the plan, and the number of refused
+    """Return the share of a run's ticks that were rows of the plan, and the number of rejected
     actions.
 
     With chunks of a stated length, each answer comes within a tick.

@@ -38,7 +38,7 @@ class Case:
     contract: dict[str, Any] = field(default_factory=lambda: RIGHT)
     statistics: dict[str, Any] | None = None
     pose: tuple[float, float] = (0.0, 0.5)
-    rows: tuple[float, float] = (0.0, 0.5)  # of the policy's chunk
+    rows: tuple[float, float] = (0.0, 0.5)  # rows of the policy's chunk
 
 
 def action(**changes: Any) -> dict[str, Any]:

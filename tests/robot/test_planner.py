@@ -28,7 +28,7 @@ from vlagents_ray.interface import (
 )
 from vlagents_ray.robot import RobotWithPlanner, run_loop
 
-PERIOD_S = 0.1  # of the robot's ticks
+PERIOD_S = 0.1  # period of the robot's ticks
 
 
 class Planner(Agent):
@@ -38,7 +38,7 @@ class Planner(Agent):
     reads_slo = True
 
     def __init__(self) -> None:
-        self.infos: list[dict[str, Any]] = []  # of the observations of its requests
+        self.infos: list[dict[str, Any]] = []  # infos of the observations of its requests
         self.options: dict[str, Any] = {}
         self.instruction: str | None = None
         self.failure: Exception | None = None

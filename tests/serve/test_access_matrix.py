@@ -68,7 +68,7 @@ def test_what_the_table_says_is_so(replica: KeyedReplica, cell: Cell) -> None:
         return
     assert not done, said
     if cell.stated != "nothing":
-        # A connection may be cut off before the request was refused.
+        # A connection may be cut off before the request was rejected.
         assert said == cell.stated or (said == "ended" and cell.when == "after" and visitor.ends)
 
 

@@ -35,7 +35,7 @@ from vlagents_ray.serve.replica.replica import answer_frame
 
 # A gateway is a client of the replica, whose own clients the replica does not know.
 REPLICA_CLIENTS = [name for name in CLIENTS if name not in GATEWAYS]
-BRIGHTNESS = 3  # of the act that is abandoned
+BRIGHTNESS = 3  # brightness of the act that is abandoned
 SENT_S = 0.1  # time in which a client on another thread has sent its act
 READ_S = 0.5  # time in which a replica that continues has read the act
 

@@ -2,7 +2,7 @@
 makes it grow, or acts.
 
 What is fuzzed are the states of each protocol before authentication: handshakes that are nearly
-right, whole requests before, with and after refused ones, in segments cut anywhere.
+right, whole requests before, with and after rejected ones, in segments cut anywhere.
 `tests/integration/test_fuzz.py` does so after it. Some thousands in CI; as many as wanted by hand,
 all of them from one seed:
 

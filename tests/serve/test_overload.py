@@ -196,13 +196,13 @@ def _post(path: str, kind: str, content: bytes) -> Callable[[Visitor, str], str]
 NOTHING_TO_DECODE = {
     *(endpoint for endpoint in ATTEMPTS if endpoint.startswith("`GET")),
     "`POST /v1/close`",  # nothing that it brings is decoded
-    "own port, another path",  # is refused
-    "`WS /v1/weights`",  # is refused without the scope
-    "`POST /v1/weights/{step}`",  # is refused without the scope
+    "own port, another path",  # is rejected
+    "`WS /v1/weights`",  # is rejected without the scope
+    "`POST /v1/weights/{step}`",  # is rejected without the scope
     "`POST /v1/weights/{step}`, scope `weights`",  # two options in the URL
-    "`POST /v1/live/command`",  # is refused without the scope
+    "`POST /v1/live/command`",  # is rejected without the scope
     "`POST /v1/live/command`, scope `operate`",  # a name and a word, in 16 KiB at most
-    "`WS /v1/live`",  # is refused without the scope
+    "`WS /v1/live`",  # is rejected without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }
 NO_KEY = {
@@ -853,7 +853,7 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
 def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading them would take time from robots, and memory until they are refused."""
+    """Reading them would take time from robots, and memory until they are rejected."""
     monkeypatch.setattr(api_keys, "_THROTTLED_S", (3.0, 3.0))
     visitor = replica.visitor("right")
     client = _keyed_stream(replica, visitor.token, "/v1/stream")
@@ -870,7 +870,7 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
-    """The layout of its arrays came with the first message, which was refused before it was
+    """The layout of its arrays came with the first message, which was rejected before it was
     parsed.
     """
     visitor = replica.visitor("right")

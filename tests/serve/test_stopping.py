@@ -35,7 +35,7 @@ from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.dialects.base import RouteDialect
 
 SITUATIONS = ("idle", "in flight", "waiting", "half a message")
-BRIGHTNESS = {"in flight": HELD + 1, "waiting": 3}  # of the act
+BRIGHTNESS = {"in flight": HELD + 1, "waiting": 3}  # brightness of the act
 EACH = [
     pytest.param(name, situation, id=f"{name}, {situation}")
     for name in CLIENTS

@@ -1,6 +1,6 @@
 """Robots that share one policy, in virtual time: the real queue, and the real pace of its replica.
 
-`python -m tests.simulation.robots --seeds 100000` plays drawn worlds, and checks each; `python -m
+`python -m tests.simulation.robots --seeds 100000` runs drawn worlds, and checks each; `python -m
 tests.simulation.robots --fleets` prints the largest fleets in time, with the queue's use of slack
 and without it.
 """
@@ -30,7 +30,7 @@ PI0 = CostCurve(0.0293, 0.00806)  # pi0 on an H200, compiled
 GRAPHS = CostCurve(0.0415, 0.0105)
 SMALL = CostCurve(0.004, 0.0005)
 LARGEST = 16
-WIRE_S = 0.002  # of a message, one way
+WIRE_S = 0.002  # network time of a message, one way
 MEASURED_S = 30.0  # of a fleet, at least
 
 

@@ -1,6 +1,6 @@
 """Robots that share a policy, in virtual time: what holds for every seed, and how many are in time.
 
-`python -m tests.simulation.robots --seeds 100000` plays more seeds, and `--fleets` prints the
+`python -m tests.simulation.robots --seeds 100000` runs more seeds, and `--fleets` prints the
 largest fleets.
 """
 

@@ -1,4 +1,4 @@
-"""Histories of sessions under faults, each drawn from a seed, and played in a few milliseconds.
+"""Histories of sessions under faults, each drawn from a seed, and run in a few milliseconds.
 
 VLAGENTS_SIMULATION_SEED=1234 pytest tests/simulation -s     replays a seed that failed, and prints
 its history VLAGENTS_SIMULATION_SEEDS=100000 pytest tests/simulation     more of them than 2,000
@@ -120,7 +120,7 @@ def export_at_once(replica: Replica) -> None:
 
 
 def deadlines_begin_anew(replica: Replica) -> None:
-    """Counts the deadline anew once the session was fetched, and asks nobody whether it was
+    """Counts the deadline again once the session was fetched, and asks nobody whether it was
     answered.
     """
     engine = replica.engine

@@ -2,7 +2,7 @@
 has for them.
 
 The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. What
-a replica's thread, its event loop and Ray's calls between replicas do is played here: a batch takes
+a replica's thread, its event loop and Ray's calls between replicas do is run here: a batch takes
 a time that is drawn, a message is late, comes twice or out of order, or waits until a partition
 heals; a replica stops, is killed or frozen; clocks are set.
 """
@@ -29,7 +29,7 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
-LENGTH_S = 60.0  # of a world, at most
+LENGTH_S = 60.0  # length of a world, at most
 _EPOCH_NS = 1_700_000_000 * 10**9
 
 

@@ -87,7 +87,7 @@ from vlagents_ray_learn.weights_endpoint import weights_routes
 ANSWER_S = 10.0
 LIMITS = MessageLimits(body_bytes=2**20)
 _NUMBERS = itertools.count()
-_WORDS = {  # of refusals, where a protocol has no code
+_WORDS = {  # words of refusals, where a protocol has no code
     "401": r"revoked|expired|not known|needs an API key",
     "403": r"is for \[",
     "429": r"requests a second|may hold \d+ sessions|sessions here",
@@ -154,7 +154,7 @@ class Visitor:
         self.replica.known.change(self.name, **changes[self.credential])
         for keys in (self.replica.known.keys, self.replica.at_gateway):
             if self.credential == "over its rate":
-                # The end of a refused WebSocket has been charged to it.
+                # The end of a rejected WebSocket has been charged to it.
                 with contextlib.suppress(TooManyRequests):
                     keys.check(self.token, "app").take_request()
             if self.credential == "over its sessions":

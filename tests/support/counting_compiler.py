@@ -18,10 +18,10 @@ class CountingCompiler:
     """Makes programs without code for this machine, whose compiler would take minutes."""
 
     def __init__(self) -> None:
-        self.rows: list[int] = []  # of each program
+        self.rows: list[int] = []  # rows of each program
         # Of the results of programs, by their rows.
         self.change: dict[int, Callable[[Any], Any]] = {}
-        self.calls = 0  # of programs
+        self.calls = 0  # calls of programs
 
     def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
         rows = next(

@@ -1,4 +1,4 @@
-"""The C++ client in a process of its own, which a test tells what to do."""
+"""The C++ client in a separate process, which a test tells what to do."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ MESSAGES = (
     "malformed message",
     "control frame",
 )
-_RATE = 1000.0  # of the key whose charges are counted, requests/s
+_RATE = 1000.0  # rate of the key whose charges are counted, requests/s
 
 
 @dataclass(frozen=True)

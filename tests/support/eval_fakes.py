@@ -274,7 +274,7 @@ class Clock:
 
 
 class SimulatedTime:
-    """A clock that goes on when a thread sleeps, in place of the module `time`."""
+    """A clock that continues when a thread sleeps, in place of the module `time`."""
 
     now = 0.0
 

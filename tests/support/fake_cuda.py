@@ -49,7 +49,7 @@ class FakeCuda:
         self.most_rows = sys.maxsize
         self.emptied = 0  # calls of `empty_cache`
         self.pinned: list[torch.Tensor] = []
-        self.clock_ms = 0.0  # of all GPUs
+        self.clock_ms = 0.0  # clock of all GPUs
         self.captures: list[Capture] = []  # all that were begun
         self.replays: list[Capture] = []  # the graph of each replay
         self.reserved = [0, 0]  # bytes of the graphs on each device
@@ -422,7 +422,7 @@ class GpuTensor(torch.Tensor):
     values: torch.Tensor  # on the CPU
     cuda_of: FakeCuda
     index: int
-    streams: list[Stream]  # of `record_stream`
+    streams: list[Stream]  # streams of `record_stream`
 
     @staticmethod
     def __new__(cls: Any, values: torch.Tensor, cuda: FakeCuda, index: int) -> GpuTensor:

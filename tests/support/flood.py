@@ -1,4 +1,4 @@
-"""A keyed replica in a process of its own, and one that floods it.
+"""A keyed replica in a separate process, and one that floods it.
 
 `flood.py serve`, `flood.py haproxy PORT`, `flood.py gateways`, `flood.py page`, and `flood.py
 attacks`.
@@ -85,7 +85,7 @@ from vlagents_ray_live.live_view import Fleet
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 GATEWAYS_IN_FLIGHT = 256 * 2**20  # bytes; a key or an address may take half of it
-IMAGES = 4  # of these in the largest request
+IMAGES = 4  # images of these in the largest request
 SLOW_S = 6.0  # time in which a message must arrive
 # Time after which a silent client ends: over that of all rows, between which a robot is silent.
 IDLE_S = 7200.0
@@ -408,7 +408,7 @@ def connected(path: str, where: Where) -> Iterator[socket.socket]:
 @contextlib.contextmanager
 def opened(path: str, where: Where, key: str) -> Iterator[tuple[socket.socket, bytes]]:
     """A WebSocket, which offers compression, and the answer to its handshake; `OSError` if it is
-    refused.
+    rejected.
     """
     port, place = address_of(path, where)
     with connected(path, where) as connection:
@@ -724,7 +724,7 @@ def misbehave_over_http(endpoint: str, name: str, where: Where, end: float) -> N
 
 @contextlib.contextmanager
 def http_robot(where: Where) -> Iterator[Callable[[], None]]:
-    """An act of a robot over HTTP through HAProxy, in a session of its own."""
+    """An act of a robot over HTTP through HAProxy, in a separate session."""
     headers = {
         "authorization": "Bearer robot",
         "content-type": CONTENT_TYPE,
@@ -1086,7 +1086,7 @@ def child(*args: str) -> Iterator[subprocess.Popen[str]]:
 def serve_attacks() -> None:
     """Fork a process for each attack that the standard input names, and kill it at the next line.
 
-    A process of its own for each would import for most of a second.
+    A separate process for each would import for most of a second.
     """
     for line in iter(sys.stdin.readline, ""):
         arguments = json.loads(line)

@@ -50,7 +50,7 @@ class Golden:
     """A frame, and what it means."""
 
     name: str
-    kind: str  # "requests", "replies", "malformed" (a reader refuses it), or "probe"
+    kind: str  # "requests", "replies", "malformed" (a reader rejects it), or "probe"
     says: str
     data: bytes
     meaning: Any = None

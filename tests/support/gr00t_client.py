@@ -44,7 +44,7 @@ def decode_n15(value: Any) -> Any:
 
 
 def modality_config(delta_indices: list[int], modality_keys: list[str]) -> dict[str, list[Any]]:
-    """Its fields; as the newest client, refuses a modality without keys."""
+    """Its fields; as the newest client, rejects a modality without keys."""
     if not modality_keys:
         raise ValueError("modality_keys must not be empty")
     return {"delta_indices": delta_indices, "modality_keys": modality_keys}

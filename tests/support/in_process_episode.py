@@ -56,7 +56,7 @@ def run_episode(
 def play(
     env: EvalEnv, name: str, agent: Agent | str, *, seed: int = 0, **options: Any
 ) -> EpisodeResult:
-    """The episode of `seed` and the reset's `options`, played by an agent or by an expert,
+    """The episode of `seed` and the reset's `options`, run by an agent or by an expert,
     "module:Class".
     """
     if isinstance(agent, str):

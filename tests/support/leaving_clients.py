@@ -177,7 +177,7 @@ class StoppableServer:
         self.engine.start()
         self.shutdown = Shutdown()
         self._loop: asyncio.AbstractEventLoop | None = None  # of the requests to the server's port
-        self.requests = 0  # of HTTP, and WebSockets, that are under way
+        self.requests = 0  # requests of HTTP, and WebSockets, that are under way
         routes = dialect_routes(
             DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
         )

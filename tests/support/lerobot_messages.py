@@ -149,7 +149,7 @@ class AsyncClient:
     """A client of LeRobot's service over gRPC, without its threads and its robot."""
 
     def __init__(self, port: int, **options: Any) -> None:
-        # A channel of its own for each: gRPC shares the connections of channels with the same
+        # A separate channel for each: gRPC shares the connections of channels with the same
         # options.
         self.channel = grpc.insecure_channel(
             f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)], **options

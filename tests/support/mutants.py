@@ -1,7 +1,6 @@
-"""Mutants: small defects, drawn over the subjects of the core, each played against its tests.
-
-`python -m tests.support.mutants --seed 56 --count 60` plays them in a copy of the checkout, and writes
-a line of JSON for each. A mutant that survives shows a test that is missing, code that
+"""Mutants: small defects, drawn over the subjects of the core, each run against its tests.
+ `python -m tests.support.mutants --seed 56 --count 60` runs them in a copy of the checkout, and
+writes a line of JSON for each. A mutant that survives shows a test that is missing, code that
 nothing needs, or a change that means the same. `--list` only prints them.
 """
 
@@ -28,12 +27,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 
-# What no test may need here: mutants are played against tests that take seconds.
+# What no test may need here: mutants are run against tests that take seconds.
 MARKS = (
     "not (ray or server or hosts or sim or vulkan or gpu or browser or node or compiler or alone"
     " or slow or integration)"
 )
-RELATED_FILES = 6  # test files that are played first
+RELATED_FILES = 6  # test files that are run first
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ def _is_replaceable(node: ast.AST, text: str) -> bool:
 
 
 def draw(seed: int, count: int) -> list[Mutant]:
-    """Draw `count` mutants, as many of each subject, in turns.
+    """Draw `count` mutants, as many of each subject, interleaved.
 
     The draws of a subject depend on the seed and on its own sources alone.
     """

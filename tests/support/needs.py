@@ -1,13 +1,12 @@
 """What a test needs, by its markers: what this machine cannot give is skipped, what no marker names
-is refused.
+is rejected.
 
 So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no
 simulator. The marker `integration` is the tier that `make test` leaves out.
-
-On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests
+ On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests
 need but a GPU, sources and assets that are on no package index, a browser where apt has none,
-libraries that others load wherever they are installed, and other versions of Python: only tests marked
-`gpu`, `source`, `assets`, `browser`, `library` and `python` may be skipped there.
+libraries that others load wherever they are installed, and other versions of Python: only tests
+marked `gpu`, `source`, `assets`, `browser`, `library` and `python` may be skipped there.
 """
 
 from __future__ import annotations
@@ -164,7 +163,7 @@ _WHY_MISSING: dict[str, Callable[..., str | None]] = {
 
 @contextmanager
 def nothing_else(item: pytest.Item) -> Iterator[None]:
-    """Refuse Ray, torch and simulators for the length of a test, unless its markers name them."""
+    """Reject Ray, torch and simulators for the length of a test, unless its markers name them."""
     marked = {marker.name for marker in item.iter_markers()}
     modules = set()
     if not marked & {"sim", "vulkan"}:

@@ -1,5 +1,5 @@
 """The processes that run tests: which tests may run at the same time in those of pytest-xdist, and
-which run in a process of their own.
+which run in a separate process.
 
 The tests that ran in this process before may have left connections, such as Ray's, which come and
 go at any time: a test that counts what its process holds is marked `own_process`.
@@ -72,7 +72,7 @@ class _FreshProcesses:
         self._lines = os.fdopen(self._answers, "rb")
 
     def failure_of(self, name: str) -> str | None:
-        """Run the test of that name in a process of its own; returns None if it passed."""
+        """Run the test of that name in a separate process; returns None if it passed."""
         with contextlib.suppress(BrokenPipeError):
             os.write(self._asks, json.dumps(name).encode() + b"\n")
         line = self._lines.readline()

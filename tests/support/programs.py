@@ -42,9 +42,9 @@ class Program:
     python: str = "3.11"
     client: str = ""  # name of the function
     dialects: Mapping[str, Any] = field(default_factory=dict)
-    dim: int = 7  # of an action
+    dim: int = 7  # dim of an action
     used: int = 4  # rows of a chunk that are executed
-    options: tuple[str, ...] = ()  # of `uv pip install`
+    options: tuple[str, ...] = ()  # options of `uv pip install`
 
 
 def _adapter(name: str, version: str, *more: str) -> tuple[str, ...]:

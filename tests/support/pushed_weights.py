@@ -15,7 +15,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import own_copy
 
-_FACTOR = 0.8  # of all numbers of a network, whose actions then differ, and remain finite
+_FACTOR = 0.8  # factor of all numbers of a network, whose actions then differ, and remain finite
 
 
 def push(engine: Engine, named: Mapping[str, Any], **options: Any) -> int:

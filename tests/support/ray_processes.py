@@ -1,6 +1,6 @@
 """Processes of servers and of Ray.
 
-Those of a Ray that has a folder of its own (RAY_TMPDIR, --temp-dir) are known by it. `serving` runs
+Those of a Ray that has a separate folder (RAY_TMPDIR, --temp-dir) are known by it. `serving` runs
 `vlagents-ray serve` as users do; `leaked` searches the places where other processes can read a
 secret.
 """

@@ -257,7 +257,7 @@ def check_command(words: list[str], where: str) -> None:
 
 DOCS = ROOT / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
-COMMAND: Any = get_command(app)  # of click, or of what typer has of it
+COMMAND: Any = get_command(app)  # command of click, or of what typer has of it
 PAGES = sorted([ROOT / "README.md", ROOT / "SECURITY.md", *DOCS.rglob("*.md")])
 
 

@@ -43,7 +43,7 @@ OF_PLUGINS: dict[str, list[str]] = {
 }
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"] | OF_PLUGINS
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
-SERVER_PYTHON = "3.11"  # of the images
+SERVER_PYTHON = "3.11"  # server python of the images
 PLATFORM = "x86_64-manylinux_2_36"  # Debian bookworm's
 BEGIN, END = "<!-- resolved {} -->", "<!-- /resolved -->"
 

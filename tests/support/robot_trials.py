@@ -109,7 +109,7 @@ def tasks(max_steps: int = 4) -> dict[str, dict[str, Any]]:
 
 
 class Policies:
-    """A factory of agents, which notes which of them played: the first of each are rehearsals."""
+    """A factory of agents, which notes which of them run: the first of each are rehearsals."""
 
     def __init__(self, make: Callable[[str], Agent] = Reaching) -> None:
         self.made: list[str] = []

@@ -18,13 +18,13 @@ from typing import Any
 import pytest
 
 _SECONDS = Path(__file__).parent / "seconds.json"
-_LEAST_S = 8.0  # of a file that is recorded
+_LEAST_S = 8.0  # shortest duration of a file that is recorded
 # Of several hosts each: one at a time, as two of them starve each other of CPU.
 _CLUSTERS = "tests/cluster/"
 
 
 def unit(nodeid: str) -> str:
-    """The file of a test, or the folder whose files one process plays."""
+    """The file of a test, or the folder whose files one process runs."""
     return _CLUSTERS if nodeid.startswith(_CLUSTERS) else nodeid.partition("::")[0]
 
 

@@ -30,7 +30,7 @@ _EXAMPLES = Path(__file__).parents[2] / "examples"
 _POLICIES = (Path(__file__).parent, _EXAMPLES / "raptor", _EXAMPLES / "two_models")
 
 _running: contextlib.ExitStack | None = None
-_port = 0  # of Serve's HTTP
+_port = 0  # port of Serve's HTTP
 
 
 def start() -> None:

@@ -44,7 +44,7 @@ class TorchCalls(TorchDispatchMode):
             0  # the same, where the parts of a function of `_ONE_KERNEL` are not counted
         )
         self.uploads = 0  # copies from the CPU of memory that may be pinned
-        self.waits: Counter[str] = Counter()  # of Python for the GPU, by their functions
+        self.waits: Counter[str] = Counter()  # waits of Python for the GPU, by their functions
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, name = kwargs or {}, op.overloadpacket.__name__

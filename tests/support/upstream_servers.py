@@ -275,7 +275,7 @@ class OpenVLA(BaseHTTPRequestHandler):
 
 @contextlib.contextmanager
 def upstream(kind: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A server of a kind in a process of its own, which is killed at the end."""
+    """A server of a kind in a separate process, which is killed at the end."""
     with upstreams({port: kind}) as process:
         yield process
 

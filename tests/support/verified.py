@@ -32,7 +32,7 @@ FOLDERS = tuple(
 )
 PAGES = ROOT / "docs" / "policies"
 PAGE = PAGES / "verification.md"
-PYTHON = "3.11"  # of this project's own environment
+PYTHON = "3.11"  # python of this project's own environment
 BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
 WHAT = ("parity", "batches", "isolation", "loading", "size")  # the columns that the page explains
 PLUGINS = ("arro",)  # wrappers of packages in plugins/, with a page among those of the policies

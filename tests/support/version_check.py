@@ -25,7 +25,7 @@ from vlagents_ray.serve.launch.server import running_server
 
 OUTSIDE: tuple[TransportName, ...] = ("http", "websocket", "shm")
 INSIDE: tuple[TransportName, ...] = ("handle", "plasma")
-TABLETOP_DIM = 4  # of an action of `tabletop`
+TABLETOP_DIM = 4  # tabletop dim of an action of `tabletop`
 EPISODES = 2
 STEPS = 20
 

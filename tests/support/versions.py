@@ -22,7 +22,7 @@ from vlagents_ray.serve.python_env.create import install
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("version_check.py")
 RUN_S = 300
-DIM = 3  # of an action of the model
+DIM = 3  # dim of an action of the model
 _MODEL = """<ir_version: 8, opset_import: ["": 17]>
     reach (float[batch, 4] state) => (float[batch, 3] action) {
         weights = Constant <value = float[4, 3] {1, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1, 1}> ()

@@ -27,7 +27,7 @@ CHECKED_ELSEWHERE = {
     "aloha",
     "upstream",
 }
-VARIANTS = {  # of envs that are not tried by their own name alone
+VARIANTS = {  # variants of envs that are not tried by their own name alone
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
     "pusht": ["pusht", "pusht/keypoints"],
 }

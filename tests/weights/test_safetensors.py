@@ -1,4 +1,4 @@
-"""Weights as bytes: what comes back, and headers that are refused before anything is allocated."""
+"""Weights as bytes: what comes back, and headers that are rejected before anything is allocated."""
 
 from __future__ import annotations
 

@@ -229,7 +229,7 @@ def test_one_number_that_is_not_finite_is_found_among_many_tensors(
 
 
 def test_infinite_values_fit_where_the_policy_has_them() -> None:
-    mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # of causal attention
+    mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # mask of causal attention
     assert (
         fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
     )

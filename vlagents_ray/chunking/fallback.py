@@ -320,7 +320,7 @@ class Motion:
         if self._safe is None:
             raise InvalidAction(f"no action for this tick: {why.reason}")
         self._ease = None
-        if self._last is None:  # the first command was refused
+        if self._last is None:  # the first command was rejected
             self._state = "stopped"
 
         last = self._standing(obs) if self._state == "stopped" else self._last

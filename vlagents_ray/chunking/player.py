@@ -278,7 +278,7 @@ class ChunkPlayer(Agent):
         self._waiting_since: float | None = None
         self._reason = WAITING  # why the plan has no row, if it has none
         # Whether the policy has yet to answer after the plan was dropped, as the robot was stopped
-        # or moved, or the guard refused a row.
+        # or moved, or the guard rejected a row.
         self._begins_again = False
         self.timeliness = Timeliness()
         self._reported = (0, 0)  # ticks and starved ticks that earlier requests have reported

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 _MOST_COLUMNS = 100
-_TERM_COLUMNS = 26  # a longer term is on a line of its own
+_TERM_COLUMNS = 26  # a longer term is on a separate line
 _BOLD, _PLAIN = "\033[1m", "\033[0m"
 HELP = "Show this help and exit."
 VERSION = "Print the version and exit."

@@ -201,9 +201,9 @@ class Connection:
         """Look for another replica while the present one does not answer a ping, and leave it when
         another one has answered; called by the transport, see `ReplicaWatch`.
 
-        If there is no other one, the call goes on to wait. Through a proxy, the next replica cannot
-        be compared with the present one. It has just answered, however, which a frozen one does
-        not.
+        If there is no other one, the call continues to wait. Through a proxy, the next replica
+        cannot be compared with the present one. It has just answered, however, which a frozen one
+        does not.
 
         Raises:
             ReplicaSilent: Another replica is connected.

@@ -26,7 +26,7 @@ class DeadlineSocket:
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
         self._deadline = math.inf  # time.monotonic()
-        self._pieces: list[Buffer] | None = None  # of a request, until it is sent at once
+        self._pieces: list[Buffer] | None = None  # pieces of a request, until it is sent at once
 
     @classmethod
     def install(cls, connection: http.client.HTTPConnection) -> DeadlineSocket:

@@ -1,7 +1,7 @@
 """JPEG and PNG files of (H, W, 3) uint8 RGB images.
 
 The structure of a file is checked first, see `vlagents_ray.images.image_file`: an image that
-declares more pixels than the caller allows is refused before memory is allocated for it.
+declares more pixels than the caller allows is rejected before memory is allocated for it.
 
 PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the
 row above), and zlib uses its run-length strategy. A search for better filters or longer matches

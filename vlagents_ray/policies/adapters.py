@@ -286,7 +286,7 @@ def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
 
 CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 FILES = (CONFIG, WEIGHTS)
-_PREFIX = "base_model.model."  # of all names in the file
+_PREFIX = "base_model.model."  # prefix of all names in the file
 _DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
 _BASE = ".base_layer."  # in the names of values of a layer with an adapter
 _LISTED = 5

@@ -337,7 +337,7 @@ _GRAPH, _COMPILED = "CUDA graph", "torch.compile"
 class Compilation:
     """The compiled cores of one policy."""
 
-    backend: ClassVar[str] = "inductor"  # of torch.compile
+    backend: ClassVar[str] = "inductor"  # backend of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
         """Set what is compiled.

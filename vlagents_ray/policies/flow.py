@@ -302,13 +302,13 @@ class FlowPasses(abc.ABC):
     The steps may also be compiled as one pass.
     """
 
-    # Whether the passes call their layers as regions, see `Compilation.region`.
+    # Whether each layer is compiled as a separate region, see `Compilation.region`.
     by_regions: ClassVar[bool] = False
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a model, in their compiled form if there is one."""
+        """Create the forward passes of a model, compiled where possible."""
         self.model = model
-        self.adapters = LoraAdapters()  # of the policy
+        self.adapters = LoraAdapters()  # adapters of the policy
         # The module that defines the model, which has the functions of its authors' passes.
         self.module = sys.modules[type(model).__module__]
         self._compilation = compilation

@@ -116,7 +116,7 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     """Decode the requests in a frame.
 
     Args:
-        budget: The budget of the message, which may refuse it before any of it is parsed, and each
+        budget: The budget of the message, which may reject it before any of it is parsed, and each
             request before its images are decoded.
 
     Raises:

@@ -358,7 +358,7 @@ class Budget:
         self._refill()
 
     def begin_message(self) -> None:
-        """Raise an error if the message is refused, before any of it is parsed."""
+        """Raise an error if the message is rejected, before any of it is parsed."""
 
     def parse(self, size: int) -> None:
         """Count the memory for the values of `size` bytes of JSON before they are parsed. This
@@ -368,7 +368,7 @@ class Budget:
 
     def begin(self, op: object, priority: object = "robot") -> None:
         """Begin the next request of the message after its header is parsed; raise an error if it is
-        refused.
+        rejected.
         """
         self._refill()
 

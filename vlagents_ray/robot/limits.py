@@ -293,9 +293,9 @@ class _Joint(NamedTuple):
     """A joint of a kinematic chain."""
 
     rotation: list[float]  # from the child's frame to the parent's, (9,), row by row
-    offset: list[float]  # of the child's frame in the parent's, (3,), m
+    offset: list[float]  # offset of the child's frame in the parent's, (3,), m
     axis: list[float]  # unit vector, (3,)
-    action_index: int  # of its number in an action; -1 without one
+    action_index: int  # index of its number in an action; -1 without one
     slides: bool
 
 

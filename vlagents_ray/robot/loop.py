@@ -419,7 +419,7 @@ class LoopOptions:
     """Options of the control loop that most callers leave at their defaults.
 
     Args:
-        guard: Checks every action; a refused action ends the loop. The default is the agent's own
+        guard: Checks every action; a rejected action ends the loop. The default is the agent's own
             `check`, such as a chunk player's, which continues with a safe action instead; else a
             guard of the agent's contract.
         restart: With "manual", `watchdog.restart()` restarts motion after a stop; only an operator
@@ -511,7 +511,7 @@ def run_loop(
         ConfigError: `hz` or `seconds` has a wrong value, the guard differs from the agent's own or
             has limits for another rate, or the recorder has no columns for interventions.
         ContractMismatch: Before the first motion of the policy: it does not fit the robot.
-        InvalidAction: An action is a chunk, or the guard refuses it.
+        InvalidAction: An action is a chunk, or the guard rejects it.
     """
     options = options or LoopOptions()
     restart = options.restart

@@ -1,6 +1,6 @@
 """A robot with two models: a slow planner chooses the subtask, and a fast policy acts on it.
 
-The planner is a policy in a deployment of its own, and has a session of its own. It is part of the
+The planner is a policy in a deployment of its own, and has a separate session. It is part of the
 robot here, like a slow sensor: its newest answer is in each observation. So the policy of the
 control loop remains the only agent that moves the robot, with its guard and its watchdog.
 """

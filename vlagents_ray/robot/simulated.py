@@ -14,7 +14,7 @@ from vlagents_ray.interface import Act, Obs
 if TYPE_CHECKING:
     from vlagents_ray.envs.base import EvalEnv
 
-_SIDE = 224  # of an image whose size the contract does not declare, px
+_SIDE = 224  # side of an image whose size the contract does not declare, px
 _DOT = 16  # side of the dot, px
 _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
 

@@ -23,7 +23,7 @@ from vlagents_ray.slo import SHARE
 
 WINDOW_S = 10  # time over which shares, ages and the goodput are computed, s
 # The largest number of ticks and age of one report. A robot that was offline for weeks stays below
-# them, as it would be refused for ever otherwise.
+# them, as it would be rejected for ever otherwise.
 _MOST_TICKS = 2**31
 _MOST_AGE_MS = 2.0**31
 _AGES = 128  # number of the last ages that a session keeps

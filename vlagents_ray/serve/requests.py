@@ -210,7 +210,7 @@ class PendingRequest:
         """Return whether the deadline has passed at `now`, s, or the client has left.
 
         The queue asks this of each request before a batch takes it, whatever its way to the queue:
-        a client leaves a frozen replica, and its session goes on at another one. When the replica
+        a client leaves a frozen replica, and its session continues at another one. When the replica
         continues, it may execute what has waited before it reads that the client has left.
         """
         if self.origin.ended or now > self.deadline:

@@ -208,7 +208,7 @@ class SessionTable(Generic[M]):
         self.opened = 0  # number of sessions opened so far
         self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
-        # Version up to which the states of a session that left are refused, by session.
+        # Version up to which the states of a session that left are rejected, by session.
         self._left: OrderedDict[str, Version] = OrderedDict()
         self._lock = threading.RLock()
 

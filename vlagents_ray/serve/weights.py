@@ -68,7 +68,7 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 class PushOptions:
     """The options of a push."""
 
-    mode: PushMode = "next_episode"  # when sessions change
+    mode: PushMode = "next_episode"  # when sessions change to the new weights
     partial: bool = False  # whether names may be missing; their values are then kept
     allow_same: bool = False  # whether all values may equal those of the newest version
     # Whether sessions that do not follow the newest version also get it, at their next reset.

@@ -45,7 +45,7 @@ class ValueView:
     """One value in shared memory."""
 
     storage: int  # its key in `SharedValues.storages`
-    dtype: str  # of torch: "float32", "bfloat16", …
+    dtype: str  # dtype of torch: "float32", "bfloat16", …
     begin: int  # first element in the storage
     shape: tuple[int, ...]
     stride: tuple[int, ...]  # elements

@@ -19,7 +19,7 @@ except in `action`, whose left sides are the names that the client reads, and in
 which has the text of each integer that a client sends instead of an instruction. Unknown fields are
 errors; a text is short for an entry with that key and no other field.
 
-An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the
+An observation is rejected if the mapping reads nothing of it, or none of the cameras or none of the
 states in it.
 """
 

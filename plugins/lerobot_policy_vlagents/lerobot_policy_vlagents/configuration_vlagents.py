@@ -38,13 +38,13 @@ class VlagentsConfig(PreTrainedConfig):
     # https: PEM files of the client's certificate and its key.
     certificate: list[Path] = field(default_factory=list)
     transport: str = "auto"  # as of `RemoteAgent`
-    codec: str = "auto"  # of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
+    codec: str = "auto"  # codec of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
     priority: str = "robot"  # "simulation": robots of the same server go first
     # Move a robot although the training's statistics do not fit it; the log shows it.
     ignore_mismatch: bool = False
     timeout_s: float = 30.0  # for a request; after it the command ends with an error
     connect_timeout_s: float = 60.0  # for a server that is still loading
-    device: str | None = "cpu"  # of observations until they are sent
+    device: str | None = "cpu"  # device of observations until they are sent
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class VlagentsConfig(PreTrainedConfig):
         """Do nothing: the policy compares the features with the server's contract."""
 
     def get_optimizer_preset(self) -> NoReturn:
-        """Refuse to train."""
+        """Raise an error, as the policy cannot be trained here."""
         raise ConfigError(TRAINING)
 
     def get_scheduler_preset(self) -> Any:

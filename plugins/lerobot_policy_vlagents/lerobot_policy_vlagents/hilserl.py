@@ -86,12 +86,12 @@ class Actor:
         )
         learner = f"{at['learner_host']}:{at['learner_port']}"
         self._inputs = {name: tuple(one["shape"]) for name, one in policy["input_features"].items()}
-        self.version: int | None = None  # of the last pushed weights
+        self.version: int | None = None  # version of the last pushed weights
         self._weights = weights
         self._label: Label | None = None
         # observation, action, whether an operator's.
         self._frames: list[tuple[Obs, np.ndarray, bool]] = []
-        self._steps = 0  # of all episodes
+        self._steps = 0  # steps of all episodes
         self._error: Exception | None = None  # of the thread, raised by the next episode or `close`
         self._channel = grpc.insecure_channel(learner, grpc_channel_options())
         self._stub = services_pb2_grpc.LearnerServiceStub(self._channel)

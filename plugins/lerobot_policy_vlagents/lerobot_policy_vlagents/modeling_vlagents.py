@@ -152,11 +152,11 @@ class VlagentsPolicy(PreTrainedPolicy):
         self._of_all_threads = self._sessions
 
     def forward(self, batch: dict[str, Any]) -> NoReturn:
-        """Refuse to train."""
+        """Raise an error, as the policy cannot be trained here."""
         raise ConfigError(TRAINING)
 
     def get_optim_params(self) -> NoReturn:
-        """Refuse to train."""
+        """Raise an error, as the policy cannot be trained here."""
         raise ConfigError(TRAINING)
 
     @property

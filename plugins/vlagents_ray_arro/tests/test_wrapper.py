@@ -196,7 +196,7 @@ def test_a_bad_observation_fails_its_own_session_alone() -> None:
     assert isinstance(no_camera, MissingCamera)
     assert isinstance(good, Act)
     assert isinstance(resized, InvalidObservation)
-    assert isinstance(sessions[0].act(view((RED, 10, 10))), Act)  # and its session goes on
+    assert isinstance(sessions[0].act(view((RED, 10, 10))), Act)  # and its session continues
 
 
 def test_the_contract_asks_for_what_it_is_to_change_and_an_instruction() -> None:

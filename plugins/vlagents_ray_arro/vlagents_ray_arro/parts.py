@@ -194,7 +194,7 @@ class PretrainedConfig(BaseModel, extra="forbid"):
 class Pretrained:
     """A part with a model and a processor of transformers."""
 
-    classes: ClassVar[tuple[str, str]]  # of the model and of the processor
+    classes: ClassVar[tuple[str, str]]  # classes of the model and of the processor
 
     def __init__(self, config: Any) -> None:
         self._config = config

@@ -43,7 +43,7 @@ def printed_settings(output: str) -> dict[str, Any]:
     return settings
 
 
-@pytest.mark.slow  # each variant is measured in a process of its own
+@pytest.mark.slow  # each variant is measured in a separate process
 def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None:
     done = CliRunner().invoke(app, ["tune", str(file), *QUICK])
     assert done.exit_code == 0, done.output
@@ -62,7 +62,7 @@ def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None
     assert args.config["batch_sizes"][-1] == args.batch.max_size
 
 
-@pytest.mark.slow  # each variant is measured in a process of its own
+@pytest.mark.slow  # each variant is measured in a separate process
 def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
     done = CliRunner().invoke(
         app, ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "0.000001"]

@@ -1,4 +1,4 @@
-"""Variants of a policy, measured in processes of their own."""
+"""Variants of a policy, measured in separate processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray_cluster.tune.tuner import TunePlan, Tuner, TuningGoal, VariantFailed, choose
 
-pytestmark = pytest.mark.slow  # each variant is measured in a process of its own
+pytestmark = pytest.mark.slow  # each variant is measured in a separate process
 
 SUPPORT = str(Path(__file__).parent / "support")
 

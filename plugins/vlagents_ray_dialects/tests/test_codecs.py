@@ -1,4 +1,4 @@
-"""The codecs of other systems' messages: what goes in comes out, and what is wrong is refused by
+"""The codecs of other systems' messages: what goes in comes out, and what is wrong is rejected by
 name.
 """
 

@@ -79,7 +79,7 @@ def test_an_episode_begins_with_the_first_observation_and_with_each_new_instruct
     assert [episode.begins(text) for text in ("lift", None, "push")] == [False, False, True]
     episode.end()
     assert episode.begins(None)
-    assert episode.opening(None, None) == "lift"  # goes on under the one before
+    assert episode.opening(None, None) == "lift"  # continues under the one before
 
 
 def test_a_policy_that_needs_an_instruction_gets_one() -> None:

@@ -32,7 +32,7 @@ from vlagents_ray_dialects import gateway_sessions, gr00t
 
 pytestmark = pytest.mark.own_process
 
-PLACES = 8  # of clients
+PLACES = 8  # places of clients
 MEMORY = 32 * 2**20  # bytes that may be left, of 96 MiB and more that are sent
 LARGE = bytes(8 * 2**20)
 PING = msgpack.packb({"endpoint": "ping"})

@@ -1,4 +1,4 @@
-"""Pickles as LeRobot's messages have them are read as data; everything else is refused, and
+"""Pickles as LeRobot's messages have them are read as data; everything else is rejected, and
 nothing is executed.
 """
 

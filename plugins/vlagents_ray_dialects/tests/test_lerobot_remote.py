@@ -1,5 +1,5 @@
 """Robots of LeRobot's remote inference over Zenoh: many at one instance, their sessions, and what
-the deployment refuses.
+the deployment rejects.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_a_robot_continues_its_plan(open_arm: Open, mode: str, policy: dict[str,
         assert Counting.given[0] == {}
         np.testing.assert_equal(Counting.given[1], {LEFTOVER: model[2:], DELAY: 2})
 
-        # Another task begins an episode, and the robot's motion goes on without a jump.
+        # Another task begins an episode, and the robot's motion continues without a jump.
         robot.act(7, "another", model_continuation=model[4:], delay=1)
         np.testing.assert_equal(Counting.given[2], {LEFTOVER: model[4:], DELAY: 1})
 

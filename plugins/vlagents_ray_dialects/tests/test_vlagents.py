@@ -453,7 +453,7 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
 
 
 def test_a_slow_a_dead_and_a_silent_client_hold_up_nobody(open_dialect, replicas: Replicas) -> None:
-    # The good one is silent for less, on a busy machine, too.
+    # The good one is silent for less, on a busy machine.
     port = open_dialect("vlagents", idle_s=4.0)
     with Client(port) as half, Client(port) as silent, Client(port) as deaf:
         half.send(call("act", document())[:20])  # and no more

@@ -158,7 +158,7 @@ def test_infer_is_an_act_and_reset_begins_an_episode(served: Served, messages: M
         assert first_row(messages.infer(socket, 8)) == [8, 3, 2, 1]
         messages.ask(socket, "reset", trial_id="trial")
         assert first_row(messages.infer(socket, 9)) == [9, 3, 1, 1]
-        # Another instruction begins an episode, too.
+        # Another instruction begins an episode.
         assert first_row(messages.infer(socket, 9, task="task 5")) == [9, 3, 1, 5]
 
 

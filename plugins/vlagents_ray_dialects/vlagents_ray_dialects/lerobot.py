@@ -306,7 +306,7 @@ class LeRobotDialect(PortDialect):
         return self._acceptor is not None and self._acceptor.alive()
 
     def close(self) -> None:
-        """Refuse further requests, answer those that have arrived, and end all sessions."""
+        """Reject further requests, answer those that have arrived, and end all sessions."""
         self._closing.set()
         if self._acceptor is not None:
             self._acceptor.close()

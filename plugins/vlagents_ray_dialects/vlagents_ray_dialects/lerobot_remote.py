@@ -1,5 +1,5 @@
 """LeRobot's remote inference over Zenoh (`lerobot-rollout --inference.type=remote`): one instance
-serves many robots, each in a session of its own, where LeRobot's own server is busy with one.
+serves many robots, each in a separate session, where LeRobot's own server is busy with one.
 
 The keys of a deployment D, an instance I and a session S:
 
@@ -8,8 +8,8 @@ The keys of a deployment D, an instance I and a session S:
     …/D/instances/I/alive                                       liveliness of the server
     …/D/instances/I/sessions/S/control                          query: reset, invalidate, close
     …/D/instances/I/sessions/S/obs, …/S/act                     observations and their actions
-    …/D/instances/I/sessions/S/language/request                 refused: no policy here answers text
-    …/D/instances/I/sessions/S/alive                            liveliness of the robot
+    …/D/instances/I/sessions/S/language/request                 rejected: no policy here answers
+    text …/D/instances/I/sessions/S/alive                            liveliness of the robot
 
 Zenoh has no key of ours. Where others than trusted robots reach the network, let both sides be
 clients of a Zenoh router, which has TLS and access rules.
@@ -228,7 +228,7 @@ class LeRobotRemoteDialect(PortDialect):
             _reply(query, messages.encode(answer))
 
     def _open(self, query: Any) -> None:
-        """Begin a session on a thread of its own, as its declarations must not block Zenoh's."""
+        """Begin a session on a separate thread, as its declarations must not block Zenoh's."""
         request = self._read(query)
         if request is not None:
             threading.Thread(
@@ -463,7 +463,7 @@ class Offer:
 
 
 class RobotSession(GatewayClient):
-    """One robot, whose messages are answered in their order on a thread of its own.
+    """One robot, whose messages are answered in their order on a separate thread.
 
     Args:
         dialect: The dialect.
@@ -780,7 +780,7 @@ class RobotSession(GatewayClient):
 
     @staticmethod
     def _refuse_language(_request: Envelope, _admission: MessageAdmission) -> Envelope:
-        """Refuse a question, which no policy here answers."""
+        """Reject a question, which no policy here answers."""
         raise UnsupportedRequest("language: this deployment answers with actions only")
 
 

@@ -17,7 +17,7 @@ class GroupCheck:
 
     model: str
     group: str
-    share: float  # of ticks with an action in time
+    share: float  # share of ticks with an action in time
     predicted_share: float
     age_p95_ms: float
     predicted_age_p95_ms: float

@@ -19,7 +19,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from vlagents_ray.errors import ConfigError
 
 _MOST_LAYOUTS = 20_000  # above this number a solution may take minutes
-_LOAD_WEIGHT = 1e-3  # of the sum of loads, beside the largest load
+_LOAD_WEIGHT = 1e-3  # weight of the sum of loads, beside the largest load
 _SOLVE_S = 60.0  # longest time for one solution, s
 
 
@@ -27,7 +27,7 @@ class Piece(NamedTuple):
     """A replica of a model with its share of a GPU."""
 
     model: str
-    parts: int  # of the equal parts of a GPU
+    parts: int  # number of the equal parts of a GPU
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Choice:
 
     piece: Piece
     replicas: int
-    load: float  # of its fullest replica
+    load: float  # load of its fullest replica
 
 
 class Layout(NamedTuple):

@@ -35,7 +35,7 @@ class Use:
     group: str
     need: RobotNeed
     count: int
-    share: float  # of ticks that must have an action in time
+    share: float  # share of ticks that must have an action in time
     transport_s: float
 
 
@@ -48,7 +48,7 @@ class Demand:
     memory_gb: float
     max_batch_size: int
     gpu_fraction: float | None  # None: the plan chooses it
-    max_load: float  # of a replica
+    max_load: float  # max load of a replica
     uses: tuple[Use, ...]
 
     @property
@@ -102,11 +102,11 @@ class GroupPlan:
     robots: int
     hz: float
     rows: int
-    share: float  # of ticks with an action in time
+    share: float  # share of ticks with an action in time
     target_share: float
     replan_ms: float  # time between two requests of a robot
     slack_ms: float  # time by which an answer comes before the robot needs it
-    age_p95_ms: float  # of executed actions
+    age_p95_ms: float  # 95th percentile of their ages
     target_age_ms: float | None
 
 
@@ -118,7 +118,7 @@ class ModelPlan:
     replicas: int
     gpu_fraction: float
     batch_size: int
-    load: float  # of its fullest replica
+    load: float  # load of its fullest replica
     latency_ms: float  # longest time from a request to its answer
     groups: tuple[GroupPlan, ...]
 
@@ -132,9 +132,9 @@ class FleetPlan:
     parts: int  # the equal parts of a GPU in which layouts count
     gpus_at_hand: int
     gpus_needed: int  # by the whole fleet
-    robots: Mapping[str, int]  # of each group, that are served
+    robots: Mapping[str, int]  # robots of each group, that are served
     robots_wanted: Mapping[str, int]
-    demands: tuple[Demand, ...]  # of the robots that are served
+    demands: tuple[Demand, ...]  # demands of the robots that are served
 
     @property
     def is_complete(self) -> bool:

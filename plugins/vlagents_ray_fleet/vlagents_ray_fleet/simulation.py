@@ -31,7 +31,7 @@ from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray.serve.scaling.slo_load import slo_load
 
 _ACT = Request("act")
-_MESSAGE = IncomingMessage("simulation")  # of all requests: nothing is delivered
+_MESSAGE = IncomingMessage("simulation")  # message of all requests: nothing is delivered
 _DRAWN = 8192  # random delays, which are drawn once, as each message has one
 _AGE_BIN_S = 0.001
 _AGE_BINS = 120_000
@@ -84,7 +84,7 @@ class Tally:
     def __init__(self) -> None:
         self.in_time = 0
         self.starved = 0
-        self._runs = array("d")  # of each run: its first tick, s, ticks, period, age or -1
+        self._runs = array("d")  # runs of each run: its first tick, s, ticks, period, age or -1
         self._ages = np.zeros(_AGE_BINS, np.int64)
         self._seconds: dict[bool, np.ndarray] = {
             True: np.zeros(64, np.int64),
@@ -222,7 +222,7 @@ class Stream:
         self._tick = 0  # the next tick that is not counted yet
         self._executed = 0  # rows
         self._left = 0  # rows of the plan
-        self._captured_s = 0.0  # of the observation of the plan
+        self._captured_s = 0.0  # capture time of the observation of the plan
         self._asked = 0  # the tick of the last request
         self._asked_row = 0  # rows that were executed before it
         self._asked_at_s = 0.0

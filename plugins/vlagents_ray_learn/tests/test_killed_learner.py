@@ -1,4 +1,4 @@
-"""A learner in a process of its own, with a Ray of its own, that is killed and goes on."""
+"""A learner in a separate process, with a Ray of its own, that is killed and continues."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ from vlagents_ray_live import episodes
 
 
 class Follow(Agent):
-    """Predicts that the state goes on by one each frame."""
+    """Predicts that the state continues by one each frame."""
 
     @property
     def contract(self) -> Contract:

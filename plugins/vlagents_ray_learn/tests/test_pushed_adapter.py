@@ -91,7 +91,7 @@ def test_no_replica_acts_with_it_if_one_refuses(
     engines: list[Engine], trained: dict[str, np.ndarray]
 ) -> None:
     own, other = engines
-    push(other, trained, partial=True)  # it refuses the values that it has already
+    push(other, trained, partial=True)  # it rejects the values that it has already
     before = [acted(engine) for engine in engines]
     with pytest.raises(UnchangedWeights):
         pushing(own, other, trained)

@@ -63,7 +63,7 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
 
     def workers_class(plan: ResolvedPlan, _stack: object) -> type[InProcessWorkers]:
-        # Without workers the real class plays, as this one would wait for a worker that it does not
+        # Without workers the real class runs, as this one would wait for a worker that it does not
         # start.
         return Workers if plan.workers else InProcessWorkers
 

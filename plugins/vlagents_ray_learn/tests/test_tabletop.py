@@ -254,7 +254,7 @@ def test_a_small_run_ends_with_a_table_of_each_method(tmp_path: Path) -> None:
     assert list(table(out)) == ["bc@100", "rpd@140"]
 
 
-STEPS = 6  # of an episode
+STEPS = 6  # steps of an episode
 
 
 def wanting(obs: Obs) -> Obs:
@@ -405,7 +405,7 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
 
 
 # A run that waits when the replica holds the weights of its second iteration, before episodes are
-# played.
+# run.
 HELD = """
 import pathlib, time
 from train import LearnRun

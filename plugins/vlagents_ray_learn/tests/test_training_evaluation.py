@@ -150,7 +150,7 @@ def test_an_agent_of_this_process_has_the_results_of_a_served_one(
 
 
 def alike(result: EpisodeResult) -> dict[str, Any]:
-    """What two plays of an episode have in common, and the weights that acted."""
+    """What two runs of an episode have in common, and the weights that acted."""
     return {name: value for name, value in result.outcome.items() if name != "key"} | {
         "weights": (result.first_policy_version, result.policy_version, result.policy_fingerprint)
     }

@@ -179,7 +179,7 @@ def test_if_one_replica_refuses_none_acts_with_it(app: Application) -> None:
         app.push(5)
     assert app.gains() == [(0, 0.0)] * 3
     app.replicas.pop(1).engine.close()
-    assert app.push(5).replicas == ("r0", "r2")  # nothing is left of the refused push
+    assert app.push(5).replicas == ("r0", "r2")  # nothing is left of the rejected push
 
 
 def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -> None:

@@ -115,7 +115,7 @@ def opened(server: SimpleNamespace, query: str = "", key: str = "") -> closing[P
 
 
 def answer(socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
-    with suppress(ConnectionClosed, OSError):  # refused already
+    with suppress(ConnectionClosed, OSError):  # rejected already
         socket.send(part, 10)
     found: dict[str, Any] = json.loads(socket.recv(30))
     return found
@@ -324,7 +324,7 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
     server, header = serving(slow_s=0.2), header_of(gains(1))
     for _ in range(20):
         with opened(server) as socket:
-            # Else this machine was too slow for the header, too.
+            # Else this machine was too slow for the header.
             if answer(socket, header) == {"received": 0}:
                 refused = read_error(json.loads(socket.recv(30)))
                 break

@@ -218,7 +218,7 @@ def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(
             status, said = post(server, {"session": session, "do": do, "text": "go on"})
             assert (status, "at the robot" in said["detail"]) == (400, True)
         steps = server.engine.sessions.get(session).steps
-        # The policy goes on.
+        # The policy continues.
         wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)
         assert (arm.applied, reports) == (applied, [])
 

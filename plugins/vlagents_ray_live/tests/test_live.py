@@ -158,7 +158,7 @@ def test_sessions_that_ended_are_forgotten(watched: Watched) -> None:
 # Bounds.
 
 LARGE = 2**20  # bytes of one part of a message; a server accepts up to 64 MiB
-BUDGET = 2**21  # of each kind of what is kept
+BUDGET = 2**21  # budget of each kind of what is kept
 SLACK = 2**20  # bytes of everything besides
 
 ObsAndReply = tuple[Obs, Reply]

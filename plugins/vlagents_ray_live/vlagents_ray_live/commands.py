@@ -182,7 +182,7 @@ class CommandBoard:
                 del self._presses[session]
 
     def _save_now(self, session_id: str, press: Press) -> None:
-        """Save the last seconds of a session; runs on a thread of its own."""
+        """Save the last seconds of a session; runs on a separate thread."""
         try:
             press.why = self._save(session_id)
             press.state = "done"

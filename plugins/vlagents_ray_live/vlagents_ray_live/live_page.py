@@ -95,7 +95,7 @@ def live_routes(
     Args:
         fleet: The data of the page.
         open_to_network: Whether other machines reach this server without a key. Watching is then
-            refused, since the pictures of all robots would be public.
+            rejected, since the pictures of all robots would be public.
         videos: Finds the videos to which the document of an evaluation refers; None for the server
             of a policy.
     """

@@ -52,7 +52,7 @@ class SiblingViews(OtherReplicas):
             The description of the command; None if no replica has the session.
 
         Raises:
-            VLAgentsError: The replica that has the session refused the command.
+            VLAgentsError: The replica that has the session rejected the command.
         """
         calls = [
             sibling.call(ReplicaView.press, session, do, by) for sibling in await self._siblings()

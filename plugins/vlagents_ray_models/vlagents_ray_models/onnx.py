@@ -125,8 +125,8 @@ def _statistic(setting: Any, part: str, default: float) -> Any:
 
 
 class Input(Scaling):
-    """The source of an input that is neither a camera nor the state, and the conversion of any
-    input.
+    """Settings of one input of the file: its source, if it is neither a camera nor the whole state,
+    and its conversion.
     """
 
     state: list[str] | None = Field(
@@ -596,7 +596,7 @@ class Network:
             *alone, again = self.run([*rows, rows[0]])
         except ConfigError:
             raise
-        except Exception as error:  # of the runtimes' many classes
+        except Exception as error:  # error of the runtimes' many classes
             shapes = ", ".join(
                 f"{name} {tensor.row_shape} {tensor.dtype}" for name, tensor in self.inputs.items()
             )

@@ -953,7 +953,7 @@ class OpenPi(ModelPolicy):
 
 
 SOURCE = "OPENPI_SRC"  # the variable that names a checkout; "openpi" on PyPI is another project
-FOLDERS = ("src", "packages/openpi-client/src")  # of a checkout, from which Python imports
+FOLDERS = ("src", "packages/openpi-client/src")  # folders of a checkout, from which Python imports
 
 
 def train_config(name: str) -> Any:

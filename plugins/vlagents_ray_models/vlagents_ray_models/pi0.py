@@ -46,7 +46,7 @@ CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 # Defaults: openpi's name of each camera -> ours, and the parts of LIBERO's state.
 DEFAULT_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 DEFAULT_STATE = ("xyz_axis_angle", "gripper_qpos")
-_ROUNDING = 1e-5  # of float32, for pixels of about 1
+_ROUNDING = 1e-5  # rounding of float32, for pixels of about 1
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
 _BILINEAR = 2  # Pillow's number of that filter
 _PROCESSOR = "processor_config.json"
@@ -402,7 +402,7 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
     [converted] = image_processor([image], return_tensors="np")["pixel_values"]
     converted = np.asarray(converted, np.float32)
 
-    summand = converted[:, :1, :1]  # of black, the first pixel
+    summand = converted[:, :1, :1]  # summand of black, the first pixel
     white = converted[:, levels == 255][:, :1, None]
     factor = (white - summand) / np.float32(255)
     if converted.shape != (3, *levels.shape) or not np.allclose(
@@ -440,7 +440,7 @@ class Pi0HfPasses(FlowPasses):
     def __init__(
         self, network: Any, compilation: Compilation, attention: Attention = "sdpa"
     ) -> None:
-        """Use the passes of a network, in their compiled form if there is one.
+        """Create the forward passes of a network, compiled where `compilation` does so.
 
         Args:
             network: The `PI0ForConditionalGeneration`.

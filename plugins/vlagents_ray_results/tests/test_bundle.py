@@ -1,5 +1,5 @@
 """A bundle: what is checked holds for an honest one, is contradicted by a changed one, and a
-hostile one is refused.
+hostile one is rejected.
 """
 
 from __future__ import annotations

@@ -372,7 +372,7 @@ def test_links_within_a_folder_and_to_it_are_followed(
 
 
 def with_weights(folder: Path, weights: str) -> Path:
-    """All its episodes as if these weights had played them."""
+    """All its episodes as if these weights had run them."""
     with closing(sqlite3.connect(folder / "results.db")) as db:
         db.execute("UPDATE episodes SET weights = ?", (weights,))
         db.commit()

@@ -58,7 +58,7 @@ def rates(results: Results) -> list[float]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_service_left() -> Iterator[None]:
-    """wandb's own process lives as long as the one that wanted it, which here goes on with other
+    """wandb's own process lives as long as the one that wanted it, which here continues with other
     tests.
     """
     yield

@@ -32,7 +32,7 @@ from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results, reading
 
 MANIFEST = "bundle.json"
-MOST_BYTES = 16 * 10**9  # of all members, unpacked
+MOST_BYTES = 16 * 10**9  # largest number of bytes of all members, unpacked
 _MOST_MEMBERS = 200_000
 _MOST_MANIFEST = 64 * 2**20  # bytes
 _CHUNK = 2**20
@@ -256,7 +256,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """Write the results in `folder` as one file that others can check (`verify`).
 
     It holds the present results.db, the differences from the commits, and the trajectories, by
-    which episodes are played again, but nothing that is computed from these. The database names
+    which episodes are run again, but nothing that is computed from these. The database names
     only files in the bundle, so that its results can be merged with others.
 
     Args:

@@ -156,11 +156,11 @@ class _Demonstration:
 
     case: CaseResults
     episode: Episode
-    contract: Contract  # of the env
+    contract: Contract  # contract of the env
     actions: np.ndarray  # (N, A)
     rewards: np.ndarray  # (N,)
     success: np.ndarray  # (N,)
-    parts: tuple[str, ...]  # of `observation.state`
+    parts: tuple[str, ...]  # parts of `observation.state`
     environment: tuple[str, ...]  # parts of `observation.environment_state`
     state: dict[str, np.ndarray]  # (N, D) each
     gripper: np.ndarray | None  # (N,)

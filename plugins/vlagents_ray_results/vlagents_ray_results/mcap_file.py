@@ -103,7 +103,7 @@ class McapFile:
     """
 
     def __init__(self, writer: Any, quality: int) -> None:
-        self.prefix = ""  # of the topics of the following messages
+        self.prefix = ""  # prefix of the topics of the following messages
         self._writer = writer
         self._quality = quality
         self._schemas: dict[str, int] = {}  # numbers of schemas by name

@@ -53,7 +53,7 @@ def merge(
 ) -> Summary:
     """Merge the results of `folders` into the new folder `out`, which can be resumed.
 
-    An episode with the same outcome in several folders is taken from the first; a played one
+    An episode with the same outcome in several folders is taken from the first; a run one
     replaces one that failed by infrastructure.
 
     Args:

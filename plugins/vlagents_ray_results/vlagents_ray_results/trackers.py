@@ -13,7 +13,7 @@ from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
 STEP = "training_step"  # wandb's axis of the curves
-FOLDER = "tensorboard"  # of its event files, in the folder of results
+FOLDER = "tensorboard"  # folder of its event files, in the folder of results
 
 
 class WandbRun:
@@ -94,7 +94,7 @@ class TrackioRun(WandbRun):
 
 
 class TensorboardRun:
-    """Scalars and texts. TensorBoard plays no MP4, so that the paths of videos are logged."""
+    """Scalars and texts. TensorBoard runs no MP4, so that the paths of videos are logged."""
 
     def __init__(self, subject: TrackedPolicy) -> None:
         self._event: Any = require("tensorboard.compat.proto.event_pb2").Event

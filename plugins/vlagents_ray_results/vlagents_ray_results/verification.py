@@ -92,7 +92,7 @@ def verify(
         bundle: The file.
         into: A new folder for its results, which can be read, merged and exported as any others;
             None: they are removed. Summary and report in it are written from the database.
-        replay: The number of episodes whose recorded actions are played again.
+        replay: The number of episodes whose recorded actions are run again.
         seed: The seed by which these episodes are drawn; None: a new one, which the author of the
             bundle cannot know.
         trust: Whether its environments may name any code and files.
@@ -588,7 +588,7 @@ def _difference(
     recorded: Trajectory, number: int, obs: Obs, outcome: tuple[float, bool] | None
 ) -> float | None:
     """Return the largest difference of a step's numbers, or of those of the reset; None if they are
-    equal to the bit.
+    bit-identical.
 
     It is infinite if there are other numbers, and 0 if only the success differs.
 
@@ -630,7 +630,7 @@ def require_harmless(case: CaseResults) -> None:
 
     A bundle may come from a stranger: "module:Class" would be imported, and an option that is a
     path or a nested value could name files or code of this machine. `trust_remote_code` from a
-    bundle is refused: only the local user can grant it.
+    bundle is rejected: only the local user can grant it.
     """
     if env_suite(case.env) not in names("envs") or ":" in case.env:
         raise ConfigError(
@@ -654,7 +654,7 @@ def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
     Raises:
-        ConfigError: The environment refuses these options, or is unknown here; also
+        ConfigError: The environment rejects these options, or is unknown here; also
             `MissingDependency`.
         EnvFailed: The simulator failed.
     """

@@ -970,7 +970,7 @@ class _Layout:
     grippers: list[int]  # the indices of the grippers in an action
     joint_parts: list[str]  # the parts of the state that together contain the joints
     pose_of: list[str | None]  # for each joint, the part with the pose of its hand
-    unit: str  # of the joints
+    unit: str  # unit of the joints
     relative: bool  # whether actions are relative
 
     @classmethod
@@ -1056,8 +1056,8 @@ class _Card:
 
     red: bool  # otherwise it is blue
     x: float  # of its middle, in [0, 1] from the left
-    y: float  # of its middle, in [0, 1] from the top
-    share: float  # of all pixels
+    y: float  # y of its middle, in [0, 1] from the top
+    share: float  # share of all pixels
 
 
 def _find_card(before: np.ndarray, after: np.ndarray) -> _Card | None:

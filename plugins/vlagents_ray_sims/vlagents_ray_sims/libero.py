@@ -539,7 +539,7 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     states whose sign was not normalised. The w of a gripper that points down is near 0, so that a
     normalised state would jump.
     """
-    cosine = min(max(float(quaternion[3]), -1.0), 1.0)  # of half the angle, as is the sine
+    cosine = min(max(float(quaternion[3]), -1.0), 1.0)  # cosine of half the angle, as is the sine
     sine = math.sqrt(1.0 - cosine * cosine)
     if math.isclose(sine, 0.0):
         return np.zeros(3)

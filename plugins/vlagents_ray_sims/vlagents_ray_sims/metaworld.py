@@ -23,7 +23,7 @@ from vlagents_ray.registry import pip_install, require
 PROTOCOL = BenchmarkProtocol(
     name="Meta-World",
     source="Meta-World 3.1.1, metaworld.evaluation and MT1",
-    max_steps=500,  # the simulator refuses further steps
+    max_steps=500,  # the simulator rejects further steps
     control_hz=80.0,
     control="position of the hand, delta",
     success="the task is solved after any step: success_once",

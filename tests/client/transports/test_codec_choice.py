@@ -63,7 +63,7 @@ def test_pixels_are_raw_within_a_machine_and_compressed_over_a_network(
 ) -> None:
     choice = CodecChoice(requested)
     assert choice.codec is None
-    # Each connection decides anew.
+    # Each connection decides again.
     for near, chosen in ((True, RAW), (False, compressed), (True, RAW)):
         choice.connected(near=near)
         assert choice.codec == choice.codec_for(OBS) == chosen

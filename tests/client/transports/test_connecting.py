@@ -25,7 +25,7 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.ports import free_port
 
-TIMEOUT_S = 2.0  # of an act, in which a session whose replica froze connects to another
+TIMEOUT_S = 2.0  # timeout of an act, in which a session whose replica froze connects to another
 
 
 class Clock(SimulatedTime):

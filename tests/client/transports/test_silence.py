@@ -36,7 +36,7 @@ TRANSPORTS = ("shm", "websocket", "http")
 class Gated(Agent):
     """Counts its acts, and waits for a gate where it is told to."""
 
-    gate: threading.Event  # of all sessions, as the next one
+    gate: threading.Event  # gate of all sessions, as the next one
     acts: list[str]
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:

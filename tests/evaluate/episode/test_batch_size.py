@@ -50,7 +50,7 @@ TROUBLES = [
     *EXPLOSIONS,
 ]
 _OTHERS = itertools.count(10)
-_LIMIT = 1.0  # of an action; beyond it, the environment has its trouble
+_LIMIT = 1.0  # limit of an action; beyond it, the environment has its trouble
 
 
 class Fragile(EvalEnv):
@@ -197,7 +197,7 @@ def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(
 def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     run: Callable[..., Summary], trouble: str
 ) -> None:
-    """After an error that is of one of the episodes, each is played alone."""
+    """After an error that is of one of the episodes, each is run alone."""
     alone = outcomes(run(trouble))
     together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=2)
     assert outcomes(together) == alone

@@ -1,4 +1,4 @@
-"""Episodes played together come out as those played alone."""
+"""Episodes run together come out as those run alone."""
 
 from __future__ import annotations
 

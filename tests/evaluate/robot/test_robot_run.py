@@ -361,7 +361,7 @@ def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
 
 def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     config, policies = plan(tmp_path / "out"), Policies()
-    lines = ["", "s", "", "", "s", "", ""]  # the third trial is played, and never judged
+    lines = ["", "s", "", "", "s", "", ""]  # the third trial is run, and never judged
     with pytest.raises(TrialsInterrupted, match="after 2 of 8"):
         evaluate_on_robot(config, ScriptedPerson(typed(lines)), agent_factory=policies)
     assert not (tmp_path / "out" / "results.db").exists()

@@ -34,7 +34,7 @@ def order(trials: list[Trial]) -> list[tuple[str, int, str]]:
 
 
 def orders_by_task(trials: list[Trial]) -> dict[str, list[list[str]]]:
-    """Return the order of the policies in each scene of each task, as they are played."""
+    """Return the order of the policies in each scene of each task, as they are run."""
     scenes: dict[tuple[str, int], list[str]] = {}
     for env, scene, name in order(trials):
         scenes.setdefault((env, scene), []).append(name)

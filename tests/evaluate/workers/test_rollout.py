@@ -146,7 +146,7 @@ def rendered(
 def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(
     config: Config, kept: str
 ) -> None:
-    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is played again for
+    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is run again for
     all of them.
     """
     seeds = seeds_by_outcome(config, chunk=3)

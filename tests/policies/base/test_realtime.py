@@ -15,7 +15,7 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import FlowPasses, Guide
 
 HORIZON, DIM, STEPS = 8, 3, 10
-TARGET = 2.0  # of the model, for each number of each row
+TARGET = 2.0  # target of the model, for each number of each row
 
 
 def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
@@ -73,7 +73,7 @@ def test_a_delay_beyond_the_plan_and_a_plan_beyond_the_horizon_are_cut_to_it() -
     np.testing.assert_allclose(flow(row(plan(20), 20))[0], plan(20)[:HORIZON], atol=1e-6)
 
 
-STEP = 0.25  # by which the policy below goes on in each row
+STEP = 0.25  # by which the policy below continues in each row
 
 
 class Prefixed(FlowPasses):

@@ -20,7 +20,7 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 
 
 class Endpoint(PolledServer[Any]):
-    """Keeps who comes, or refuses to."""
+    """Keeps who comes, or rejects to."""
 
     def __init__(self) -> None:
         listener = socket.create_server(("127.0.0.1", 0))

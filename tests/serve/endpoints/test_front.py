@@ -71,7 +71,7 @@ def test_headers_that_are_not_utf_8_are_malformed(header: bytes) -> None:
                 )
                 head, _, body = client.recv(65536).partition(b"\r\n\r\n")
                 assert head.split(b" ")[1] == b"400"
-                if b"x-\xe9" in header:  # the server itself refuses a name with such bytes
+                if b"x-\xe9" in header:  # the server itself rejects a name with such bytes
                     continue
                 while not body.endswith(b"}"):
                     body += client.recv(65536)

@@ -1,4 +1,4 @@
-"""Deployment files, and servers whose settings cannot hold: all is refused before anything
+"""Deployment files, and servers whose settings cannot hold: all is rejected before anything
 starts.
 """
 

@@ -170,7 +170,7 @@ def test_clients_are_refused_until_the_first_replica_runs_and_when_the_server_st
     begins_empty: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """openpi's client waits for a server whose port is closed, and ends at a handshake that is
-    refused or hangs.
+    rejected or hangs.
     """
     monkeypatch.setenv(MARK, str(tmp_path))
     launcher, config = _write_launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"

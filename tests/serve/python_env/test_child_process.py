@@ -1,4 +1,4 @@
-"""A policy behind an engine, in a process of its own: as if it were in this one."""
+"""A policy behind an engine, in a separate process: as if it were in this one."""
 
 from __future__ import annotations
 
@@ -313,7 +313,7 @@ def test_a_session_that_ends_takes_its_stored_observations_along(preparing: Engi
     assert info(ask(preparing, "d", "reset"))["alive"] == 1
     child.call([Request("close", session=stored.session)])
     wait_for(lambda: info(ask(preparing, "d", "reset"))["alive"] == 0, 10)
-    del stored  # the child does not know it any more, and goes on
+    del stored  # the child does not know it any more, and continues
     wait_for(child._dropped.empty)
     assert info(ask(preparing, "c", "act"))["value"] == 0.0
 

@@ -137,7 +137,7 @@ def test_robots_without_end_do_not_starve_simulations() -> None:
             assert served[-1][0].startswith("r")
     order = [name for batch in served for name in batch]
     assert {"s0", "s1"} <= set(order)
-    # A robot in between, even where a batch has one slot.
+    # A robot is served in between, even if a batch has one slot.
     assert order.index("s1") - order.index("s0") == 2
 
 

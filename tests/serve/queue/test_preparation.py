@@ -1,5 +1,5 @@
-"""Observations are prepared beside the policy's thread, and what the policy then computes is the
-same.
+"""Observations are prepared on other threads than the policy's, and the policy computes the same
+actions.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def test_an_error_of_a_preparation_is_that_of_its_request_alone(
     assert "not an observation" not in str(error)  # only logged
     assert "not an observation" in caplog.text
     assert [prepared(other).partition(":")[0] for other in others] == one.names[1:-1]
-    prepared(one.submit(one.names[-1], "act"))  # its session goes on
+    prepared(one.submit(one.names[-1], "act"))  # its session continues
 
 
 def test_what_was_prepared_for_the_episode_before_is_not_used(

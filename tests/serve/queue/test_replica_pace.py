@@ -172,7 +172,7 @@ def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> No
     assert all(plan.is_admitted for plan in here)
     assert robots.pace.load().in_time
 
-    gone[0].heard = robots.now  # it goes on
+    gone[0].heard = robots.now  # it continues
     robots.read()
     assert gone[0].is_admitted
     assert {plan.is_admitted for plan in gone[1:]} == {None}

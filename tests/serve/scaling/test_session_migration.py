@@ -169,7 +169,7 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(
     replicas: Callable[[int], Replicas], first: str
 ) -> None:
     """The newer episode survives, whichever of the two the replica comes to first; acts of the
-    late one are refused.
+    late one are rejected.
     """
     served = replicas(2)
     cut_off(served)

@@ -24,7 +24,7 @@ SIZE = 100_000  # elements of a value
 MODEL = 4 * 4 * SIZE  # bytes: four values, one of which has two names
 KEEP, PARTIAL = PushOptions("keep"), PushOptions(partial=True, allow_same=True)
 PART = 4 * 10_000  # bytes that operations on a version need beside it
-WORDS = 500  # of a piece of a value, for the fingerprint
+WORDS = 500  # words of a piece of a value, for the fingerprint
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 """New weights in one replica: two phases, when sessions change, and nothing changed by what is
-refused.
+rejected.
 """
 
 from __future__ import annotations

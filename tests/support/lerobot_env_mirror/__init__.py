@@ -1,7 +1,7 @@
 """An environment as LeRobot finds it, `--env.discover_packages_path=lerobot_env_mirror
 --env.type=mirror`.
 
-It knows which actions `mirror_policy.MirrorPolicy` returns to a session of its own, and rewards
+It knows which actions `mirror_policy.MirrorPolicy` returns to a separate session, and rewards
 each of them by 1.
 """
 

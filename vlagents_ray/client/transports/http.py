@@ -214,7 +214,7 @@ class HttpTransport:
                 self._watch.is_proxied = True
             probe = _ProxiedProbe(self._url, self._credentials, self._session, self._answered_by)
             # After a silence, the proxy may give this call to a replica that would search for the
-            # session at the silent one. The client leaves as if that one had this call, too.
+            # session at the silent one. The client leaves as if that one had this call.
             probe.accepts_first = self._watch is None or not self._watch.is_silent
             path = f"/v1/{op}"
             answer = self._link.exchange("POST", path, frame, headers, left_s(deadline), probe)
@@ -530,7 +530,7 @@ def http_url(url: str) -> SplitResult:
     try:
         parts = urlsplit(url)
         is_port = parts.port != 0
-    except ValueError as error:  # of its port, or of an IPv6 address
+    except ValueError as error:  # error of its port, or of an IPv6 address
         raise ConfigError(
             f"url: expected http(s)://HOST:PORT, with a port from 1 to 65535, got {url!r} ({error})"
         ) from error

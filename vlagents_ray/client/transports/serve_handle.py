@@ -110,7 +110,7 @@ class HandleTransport:
         self._session = uuid.uuid4().hex
         self._watch = watch or ReplicaWatch()
         self._replica: Any = None
-        self._pause = 0.0  # of the replica, see `ClientApi.call`
+        self._pause = 0.0  # pause of the replica, see `ClientApi.call`
         self._unanswered: list[Any] = []  # attempts to choose a replica that are still pending
 
     def connect(self, timeout_s: float) -> dict[str, Any]:

@@ -183,8 +183,8 @@ class TrajectoryRecorder(EpisodeObserver):
     """Collects the numbers of one episode."""
 
     def __init__(self) -> None:
-        self._states: list[dict[str, np.ndarray]] = []  # of each observation
-        self._grippers: list[float | None] = []  # of each observation
+        self._states: list[dict[str, np.ndarray]] = []  # states of each observation
+        self._grippers: list[float | None] = []  # grippers of each observation
         # The action, reward, success and version of each step.
         self._steps: list[tuple[np.ndarray, float, bool, int]] = []
         self._cameras: tuple[str, ...] = ()

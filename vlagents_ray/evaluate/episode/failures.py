@@ -54,7 +54,7 @@ _WORKER = (errors.EnvFailed, errors.InvalidInput)
 # These subclasses of `InvalidInput` are errors of the connection to the policy.
 _POLICY = (errors.UnknownSession, errors.NotReset)
 # These errors of an environment are no breakdown: they report settings, a breach of its contract, a
-# missing package, or a refused action.
+# missing package, or a rejected action.
 _FROM_ENV = (
     errors.ConfigError,
     errors.ContractMismatch,
@@ -105,7 +105,7 @@ def explain(error: errors.VLAgentsError) -> Failure:
 def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
     """Return the failure for an `error` that ended a number of `episodes` in one simulator.
 
-    An action that the simulator refuses and a simulation that diverges belong to one of them, which
+    An action that the simulator rejects and a simulation that diverges belong to one of them, which
     is not known.
     """
     if episodes > 1 and (isinstance(error, errors.InvalidAction) or raised_by_divergence(error)):
@@ -128,13 +128,13 @@ class _Side:
 
 
 class env_side(_Side):  # noqa: N801 - a context manager
-    """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and refused
+    """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and rejected
     actions.
     """
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         _raise_if_quit(error)
-        # At a reset, only the environment itself can have chosen an action that it refuses.
+        # At a reset, only the environment itself can have chosen an action that it rejects.
         refuses_own = self._phase == "reset" and isinstance(error, errors.InvalidAction)
         passes = isinstance(error, _FROM_ENV) and not refuses_own
         # ManiSkill raises SystemExit when an asset is missing.

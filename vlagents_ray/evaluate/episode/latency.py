@@ -142,7 +142,7 @@ class ChunkExecutor:
             step = self._plan.next if self._clock.meanwhile == "chunk" else None
             if step is None:
                 action = self._held(dim)
-                # A relative action that is repeated moves the robot on, so that the plan goes on.
+                # A relative action that is repeated moves the robot on, so that the plan continues.
                 repeats = self._clock.meanwhile == "hold" and self._plan.executed > 0
                 if repeats and stopping(self._spec) == "zero":
                     self._plan.advance()

@@ -16,7 +16,7 @@ from vlagents_ray.ray_tools.git_state import GitState
 Status = Literal["done", "policy_error", "infra_failed"]
 Ending = Literal["terminated", "truncated", "policy_done", "error"]
 
-_DIGITS = 16  # of a digest in a key
+_DIGITS = 16  # digits of a digest in a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class EpisodeResult:
     seconds: float = 0.0  # from reset to the last step
     reset_ms: float | None = None  # reset of the environment
     env_step_ms: float | None = None  # median
-    env_seconds: float | None = None  # of the reset and all steps; None on a robot
+    env_seconds: float | None = None  # duration of the reset and all steps; None on a robot
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
@@ -47,7 +47,7 @@ class EpisodeResult:
     # the policy.
     ticks: int | None = None  # ticks at which the policy was to act
     starved: int | None = None  # those of them without a row of an answer
-    age_p50_ms: float | None = None  # of executed actions
+    age_p50_ms: float | None = None  # median age of executed actions
     age_p95_ms: float | None = None
     age_p99_ms: float | None = None
     # Medians of the times in `act.info["timing"]`.

@@ -128,7 +128,7 @@ class PlayedEpisode(EpisodeObserver):
         observation.
 
         State, gripper, reward and success of every step, and the images of the first pass, must be
-        equal to the bit, so that the new images show this episode.
+        bit-identical, so that the new images show this episode.
 
         Args:
             env: The environments.
@@ -173,7 +173,7 @@ class _Comparison(EpisodeObserver):
         self._outcomes = outcomes
         self._record = record
         self._steps = -1  # before the reset
-        self._difference: str | None = None  # of the newest observation
+        self._difference: str | None = None  # difference of the newest observation
 
     def add_observation(self, obs: Obs) -> None:
         """Record an observation; raise `_DifferenceFound` if that of the reset has changed."""

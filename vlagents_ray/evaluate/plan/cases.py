@@ -210,7 +210,7 @@ def _require_distinct(cases: list[EvalCase]) -> None:
 
 
 def require_envs(cases: Iterable[EvalCase]) -> None:
-    """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env refuses."""
+    """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env rejects."""
     for case in cases:
         if case.robot is None:
             env_arguments(case.env, case.suite.env_options)

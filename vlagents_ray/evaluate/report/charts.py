@@ -216,7 +216,7 @@ def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
     """Return a chart with a bar for each of `rows`, of which there is at least one. A row maps the
     names of its segments to their values.
     """
-    names: dict[str, None] = {}  # of all segments
+    names: dict[str, None] = {}  # names of all segments
     for values in rows.values():
         names |= dict.fromkeys(values)
     styles = {name: Style(name, f"c{index % _COLOURS}") for index, name in enumerate(names)}

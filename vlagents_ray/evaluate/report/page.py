@@ -265,7 +265,7 @@ class Latency:
 
 
 def latency(summary: Summary) -> Latency | None:
-    """Return the latencies; None if no episode was played."""
+    """Return the latencies; None if no episode was run."""
     counted: dict[str, list[EpisodeResult]] = {}  # by policy id
     for name in summary.results.policy_ids:
         results = summary.results.only(name).counted
@@ -322,12 +322,12 @@ class Configuration:
     """Runs, workers, versions, the metadata of each policy's server, and all settings."""
 
     runs: tuple[Run, ...]
-    changes: list[Change]  # of files or weights, between episodes
+    changes: list[Change]  # changes of files or weights, between episodes
     programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files by path)
     # (policy id, checkpoint, commit, digest or version of its weights)
     checkpoints: list[tuple[str, str]]
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
-    versions: list[Mapping[str, Any]]  # of each folder
+    versions: list[Mapping[str, Any]]  # versions of each folder
     policies: list[tuple[str, str]]  # (name, metadata as YAML)
     settings: list[tuple[str, str]]  # (folder, settings as YAML)
 

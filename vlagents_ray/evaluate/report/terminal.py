@@ -48,7 +48,7 @@ class Progress:
         Args:
             cases: All planned cases.
             recorded: The success rates of earlier runs, by the case's fingerprint.
-            left: The number of episodes to be played.
+            left: The number of episodes to be run.
         """
 
     def episode(self, case: EvalCase, result: EpisodeResult) -> None:
@@ -60,7 +60,7 @@ class Progress:
         """
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that an attempt failed by infrastructure; the episode will be played again.
+        """Note that an attempt failed by infrastructure; the episode will be run again.
 
         Args:
             job: The episode.
@@ -72,8 +72,8 @@ class Progress:
 
         Args:
             case: The case.
-            at: The number of played episodes.
-            spared: The number of episodes that will not be played.
+            at: The number of finished episodes.
+            spared: The number of episodes that will not be run.
         """
 
     def end(self) -> None:

@@ -49,7 +49,7 @@ class Group:
     infra_failures: int  # number of episodes that failed because of infrastructure; in no rate
     retries: int  # number of attempts that failed because of infrastructure and were repeated
     steps: int  # number of actions executed in all episodes
-    mean_steps: float | None  # None if the episodes have no common rate; likewise `mean_return`
+    mean_steps: float | None  # None if the episodes have no common rate; also `mean_return`
     mean_return: float | None  # mean of the episodes' sums of rewards
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians

@@ -1,7 +1,7 @@
 """Blind evaluation on a real robot: an operator resets the scene and judges, without seeing which
-policy plays.
+policy runs.
 
-`evaluate_on_robot` plays a plan's trials in an order that the plan's key draws (`schedule`). The
+`evaluate_on_robot` runs a plan's trials in an order that the plan's key draws (`schedule`). The
 operator is an `Operator`: at a page in the browser (`PageOperator`), at a terminal
 (`TerminalOperator`), or any class with the same methods.
 """

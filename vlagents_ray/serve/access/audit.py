@@ -3,8 +3,8 @@ per request.
 
     key arm-1: let in by websocket
     key arm-1: reset session 'robot-1'
-    key arm-1: refused: too_many_requests (57 more like this since the last line)
-    key (none): refused: an unknown key
+    key arm-1: rejected: too_many_requests (57 more like this since the last line)
+    key (none): rejected: an unknown key
     key lab: pressed 'pause' for session 'arm-1/7f3a'
 
 A kind of event is logged immediately, and again after `_EVERY_S` at the earliest, with the number
@@ -78,7 +78,7 @@ class Audit:
             logger.info("key %s: %s %s%s", name, event, subject, suffix)
 
     def refused(self, name: str, reason: str) -> None:
-        """Log that the key `name` was refused; an empty name means a missing or an unknown key."""
+        """Log that the key `name` was rejected; an empty name means a missing or an unknown key."""
         suffix = self._count(name, reason)
         if suffix is not None:
             logger.warning("key %s: rejected: %s%s", name or "(none)", reason, suffix)

@@ -24,7 +24,7 @@ What is charged to the rate of a key:
   request, and ends.
 - A WebSocket that ends before its first message, or by a frame that is invalid, costs one request.
 
-A refused request costs nothing. A limit per key that concerns messages, requests or control frames
+A rejected request costs nothing. A limit per key that concerns messages, requests or control frames
 belongs here, and then applies at every endpoint.
 """
 
@@ -125,14 +125,14 @@ class Account:
 
     @property
     def refused_too_often(self) -> bool:
-        """Whether so many consecutive messages were refused that the connection has to end."""
+        """Whether so many consecutive messages were rejected that the connection has to end."""
         return self._refused >= REFUSALS
 
     def throttled_s(self) -> float:
         """Return for how long the server must not read from the client, s; 0 if the key is within
         its rate.
 
-        The pause slows down clients of a key whose messages are refused in any case.
+        The pause slows down clients of a key whose messages are rejected in any case.
         """
         return self.caller.throttled_s() if isinstance(self.caller, Caller) else 0.0
 
@@ -158,7 +158,7 @@ class Charge:
 
         Args:
             caller: The sender.
-            refusal: The reason why the message is refused.
+            refusal: The reason why the message is rejected.
             is_robot: Whether the key allows requests with the priority of robots.
         """
         self.is_robot = is_robot
@@ -173,14 +173,14 @@ class Charge:
         return None if self.caller is None else self.caller.name
 
     def require(self) -> None:
-        """Raise the reason why the message is refused, if it is; nothing of it may be parsed
+        """Raise the reason why the message is rejected, if it is; nothing of it may be parsed
         then.
         """
         if self._refusal is not None:
             raise self._refusal
 
     def require_valid(self) -> None:
-        """Raise an error if the message is refused, or its key has become invalid meanwhile."""
+        """Raise an error if the message is rejected, or its key has become invalid meanwhile."""
         if self.caller is not None:
             self.require()
             self.caller.require()

@@ -164,7 +164,7 @@ class Dialect(abc.ABC):
     Config: ClassVar[type[DialectConfig]] = DialectConfig
     clients: ClassVar[str]  # the system whose clients it serves, as named in `/docs`
     summary: ClassVar[str] = ""  # text of `/docs` about sessions, episodes and errors
-    # Modules of optional packages, without which a deployment is refused.
+    # Modules of optional packages, without which a deployment is rejected.
     requires: ClassVar[Sequence[str]] = ()
     # Mappings that deployment files may name.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
@@ -388,9 +388,9 @@ def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute
 async def decoded(
     read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission
 ) -> T:
-    """Decode a message with `read`, unless it is refused.
+    """Decode a message with `read`, unless it is rejected.
 
-    `data` of None is a WebSocket's text, which is refused.
+    `data` of None is a WebSocket's text, which is rejected.
     """
     admission.begin_message()
     if data is None:
@@ -400,7 +400,7 @@ async def decoded(
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
-    """Accept a WebSocket; return False if it was refused, as the policy is not ready or the
+    """Accept a WebSocket; return False if it was rejected, as the policy is not ready or the
     replica is full.
     """
     try:

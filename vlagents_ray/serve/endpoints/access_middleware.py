@@ -4,7 +4,7 @@ and the end of connections.
 The middleware wraps an ASGI application, so that all of its paths, including the dialects, are
 protected in the same way. Some paths require no key: `/healthz` reports only whether the policy is
 ready, or the step of loading that it has reached, and `public` ones are pages without data. A
-WebSocket is refused before it is accepted.
+WebSocket is rejected before it is accepted.
 
 When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels
 requests over HTTP. None of the client's waiting requests is executed then. When the replica stops
@@ -127,7 +127,7 @@ class AccessMiddleware:
 
         try:
             caller = await self._identify(scope, headers)
-            # A request is charged, and possibly refused, before its body is read.
+            # A request is charged, and possibly rejected, before its body is read.
             charge = Account(caller).charge() if scope["type"] == "http" else None
             if charge is not None:
                 charge.require()
@@ -173,7 +173,7 @@ class AccessMiddleware:
             return NoKey.OPEN
 
         caller = self._keys.check(token_of(headers), self._name)
-        # The wait bounds how often the key's requests are refused.
+        # The wait bounds how often the key's requests are rejected.
         wait_s = caller.throttled_s()
         if wait_s > 0:
             await asyncio.sleep(wait_s)

@@ -91,7 +91,7 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
             self.open()
 
     def close(self) -> None:
-        """End all connections; the polling thread, which goes on, closes them."""
+        """End all connections; the polling thread, which continues, closes them."""
         clients = list(self._clients)
         for client in clients:
             client.end(STOPPING, SERVICE_RESTART)
@@ -247,7 +247,7 @@ class AsgiWebSocket:
         connection = self._connection
         if connection is None and message["type"] == "websocket.accept":
             await self._accept(message, self._make_messages)
-        elif connection is None:  # the WebSocket is refused
+        elif connection is None:  # the WebSocket is rejected
             await self._send_first(message)
         elif message["type"] == "websocket.close":
             connection.end(message.get("reason") or "", message.get("code", _NORMAL))
@@ -366,7 +366,7 @@ def uncancel(task: asyncio.Task[object] | None) -> None:
 
 @functools.cache
 def _own_poller() -> Poller:
-    """Return the poller of this process for all its applications, with a thread of its own."""
+    """Return the poller of this process for all its applications, with a separate thread."""
     poller = Poller()
 
     def poll() -> None:

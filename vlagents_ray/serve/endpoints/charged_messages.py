@@ -23,7 +23,7 @@ class ChargedMessage(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of bytes to decode: none of a text, which is refused."""
+        """The number of bytes to decode: none of a text, which is rejected."""
         return 0 if self.data is None else len(self.data)
 
 
@@ -31,7 +31,7 @@ class ChargedMessages:
     """The messages of one accepted WebSocket, as a context that ends after the last answer.
 
     `async for` returns one after the other, until the client is gone. Messages stay unread while
-    the key of the client is over its rate. After too many refused ones in a row, there are no
+    the key of the client is over its rate. After too many rejected ones in a row, there are no
     further messages, and the context closes the WebSocket.
     """
 
@@ -46,7 +46,7 @@ class ChargedMessages:
         """Wait for the next message, and charge it.
 
         Raises:
-            StopAsyncIteration: The client is gone, or too many messages were refused.
+            StopAsyncIteration: The client is gone, or too many messages were rejected.
         """
         if self._account.refused_too_often:
             raise StopAsyncIteration

@@ -42,7 +42,7 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 logger = logging.getLogger(__name__)
 
 # Maximum number of connections that wait to be accepted. Above it the kernel discards a client's
-# SYN, which the client repeats after one second, and refuses a local client.
+# SYN, which the client repeats after one second, and rejects a local client.
 BACKLOG = 1024
 # Maximum number of ended connections that are closed at once; each takes about 0.01 ms.
 _ENDED_AT_ONCE = 64
@@ -201,7 +201,7 @@ class PolledConnection(ABC):
         """End the pause for the rate of the key; return False if the connection has ended, or the
         key is over its rate again.
 
-        A client that has hung up is disconnected: its unread messages would be refused one by one,
+        A client that has hung up is disconnected: its unread messages would be rejected one by one,
         which would delay the key's other connections.
         """
         self._unpolled_for.discard(THROTTLED)
@@ -221,7 +221,7 @@ class PolledConnection(ABC):
         """Decode a message with `read`, on another thread if that is slow or the message is
         `long`, and `submit` its requests.
 
-        An error of the other thread is passed to `refuse`, one of this thread is raised.
+        An error of the other thread is passed to `reject`, one of this thread is raised.
         """
         try:
             if long:
@@ -408,7 +408,7 @@ class PolledServer(ConnectionOwner[C], ABC):
         self.check_key = check_key
         self._listener = listener
         self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
-        # Without a free descriptor a client could not even be refused, and the listener would stay
+        # Without a free descriptor a client could not even be rejected, and the listener would stay
         # readable.
         self._spare = _spare_descriptor()
 

@@ -36,7 +36,7 @@ class DirectRequests:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._prefix: str | None = None  # of the application's paths; None until it is known
+        self._prefix: str | None = None  # prefix of the application's paths; None until it is known
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request that Serve passes on, which shows the prefix of the application."""
@@ -99,7 +99,7 @@ class _Client:
         return message
 
     def stop_watching(self) -> None:
-        """Stop watching, as the request is answered."""
+        """Stop watching the client, because the request has been answered."""
         if self._watch is not None:
             self._watch.cancel()
 

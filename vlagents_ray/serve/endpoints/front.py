@@ -21,7 +21,7 @@ def middlewares() -> list[Middleware]:
 
 
 class FrontMiddleware:
-    """Refuses headers that are not UTF-8, which Serve decodes.
+    """Rejects headers that are not UTF-8, which Serve decodes.
 
     Lets requests of robots pass by Serve, see `DirectRequests`, and the application take the socket
     of a WebSocket, see `ClientSocket`, or ask whether the client of a request has left, see

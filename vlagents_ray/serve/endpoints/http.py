@@ -265,7 +265,7 @@ def _timed(http: HttpRequest, incoming: IncomingMessage) -> HttpRequest:
 
 
 async def _refuse_path(refuse_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an
+    """Reject an unknown path: Starlette would reject a WebSocket with 403, which means an
     invalid key.
     """
     if scope["type"] == "websocket":
@@ -275,7 +275,7 @@ async def _refuse_path(refuse_http: ASGIApp, scope: Scope, receive: Receive, sen
 
 
 async def _http_problem(http: HttpRequest, error: Exception) -> Response:
-    """Reply to a request that the router refuses: an unknown path, or an unsupported method."""
+    """Reply to a request that the router rejects: an unknown path, or an unsupported method."""
     refused = cast(HTTPException, error)
     if refused.status_code == 404:
         return http_messages.problem_response(UnknownApp(_NO_PATH), http_messages.request_id(http))

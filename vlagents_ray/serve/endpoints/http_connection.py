@@ -91,7 +91,7 @@ class HttpHead:
 
     method: str = ""
     path: str = ""
-    is_kept: bool = True  # whether the client wants to keep the connection
+    is_kept: bool = True  # whether the client requests to keep the connection
     version: str = "1.1"
     is_chunked: bool = False
     fields: list[tuple[bytes, bytes]] = field(default_factory=list)
@@ -269,19 +269,19 @@ class HttpConnection(MessageConnection):
         self._server = server
         self._engine = server.engine
         self._limits = limits
-        self._key: str | None = None  # of the caller
+        self._key: str | None = None  # key of the caller
 
         self._head = b""  # received part of a head
         self._reading: _Reading | None = None  # request whose body arrives
         self._left = 0  # number of bytes of its body that have not arrived; -1: it has chunks
         self._parts: list[bytes] = []  # received parts of its body
         self._size = 0  # number of bytes in them
-        self._is_dropped = False  # whether the body is discarded, as the request is refused
+        self._is_dropped = False  # whether the body is discarded, as the request is rejected
         self._answering: HttpHead | None = None  # request whose answer is awaited
-        self._request_id = ""  # of that request, in the headers of its answer
+        self._request_id = ""  # request id of that request, in the headers of its answer
         self._name = ""  # id of that request in the document of an error
-        self._sender: Sender | None = None  # of that request
-        self._charge: Charge | None = None  # of the latest request
+        self._sender: Sender | None = None  # sender of that request
+        self._charge: Charge | None = None  # charge of the latest request
 
     # Reading.
 
@@ -355,7 +355,7 @@ class HttpConnection(MessageConnection):
         self._run(partial(self.begin, head))
 
     def begin(self, head: bytes) -> None:
-        """Serve a request whose whole head has arrived; without bytes, refuse a head that is too
+        """Serve a request whose whole head has arrived; without bytes, reject a head that is too
         long.
         """
         try:
@@ -398,7 +398,7 @@ class HttpConnection(MessageConnection):
         self._charge.require()
 
     def _refuse_access(self, reading: _Reading, error: VLAgentsError) -> None:
-        """Refuse a request whose client has no access, or has sent too many requests."""
+        """Reject a request whose client has no access, or has sent too many requests."""
         response = http_messages.problem_response(error, self._request_id)
         if isinstance(error, Unauthorized):
             response.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
@@ -425,7 +425,7 @@ class HttpConnection(MessageConnection):
         self._call_later(wait_s, refuse)
 
     def _refusal_of(self, head: HttpHead) -> Response | None:
-        """Return the response to a request that is refused by its head; None if it is served."""
+        """Return the response to a request that is rejected by its head; None if it is served."""
         try:
             if self._server.op_of(head.path) is None:
                 raise UnknownApp(_NO_PATH)
@@ -441,7 +441,7 @@ class HttpConnection(MessageConnection):
         return None
 
     def _refuse(self, reading: _Reading, response: Response) -> None:
-        """Refuse a request, whose body is discarded if it is short; otherwise the connection
+        """Reject a request, whose body is discarded if it is short; otherwise the connection
         ends.
         """
         head = reading.head
@@ -634,7 +634,7 @@ class HttpConnection(MessageConnection):
             self._answer_and_end(response, head)
 
     def _send_response(self, response: Response, head: HttpHead) -> None:
-        """Send a response after which the connection goes on; on any thread."""
+        """Send a response after which the connection continues; on any thread."""
         if not head.is_kept:
             self._answer_and_end(response, head)
             return

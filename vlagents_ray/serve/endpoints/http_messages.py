@@ -59,7 +59,7 @@ logger = logging.getLogger(__name__)
 
 # Longer JSON or msgpack is decoded on another thread, to keep the event loop responsive.
 LONG_BYTES = 512 * 1024
-DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
+DROPPED_BYTES = 2**20  # a connection is closed after a rejected request with a longer body
 # Time before a caller without a right key is answered, s. Without it, eight connections that send
 # nothing but wrong keys double the time of a robot's act on two cores, and the bodies of their
 # requests take all of the bandwidth; a person with a wrong key does not notice it.
@@ -412,7 +412,7 @@ async def answer_error(http: HttpRequest, error: Exception) -> Response:
 
 
 async def deny(socket: WebSocket, error: VLAgentsError) -> None:
-    """Refuse a WebSocket before it is accepted, with the error as an HTTP response if the server
+    """Reject a WebSocket before it is accepted, with the error as an HTTP response if the server
     supports that.
     """
     if "websocket.http.response" in (socket.scope.get("extensions") or {}):

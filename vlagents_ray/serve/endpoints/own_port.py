@@ -236,7 +236,7 @@ class PortConnection(WebSocketConnection):
         return False
 
     def _accept_handshake(self, head: bytes) -> bool:
-        """Accept the handshake; return False if it is refused, before the refusal is sent."""
+        """Accept the handshake; return False if it is rejected, before the refusal is sent."""
         with self._sending:
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
@@ -262,7 +262,7 @@ class PortConnection(WebSocketConnection):
         return True
 
     def _refuse_handshake(self) -> None:
-        """Refuse the handshake.
+        """Reject the handshake.
 
         If the key is over its rate, the refusal is delayed, which bounds the rate of refusals.
         """

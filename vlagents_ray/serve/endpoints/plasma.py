@@ -63,7 +63,7 @@ class Channel:
         there is none.
         """
         content = self._take()
-        # Ray's parser below trusts its input, so that a frame of another program is refused here.
+        # Ray's parser below trusts its input, so that a frame of another program is rejected here.
         if content.metadata != PlasmaAddress.TAG:
             raise MalformedMessage(
                 "plasma: what the channel holds is no frame; is this a client of vlagents_ray?"

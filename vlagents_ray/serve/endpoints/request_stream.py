@@ -101,7 +101,7 @@ class RequestStream(MessageHandler):
 
     def deliver(self, message: IncomingMessage) -> None:
         """Send the answers of a message, and read on if the client had too many unanswered."""
-        if message.size:  # a message that was refused before its requests were sent has none
+        if message.size:  # a message that was rejected before its requests were sent has none
             self._connection.remove_unanswered(message.size)
         self._connection.send_answers(message, self._send, self._engine.stats)
 

@@ -167,7 +167,7 @@ class UnixConnection(PolledConnection):
         self._key: bytes | None = None  # the key as sent
         self._sender: Sender | None = None  # None until the client has sent its key
         self._is_rated = False  # whether the client's key may be over a rate
-        self._refused_keys = 0  # number of messages whose key was refused
+        self._refused_keys = 0  # number of messages whose key was rejected
         self._unanswered = 0  # number of unanswered messages
         self._paused = False  # whether too many messages are unanswered
         self._pings = TokenBucket(CONTROL_FRAMES_PER_S, self._connected_at, CONTROL_FRAMES)
@@ -225,8 +225,8 @@ class UnixConnection(PolledConnection):
             self._pause(BACKLOGGED)
 
     def _end_if_refused_too_often(self) -> None:
-        """End the connection of a client whose key, or whose messages, are refused again and again;
-        called after each refusal.
+        """End the connection of a client whose key, or whose messages, are rejected again and
+        again; called after each refusal.
         """
         if self._sender is None:
             self._refused_keys += 1
@@ -255,7 +255,7 @@ class UnixConnection(PolledConnection):
     ) -> None:
         charge = message.charge = self.account.charge()
         # `read` only locates the memory. A client's new memory file is kept even if the message is
-        # refused.
+        # rejected.
         memory, compact_form, text = self._payload.read(data, descriptors)
         if not compact_form:
             admission = message_admission(self._engine, charge, self._limits)
@@ -298,7 +298,7 @@ class UnixConnection(PolledConnection):
     def _authenticate(self, message: bytes) -> Sender | None:
         """Identify the client by the key in its first message.
 
-        A refused key is checked again at the next messages, `REFUSALS` times.
+        A rejected key is checked again at the next messages, `REFUSALS` times.
 
         Returns:
             The sender of this message; None if the message was the key itself.

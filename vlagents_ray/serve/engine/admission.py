@@ -5,7 +5,7 @@ A message has a `MessageAdmission` from its arrival until it is answered. Decode
 `Budget`, so that these limits apply before anything is decoded:
 
 - The message was charged to the caller's key when it arrived (`vlagents_ray.serve.access.charges`),
-  or it is refused; each further request in it is charged when its header is parsed (429).
+  or it is rejected; each further request in it is charged when its header is parsed (429).
 - Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a
   key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved
@@ -354,7 +354,7 @@ class MessageAdmission(Budget):
         self._inline = inline
 
     def begin_message(self) -> None:
-        """Raise the reason why the message is refused, as in `Budget`; it was charged when it
+        """Raise the reason why the message is rejected, as in `Budget`; it was charged when it
         arrived.
         """
         self.charge.require()

@@ -23,7 +23,7 @@ from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 
 class BackgroundCalls:
-    """Executes background calls, one after the other, on a thread of its own. Thread-safe."""
+    """Executes background calls, one after the other, on a separate thread. Thread-safe."""
 
     def __init__(self, parts: EngineParts) -> None:
         self._models = parts.models

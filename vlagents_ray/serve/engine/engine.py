@@ -169,7 +169,7 @@ class Engine:
         return self.drain_list.draining
 
     def notice_hung(self) -> None:
-        """Refuse requests while a call of the policy exceeds its time limit, and answer the waiting
+        """Reject requests while a call of the policy exceeds its time limit, and answer the waiting
         ones with an error.
 
         This is called several times a second, on a thread that makes no calls of the policy.
@@ -198,7 +198,7 @@ class Engine:
         self.models.close()
 
     def stop(self, timeout_s: float) -> None:
-        """Refuse all requests except those of the running batch, and wait at most `timeout_s`
+        """Reject all requests except those of the running batch, and wait at most `timeout_s`
         for its end.
         """
         # This fails if the policy is loading, or if its GPU has too little memory for it to wake.

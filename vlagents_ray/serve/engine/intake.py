@@ -128,7 +128,8 @@ class Intake:
         return self._preparations.begin(session.prepares, obs, acts)
 
     def reserve(self, pending: PendingRequest) -> ReservedAct | Opening | None:
-        """Check a request before it is queued, and return what it reserves; raise if it is refused.
+        """Check a request before it is queued, and return what it reserves; raise if it is
+        rejected.
 
         The session of a request becomes one of its connection's.
         """
@@ -161,7 +162,7 @@ class Intake:
             if known is None and origin.owner:
                 origin.sessions[session_id] = episode
             if (episode if step is None else step) >= session.expected:
-                # An act of an older episode, which will be refused, does not use the session.
+                # An act of an older episode, which will be rejected, does not use the session.
                 session.origin = origin
 
             model = session.model  # another thread may set it to None
@@ -277,7 +278,7 @@ class Intake:
         return False
 
     def retry(self, pending: PendingRequest) -> None:
-        """Queue an act again after a search of its session; raise if it is refused."""
+        """Queue an act again after a search of its session; raise if it is rejected."""
         # The session stays elsewhere if its key has no room for it here.
         if pending.session_id not in self._sessions:
             self._sessions.require_allowed(pending.origin)

@@ -125,7 +125,7 @@ def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply
     own request.
 
     Arrays are not copied. An info of more than `limit` bytes, or of more values than the client
-    accepts, is refused, since sending it would delay other replies.
+    accepts, is rejected, since sending it would delay other replies.
 
     Raises:
         PolicyFailed: The info cannot be encoded, or is too large.

@@ -28,7 +28,7 @@ class ChildConnection:
 
     They are sent through shared memory (`vlagents_ray.client.transports.shm`): a batch is one
     message, and each session of the replica has a session in the child. Calls that run while the
-    policy acts have a channel of their own, as each channel has one message at a time. So has each
+    policy acts have a separate channel, as each channel has one message at a time. So has each
     thread that sends observations ahead of their acts. All methods may be called from any thread.
     """
 
@@ -45,7 +45,7 @@ class ChildConnection:
         self._background = _Channel(process, policy.address)
         # Channels for calls that are executed at once, which no thread uses at the moment.
         self._immediate: queue.SimpleQueue[_Channel] = queue.SimpleQueue()
-        self._numbers = itertools.count(1)  # of stored observations
+        self._numbers = itertools.count(1)  # numbers of stored observations
 
         # Whether the policy has an ability, by the name of its protocol.
         self._abilities: dict[str, bool] = {}
@@ -93,7 +93,7 @@ class ChildConnection:
         return reply.info or {}
 
     def call_at_once(self, request: Request) -> dict[str, Any]:
-        """Make a call, one of `IMMEDIATE_OPS`, on a channel of its own; return its result.
+        """Make a call, one of `IMMEDIATE_OPS`, on a separate channel; return its result.
 
         Raises:
             ConnectionLost: The process has ended.
@@ -234,7 +234,7 @@ class _Channel:
         self._transport = ShmTransport(address)
         self._transport.connect(_CONNECT_S)
         self._lock = threading.Lock()  # held during a call
-        self._numbers = itertools.count(1)  # of requests
+        self._numbers = itertools.count(1)  # numbers of requests
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
         """Send requests in one message, and return their replies; raise `ConnectionLost` if the

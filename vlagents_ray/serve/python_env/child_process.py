@@ -39,7 +39,7 @@ class ChildProgram:
 class LoadedPolicy:
     """The policy that a child process has loaded."""
 
-    address: LocalAddress  # of the child's server, which receives the requests
+    address: LocalAddress  # address of the child's server, which receives the requests
     contract: Contract | None
     weights: dict[str, Any]  # see `ModelManager.weights`
     trained: dict[str, Any]  # the values that a learner trains, see `child_main`

@@ -196,7 +196,7 @@ class BatchQueue:
         """Return the running batch, and the waiting requests, which are removed. May be called on
         any thread.
 
-        Another thread reads later requests until the batch ends, so that they can be refused while
+        Another thread reads later requests until the batch ends, so that they can be rejected while
         it hangs.
         """
         with self._lock:
@@ -241,7 +241,7 @@ class BatchQueue:
             return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
 
     def close(self) -> list[PendingRequest]:
-        """Refuse further requests, make `next` return None after the running batch, and return
+        """Reject further requests, make `next` return None after the running batch, and return
         the waiting requests.
         """
         with self._lock:

@@ -153,7 +153,7 @@ class BatchWindow:
         # The same by size, from 0 to the largest, for `FairQueue`; empty if there is no curve.
         self.costs_s: Sequence[float] = ()
         self._missing: set[str] = set()
-        self._priority = Priority.SIMULATION  # of the missing sessions
+        self._priority = Priority.SIMULATION  # priority of the missing sessions
         self._bound = self._until = 0.0  # the longest wait, s, and its end
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:

@@ -179,7 +179,7 @@ class ReplicaPace:
         self._curve, self._plans = curve, plans
         self._max_batch_size, self._clock = max_batch_size, clock
         self._depth = depth
-        self._load = IDLE  # of all robots that can be in time
+        self._load = IDLE  # load of all robots that can be in time
         self._admitted_load = IDLE
         # The size up to which batches are filled with requests of robots that are not admitted:
         # with larger ones, the admitted robots would wait for longer than they can.
@@ -264,7 +264,7 @@ class ReplicaPace:
         need, now = plan.need, self._clock()
         # The requests of robots that are not admitted wait behind its own.
         waiting = self._depth() if plan.waits_behind_others else self._depth() - self._others
-        # A request that is sent before those that wait are answered would wait, too.
+        # A request that is sent before those that wait are answered would wait.
         waiting_s = max(0, waiting) / self._throughput_hz
         if need is None:
             return waiting_s

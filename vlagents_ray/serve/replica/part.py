@@ -101,7 +101,7 @@ class SiblingPart:
         """Call the part with the name `part` of a replica; `methods` are its
         `ReplicaPart.sibling_methods`.
         """
-        self.name = replica.name  # of the replica, unique over time
+        self.name = replica.name  # name of the replica, unique over time
         self._replica = replica
         self._part = part
         self._methods = methods

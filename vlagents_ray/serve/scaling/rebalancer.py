@@ -106,7 +106,7 @@ def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> Re
 class _Candidate(NamedTuple):
     """A replica for a client."""
 
-    sessions: float  # of `mean_sessions`
+    sessions: float  # sessions of `mean_sessions`
     load: ReplicaLoad
 
 

@@ -79,7 +79,7 @@ class Ports:
     client: int  # Ray Client, which cannot be disabled
     metrics: int  # Ray's monitor, which cannot be disabled
     serve: int  # the policy server
-    export: int  # of each node's metrics, which Prometheus scrapes
+    export: int  # export of each node's metrics, which Prometheus scrapes
 
 
 def ports_of(job: int) -> Ports:

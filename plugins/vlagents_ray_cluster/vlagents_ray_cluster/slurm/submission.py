@@ -167,8 +167,8 @@ class Script:
 
     name: str
     folder: Path  # for the script and the job's logs, on a file system that all nodes share
-    arguments: Sequence[str]  # of `vlagents_ray_cluster.slurm.job`
-    options: Mapping[str, str | None]  # of sbatch; they override the defaults
+    arguments: Sequence[str]  # arguments of `vlagents_ray_cluster.slurm.job`
+    options: Mapping[str, str | None]  # options of sbatch; they override the defaults
     resubmit: int = 0  # number of times that the job is submitted again when its time is over
     setup: Path | None = None  # a file of shell lines to run first
 

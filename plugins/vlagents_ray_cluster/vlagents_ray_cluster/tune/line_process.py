@@ -20,7 +20,7 @@ from vlagents_ray.errors import VLAgentsError
 
 _END_S = 10.0  # time for a process to end
 _LOOK_S = 0.5  # interval of the checks of a server for whose clients one waits
-_SHOWN_CHARACTERS = 2000  # of a failed process's standard error
+_SHOWN_CHARACTERS = 2000  # number of characters of a failed process's standard error
 
 
 class ProcessFailed(VLAgentsError):

@@ -58,7 +58,7 @@ class QueuedTurn:
 
     actions_per_s: float
     mean_batch: float
-    trips_ms: Sequence[float]  # of each call
+    trips_ms: Sequence[float]  # round trip of each call
 
 
 @dataclass(frozen=True, slots=True)

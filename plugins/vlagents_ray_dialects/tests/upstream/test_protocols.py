@@ -1,4 +1,4 @@
-"""Actions equal to the bit to what the upstream answers to its own client, for each protocol."""
+"""Actions bit-identical to what the upstream answers to its own client, for each protocol."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}\Z")
 _RECORD = "__lerobot_type__"
 _INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
 _DTYPES = frozenset(["bool", *_INTEGERS, "float16", "float32", "float64"])
-_ERROR_CHARACTERS = 2048  # of an error's text, as LeRobot's own server has
+_ERROR_CHARACTERS = 2048  # number of characters of an error's text, as LeRobot's own server has
 
 
 @dataclass(frozen=True, slots=True)

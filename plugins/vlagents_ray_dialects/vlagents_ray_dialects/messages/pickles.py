@@ -124,7 +124,7 @@ class _StackMachine:
         calls: Mapping[Name, Call | None],
     ) -> None:
         self._data = memoryview(data)
-        self._offset = 0  # of the next byte
+        self._offset = 0  # offset of the next byte
         self._limits = limits
         self._records = records
         self._calls = calls

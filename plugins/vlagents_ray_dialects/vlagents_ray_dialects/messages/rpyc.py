@@ -97,7 +97,7 @@ def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall
 
     Raises:
         MalformedMessage: The message is not a request.
-        Refused: The request is not offered.
+        Rejected: The request is not offered.
         MessageTooLarge: The message is longer than the limit.
     """
     message = _message(body, compressed, limit)
@@ -306,7 +306,7 @@ class _BrineReader:
 
     def __init__(self, data: memoryview) -> None:
         self._data = data
-        self._offset = 0  # of the next byte
+        self._offset = 0  # offset of the next byte
         self._items = 0  # the number of values so far
 
     def all(self) -> Any:

@@ -26,14 +26,14 @@ from vlagents_ray_dialects.messages.layouts import libero_state
 MSGPACK, JSON = "application/msgpack", "application/json"
 
 _IMAGE_PREFIX = "observation.images."
-_BASE64_KEYS = ("b64_json", "base64")  # of an image that is a JPEG or PNG file
-_VALUE_KEYS = ("values", "data")  # of an array that is written as a list
+_BASE64_KEYS = ("b64_json", "base64")  # base64 keys of an image that is a JPEG or PNG file
+_VALUE_KEYS = ("values", "data")  # value keys of an array that is written as a list
 _DTYPES = {name: np.dtype(name) for name in ("uint8", "int32", "int64", "float32", "float64")}
 
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """How a client wants its answer.
+    """How a client requests its answer.
 
     Attributes:
         is_raw: Whether it is the actions alone, instead of SGLang's envelope.
@@ -56,10 +56,10 @@ class GenerationRequest:
         is_batch: Whether the client sends several observations together, perhaps only one of them.
         session_names: The session of each robot; empty if the client names none.
         begins_episode: Whether the episode of each robot begins with its observation.
-        horizon: Number of rows that the client wants of each chunk; None for all.
+        horizon: Number of rows that the client requests of each chunk; None for all.
         width: Number of values of each row that the client expects; None for any.
         request_id: Id that the client gave the request; None if it gave none.
-        form: How the client wants its answer.
+        form: How the client requests its answer.
     """
 
     observations: list[dict[str, Any]]
@@ -146,7 +146,7 @@ def read_request(payload: Mapping[str, Any], media_type: str, budget: Budget) ->
 
 
 def require_sizes(request: GenerationRequest, rows: int | None, width: int | None) -> None:
-    """Raise `InvalidObservation` if the client wants more than the policy has.
+    """Raise `InvalidObservation` if the client requests more than the policy has.
 
     Args:
         request: The request of the client.
@@ -166,7 +166,7 @@ def require_sizes(request: GenerationRequest, rows: int | None, width: int | Non
 
 
 def trimmed(chunk: np.ndarray, request: GenerationRequest) -> np.ndarray:
-    """Return the rows of a chunk, (H, D), that the client wants; raises as `require_sizes`."""
+    """Return the rows of a chunk, (H, D), that the client requests; raises as `require_sizes`."""
     require_sizes(request, *chunk.shape)
     return chunk[: request.horizon]
 
@@ -416,7 +416,7 @@ def _begins_episode(parameters: Mapping[str, Any], size: int) -> list[bool]:
 
 
 def _size(parameters: Mapping[str, Any], observation: Mapping[str, Any], name: str) -> int | None:
-    """Return a number of rows or values that the client wants; None if it states none."""
+    """Return a number of rows or values that the client requests; None if it states none."""
     size = parameters.get(name, observation.get(name))
     if size is None:
         return None
@@ -440,7 +440,7 @@ def _form(
     observation: Mapping[str, Any],
     media_type: str,
 ) -> AnswerForm:
-    """Return how a client wants its answer."""
+    """Return how a client requests its answer."""
     runtime = _map(payload, "runtime")
     response_format = runtime.get("response_format", "envelope")
     if not isinstance(response_format, str) or response_format not in ("envelope", "raw"):

@@ -46,7 +46,7 @@ ANSWERS = {
 CLOSE, ERROR = "close", "error"
 
 _FAILED = {"infer": "infer_failed", "call": "call_failed", "reset": "reset_failed"}
-_IMAGE_KEYS = ("color", "colors", "rgb", "image")  # of a camera
+_IMAGE_KEYS = ("color", "colors", "rgb", "image")  # image keys of a camera
 # The comment in a JPEG whose channels are red, green, blue. Without it they are reversed, as they
 # were written by OpenCV from RGB pixels (`encode_image_bit` in XPolicyLab's process_data.py).
 _RGB_COMMENT = b"\xff\xfe\x00\x0aXPL-RGB1"
@@ -257,7 +257,7 @@ def read_observation(observation: Mapping[str, Any], budget: Budget) -> dict[str
 def read_observations(
     observations: Sequence[Mapping[str, Any]], budget: Budget
 ) -> list[dict[str, Any]]:
-    """Return `read_observation` of each."""
+    """Read each observation with `read_observation`."""
     return [read_observation(observation, budget) for observation in observations]
 
 

@@ -81,7 +81,7 @@ def test_transitions_are_those_of_the_policy_itself(
 def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_none(
     served: Server, expected: Any, tmp_path: Path
 ) -> None:
-    mark = tmp_path / "gate-11"  # of the second group
+    mark = tmp_path / "gate-11"  # mark of the second group
 
     def kill() -> None:
         wait_for(mark.exists)

@@ -1,4 +1,4 @@
-"""A replica of a torch policy in a process of its own, which a push in this process reaches."""
+"""A replica of a torch policy in a separate process, which a push in this process reaches."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Sampler:
     batched = False  # whether `draw` accepts several rows
     # Fields of the config with the number of rows of a chunk, by preference.
     lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")
-    random_steps: RandomSteps | None = None  # of the last call of `draw`
+    random_steps: RandomSteps | None = None  # random steps of the last call of `draw`
     # In the last call of `draw`: index of a row -> the number of its chunk's first rows that were
     # an input, because they are already planned.
     prefix_rows: Mapping[int, int] = {}

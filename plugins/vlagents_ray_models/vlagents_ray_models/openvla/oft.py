@@ -560,7 +560,7 @@ class Component:
     """A network that fine-tuning added to OpenVLA, as its tensors by name."""
 
     weights: Weights  # by upstream's names, which a learner pushes
-    _prefix = ""  # of all names
+    _prefix = ""  # prefix of all names
 
     def to(self, device: Any, dtype: Any) -> Self:
         """Move the weights to a device and convert them to a type; return the component."""

@@ -118,7 +118,7 @@ class TokenDecoder:
 
     base: prismatic.Prismatic
     longest: int  # the largest number of tokens of an answer
-    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # of the policy
+    adapters: LoraAdapters = field(default_factory=LoraAdapters)  # adapters of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
         """Replace the passes with their compiled forms, if they are compiled."""

@@ -579,7 +579,7 @@ def _remove_modules() -> dict[str, types.ModuleType]:
 
 # Key of reset's options and of an observation's info, as sent by OpenVLA's clients.
 UNNORM_KEY = "unnorm_key"
-OFFERED = ("logprob", "entropy", "replay")  # of action tokens
+OFFERED = ("logprob", "entropy", "replay")  # values that are offered for action tokens
 _SINGLE_ARM = 7  # six numbers for motion, one for the gripper
 
 
@@ -588,7 +588,7 @@ class PreparedRow:
     """A valid row, ready for the model."""
 
     row: Row
-    scale: Scale  # of the actions of its dataset
+    scale: Scale  # scale of the actions of its dataset
     model_input: Any
 
 
@@ -739,7 +739,7 @@ class PrismaticPolicy(ModelPolicy):
 
 SIDE = 224  # px; the size of all images in OpenVLA's training data
 CROP_AREA = 0.9  # share of the area that training's random crops kept
-_LOBES = 3  # of the Lanczos kernel
+_LOBES = 3  # lobes of the Lanczos kernel
 
 
 def resize(image: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 as arrays and words, whatever their layout; garbage is refused with its
+"""Messages of ROS 2 as arrays and words, whatever their layout; garbage is rejected with its
 cure.
 """
 

@@ -194,7 +194,7 @@ def test_no_action_reaches_the_arm_that_the_guard_has_not_seen() -> None:
     for one in drive.commands:
         assert one in SeeingGuard.passed or one in drive.arm.poses  # a stop is where the arm is
         assert FAR not in one
-    assert drive.reports[0].safe["limits"]  # the wild rows were asked for, and refused
+    assert drive.reports[0].safe["limits"]  # the wild rows were asked for, and rejected
 
 
 def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
@@ -208,7 +208,7 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 2)
         still = len(drive.commands)
         assert drive.commands[-1] in drive.arm.poses  # where it was measured
-        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 7)  # the loop goes on
+        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 7)  # the loop continues
         assert len(drive.commands) == still
         assert not drive.watchdog.control.stopped
         drive.arm.broken = set()

@@ -1,4 +1,4 @@
-"""An arm with a camera behind topics, as a thread that plays its driver: at 30 Hz it publishes,
+"""An arm with a camera behind topics, as a thread that runs its driver: at 30 Hz it publishes,
 and obeys commands.
 """
 

@@ -48,7 +48,7 @@ def joints(arm: str, pose: HandPose) -> list[float]:
     base_x, base_y, facing = _BASES[arm]
     x, y = facing * (pose.xyz[0] - base_x), facing * (pose.xyz[1] - base_y)
 
-    # The wrist from the shoulder, in the vertical plane of the arm, m.
+    # Position of the wrist relative to the shoulder, in the vertical plane of the arm, m.
     forward = math.hypot(x, y) - _HAND * math.cos(pose.pitch)
     up = pose.xyz[2] - _SHOULDER + _HAND * math.sin(pose.pitch)
 

@@ -129,7 +129,7 @@ def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_acts_with_pushed_weights(kind: str, checkpoint: Checkpoint) -> None:
-    policy = loaded(checkpoint(kind))  # of this test alone
+    policy = loaded(checkpoint(kind))  # policy of this test alone
     # The names are those of the authors' training.
     assert policy.parameters().keys() == policy.model.module.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(seen(0)).action)

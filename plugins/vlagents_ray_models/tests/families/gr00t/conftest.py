@@ -34,7 +34,7 @@ Policy = Callable[..., Any]
 
 @pytest.fixture(scope="session")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the checkout with a small backbone, whose code is imported."""
+    """A copy of the checkout with a small backbone. Its code is the one that is imported."""
     from plugins.vlagents_ray_models.tests.families.gr00t import tiny
 
     return tiny.checkout(tmp_path_factory.mktemp("gr00t") / "src")

@@ -157,7 +157,7 @@ def test_in_bfloat16_its_actions_are_those_of_their_class_as_it_is(
 
 
 def test_it_acts_with_pushed_weights(policy_of: Policy) -> None:
-    policy = policy_of("relative", seed=1)  # of this test alone
+    policy = policy_of("relative", seed=1)  # policy of this test alone
     # The names are those of NVIDIA's trainer.
     assert policy.parameters().keys() == policy.model.model.state_dict().keys()
     check_pushed_weights(policy, lambda: begun(policy).act(view(0)).action)

@@ -28,7 +28,7 @@ MAINS: dict[str, Callable[[], None]] = {
 
 
 def status(command: list[str], log: str) -> int:
-    """Run a command in a process of its own; its exit status."""
+    """Run a command in a separate process, and return its exit status."""
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     keyboard, terminal = os.openpty()

@@ -1,7 +1,7 @@
 """LeRobot's own asynchronous client with a simulated arm, as a process: `python robot_client.py
 PORT ACTIONS`.
 
-It plays until the arm has performed so many actions, and prints these as JSON. As a module, it is
+It runs until the arm has performed so many actions, and prints these as JSON. As a module, it is
 the arm alone.
 """
 

@@ -1,4 +1,4 @@
-"""LeRobot's own asynchronous client, in a process of its own, drives an arm by a policy behind
+"""LeRobot's own asynchronous client, in a separate process, drives an arm by a policy behind
 our gateway.
 """
 

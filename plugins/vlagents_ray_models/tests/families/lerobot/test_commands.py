@@ -47,7 +47,7 @@ class Ended:
 
     status: int
     log: str
-    folder: Path  # of all commands
+    folder: Path  # folder of all commands
     begun: list[tuple[str | None, object]]  # instructions and seeds of the episodes of all commands
 
 

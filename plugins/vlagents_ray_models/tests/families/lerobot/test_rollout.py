@@ -42,7 +42,7 @@ class Rollout:
     log: str
     # What the robot was seen to be when it got an action, and the action.
     sent: list[dict[str, Any]]
-    folder: Path  # of all rollouts
+    folder: Path  # folder of all rollouts
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +218,7 @@ def test_settings_of_the_guidance_are_the_servers(
 def test_a_reset_on_another_thread_begins_an_episode_without_its_plan(
     policy: VlagentsPolicy,
 ) -> None:
-    """LeRobot computes chunks on a thread of its own, and resets the policy on the main one."""
+    """LeRobot computes chunks on a separate thread, and resets the policy on the main one."""
     policy.config.rtc_config = RTCConfig(execution_horizon=3)
     policy.init_rtc_processor()
     # The last row is LeRobot's filling.

@@ -15,7 +15,7 @@ import transformers
 from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 
 _VISION = ("<|vision_start|>", "<|image_pad|>", "<|vision_end|>", "<|video_pad|>")
-_ACTIONS = ("<|propri|>", "<|action|>", "<|action_fast|>")  # of WALL-X
+_ACTIONS = ("<|propri|>", "<|action|>", "<|action_fast|>")  # actions of WALL-X
 _CHAT = (
     "{% for message in messages %}<|im_start|>{{ message['role'] }}\n"
     "{% for part in message['content'] %}{% if part['type'] == 'image' "
@@ -23,7 +23,7 @@ _CHAT = (
     "%}<|im_end|>\n"
     "{% endfor %}"
 )
-SIDE = 64  # of the images that GR00T's vision model gets
+SIDE = 64  # side of the images that GR00T's vision model gets
 
 
 def _write_chat_tokenizer(folder: Path) -> dict[str, int]:

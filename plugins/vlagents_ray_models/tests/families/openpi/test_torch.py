@@ -1,5 +1,5 @@
 """openpi's PyTorch port, which needs a transformers that is patched as openpi describes; without
-the patch it is refused.
+the patch it is rejected.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from vlagents_ray_models.openvla.policy import OpenVLA
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
 
-ATOL = 1e-4  # of means of actions of size 1
+ATOL = 1e-4  # atol of means of actions of size 1
 CHOSEN = ("first", None, "second", "first")
 
 

@@ -240,7 +240,7 @@ def test_actions_depend_on_each_input(loaded: Callable[..., Any], changed: str, 
 def test_it_acts_with_pushed_weights(
     loaded: Callable[..., Any], kind: str, components: set[str]
 ) -> None:
-    policy = loaded(kind, seed=1, **SETTINGS[kind])  # of this test alone
+    policy = loaded(kind, seed=1, **SETTINGS[kind])  # policy of this test alone
     assert {name.partition("/")[0] for name in policy.parameters()} == {"vla", *components}
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 

@@ -145,7 +145,7 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
 
 
 SIZE = 3
-NORMS = 2  # of a layer
+NORMS = 2  # norms of a layer
 # The rows of the tensor that each program reads first: one layer of the vision encoder, whose rows
 # are images of two cameras, and one of the language model, which begins with the factors of its
 # norms; of the steps, the embedding, one layer and the last norm.

@@ -317,7 +317,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_unpickled(tmp_path: P
         VJepa2Ac.from_config({"checkpoint": str(file), "encoder_heads": HEADS}).initialize()
 
 
-SIZE = 2  # of compiled batches
+SIZE = 2  # size of compiled batches
 
 
 # More than the 12 plans of an iteration, and no divisor of them.

@@ -83,7 +83,7 @@ def test_it_stays_once_the_goal_is_met() -> None:
     for _ in range(170):  # into the second try
         expert.act(observation(_IN))
     met = observation(_IN, unmet=[])
-    grippers = [expert.act(met).action[6] for _ in range(600)]  # it plays the second try to its end
+    grippers = [expert.act(met).action[6] for _ in range(600)]  # it runs the second try to its end
     assert set(grippers[-200:]) == {-1.0}
 
 
