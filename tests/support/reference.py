@@ -47,17 +47,17 @@ Exit status, unless a command lists others: 0 for success, 2 for wrong arguments
 any other failure. `--version` prints the version.
 """
 _ABOUT_RUN_FILE = """\
-All keys of the YAML file that [describes a run](../evaluation/running.md). An unknown key is an error. Every policy runs
-in every suite. Where a checkpoint serves several robots, write a file for each of its `embodiment`s.
+This page lists all keys of the YAML file that [describes a run](../evaluation/running.md). An unknown key is an error.
+Every policy runs in every suite. Where a checkpoint serves several robots, write a file for each of its `embodiment`s.
 """
 _ABOUT_DEPLOYMENT = """\
 A deployment file is a config file of Ray Serve whose applications have `import_path: vlagents_ray.serve.app:build`. This
-page lists the keys below `args` of such an application. An unknown key is an error. [Serve a policy](../serving.md) has
+page lists the keys below `args` of such an application. An unknown key is an error. [Serve a policy](../serving.md) shows
 an example.
 """
 _ABOUT_POLICIES = """\
-The keys below `args.config` of [a deployment file](deployment.md), which `--set KEY=VALUE` also sets, and the keys of
-its `wrappers`. [Model families](../policies/index.md) explains them.
+This page lists the keys below `args.config` of [a deployment file](deployment.md), which `--set KEY=VALUE` also sets,
+and the keys of its `wrappers`. [Models](../policies/index.md) explains them.
 """
 # Keys that the model requires, and for which the command has a default.
 _DEFAULTS_OF_COMMANDS = {"out": "`runs/NAME`"}
@@ -118,6 +118,14 @@ def help_pages() -> dict[str, HelpPage]:
     return found
 
 
+def _title(page: str) -> str:
+    """Return the title of a page, whose path is relative to docs/."""
+    if page.startswith("reference/"):  # may not be written yet
+        return Path(page).stem.replace("_", " ")
+    lines = (ROOT / "docs" / page).read_text().splitlines()
+    return next(line.removeprefix("# ") for line in lines if line.startswith("# "))
+
+
 def _commands() -> str:
     """Return the page of the commands."""
     found = help_pages()
@@ -125,7 +133,7 @@ def _commands() -> str:
     parts = [
         _NOTICE,
         "# Commands\n",
-        "Every command and its options, as `--help` prints them.\n",
+        "This page lists every command and its options, as `--help` prints them.\n",
         _EXIT_STATUS,
     ]
     rows = []
@@ -371,9 +379,8 @@ def _table(
             meaning = re.sub(r"; (?:unset|default): ", ". null: ", meaning)
         see = SEE.get(f"{model}.{name}")
         if see:
-            page = see.partition("#")[0].removesuffix(".md").rpartition("/")[2]
             link = f"../{see}".replace("../reference/", "")
-            meaning += f" See [{page.replace('_', ' ')}]({link})."
+            meaning += f" See [{_title(see.partition('#')[0])}]({link})."
         kind = _type(field.annotation)
         for inner in _inner_models(field.annotation):
             if inner in (anchors or {}):
