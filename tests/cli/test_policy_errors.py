@@ -144,7 +144,7 @@ def test_an_action_of_another_size_than_the_first_is_an_error_of_the_policy() ->
     )
     assert isinstance(result, EpisodeResult)
     assert (result.status, bool(result.success_at_end)) == ("policy_error", False)
-    assert "expected 5 numbers a row, as in the first action, got shape (1, 3)" in (
+    assert "expected 5 numbers in each row, as in the first action, got shape (1, 3)" in (
         result.error or ""
     )
 

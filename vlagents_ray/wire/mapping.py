@@ -511,7 +511,7 @@ class KeyMapping:
             if not -rows.shape[1] <= index < rows.shape[1]:
                 raise InvalidAction(
                     f"action: expected the gripper's number at {index}, got {rows.shape[1]} "
-                    "numbers a row; change mapping.action"
+                    "numbers in each row; change mapping.action"
                 )
             rows = rows.copy()
             opening = (rows[:, index] - spec.gripper_closed) / our_range

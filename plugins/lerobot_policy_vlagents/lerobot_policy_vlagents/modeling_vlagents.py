@@ -369,8 +369,8 @@ class _Sessions:
         want = self._robot.action_dim
         if odd := [chunk.shape[1] for chunk in chunks if want not in (None, chunk.shape[1])]:
             raise ContractMismatch(
-                f"action: expected {want} numbers a row, as this robot has, got {odd[0]} from the "
-                "server; check whether this is another robot's policy"
+                f"action: expected {want} numbers in each row, as this robot has, got {odd[0]} "
+                "from the server; check whether this is another robot's policy"
             )
         if self._fit is not None:
             for chunk in chunks:

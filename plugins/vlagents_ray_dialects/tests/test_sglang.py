@@ -240,7 +240,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "noise": (lambda: asking(observation=observed(noise=np.zeros(3))), "the policy draws its own"),
     "unequal lengths": (
         lambda: asking(["task 1", "task 2"]),
-        "images/front: expected one value a robot, 2 in all, got 8",
+        "images/front: expected one value for each robot, 2 in all, got 8",
     ),
     "too many sessions": (
         lambda: asking(["task 1"] * 8, parameters={"session_ids": ["one"]}),

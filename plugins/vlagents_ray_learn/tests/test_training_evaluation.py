@@ -174,7 +174,7 @@ def test_no_results_are_made_again_and_none_are_taken_for_those_of_other_weights
 ) -> None:
     TrainingEvaluation(agent, plan).play(1)
     before = Results.load(plan.out).cases
-    with pytest.raises(ConfigError, match="already has results: set resume=True"):
+    with pytest.raises(ConfigError, match="already has results; set resume=True"):
         TrainingEvaluation(agent, plan)
     again = TrainingEvaluation(agent, plan.model_copy(update={"resume": True}))
     again.play(1)

@@ -78,7 +78,7 @@ class TrainingEvaluation:
             raise ConfigError(f"plan: expected one policy without steps, got {names}")
         if (plan.out / FILE).is_file() and not plan.resume:
             raise ConfigError(
-                f"{plan.out} already has results: set resume=True in the plan, or choose another "
+                f"{plan.out} already has results; set resume=True in the plan, or choose another "
                 "folder"
             )
         require_envs(plan_cases(plan))

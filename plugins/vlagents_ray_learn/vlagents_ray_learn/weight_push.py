@@ -346,7 +346,7 @@ def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> 
         if newest.gpus:
             readable = f"only memory of GPU {', '.join(newest.gpus)}"
         raise NotShared(
-            f"replica {replica.name} can copy {readable}, and the learner's is on GPU {gpu}"
+            f"replica {replica.name} can copy {readable}, but the learner's memory is on GPU {gpu}"
         )
 
 

@@ -163,7 +163,7 @@ def test_trajectories_are_in_memory_one_at_a_time(
 def test_a_folder_that_holds_something_and_results_without_trajectories_are_refused(
     config: Config, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match="not empty"):
+    with pytest.raises(ConfigError, match="expected a new or empty folder"):
         to_lerobot(play(config(episodes=1, record="all")), tmp_path)
     with pytest.raises(ConfigError, match=r"--record all \(`record: all`"):
         to_lerobot(play(config(episodes=1, out=tmp_path / "without")), tmp_path / "dataset")

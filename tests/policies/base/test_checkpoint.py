@@ -38,7 +38,7 @@ def test_what_is_not_there_is_said_with_what_is(tmp_path: Path) -> None:
     (tmp_path / "step_1000").mkdir()
     with pytest.raises(ConfigError, match=r"step_2000.*step_1000"):
         find_checkpoint(f"{tmp_path}/step_{{step}}", 2000)
-    with pytest.raises(ConfigError, match=r"misses \['config.json'\]"):
+    with pytest.raises(ConfigError, match=r"expected \['config.json'\] in it"):
         find_checkpoint(str(tmp_path / "step_1000"), needs=["config.json"])
 
 

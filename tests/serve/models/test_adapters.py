@@ -191,6 +191,6 @@ def test_adapters_of_the_settings_stay_beside_those_of_the_deployment() -> None:
         of({"checkpoint": "/runs/a", "adapters": {"stack": "/runs/other"}})
     with pytest.raises(
         ConfigError,
-        match=r"adapters: expected a folder or hub id by the name of each, got \['stack'\]",
+        match=r"adapters: expected a folder or a hub id for each name, got \['stack'\]",
     ):
         of({"checkpoint": "/runs/a", "adapters": ["stack"]})

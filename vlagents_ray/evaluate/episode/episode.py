@@ -359,8 +359,8 @@ class _Episode:
             # The contract of the environment may state no size.
             if self._width not in (None, rows.shape[1]):
                 raise InvalidAction(
-                    f"action: expected {self._width} numbers a row, as in the first action, got "
-                    f"shape {rows.shape}"
+                    f"action: expected {self._width} numbers in each row, as in the first action, "
+                    f"got shape {rows.shape}"
                 )
             self._width = rows.shape[1]
 

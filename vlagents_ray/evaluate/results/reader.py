@@ -291,7 +291,7 @@ class Results:
             available = sorted({f"{case.policy_id} in {case.env}" for case in self.cases})
             raise ConfigError(
                 f"{self.out}: expected episodes of {policy_id or 'any policy'} in "
-                f"{env or 'any env'}, got none; it has {available}"
+                f"{env or 'any env'}, got none; the results have {available}"
             )
         return self.among(selected)
 

@@ -72,7 +72,9 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
     path = Path(name).expanduser()
     if not path.exists():
         if name.startswith((".", "/", "~")) or name.partition("@")[0].count("/") != 1:
-            raise ConfigError(f"checkpoint {name!r}: no such file or folder; have {_beside(path)}")
+            raise ConfigError(
+                f"checkpoint {name!r}: no such file or folder; this folder has {_beside(path)}"
+            )
         path = _from_hub(name)
 
     if path.is_dir():
@@ -80,8 +82,8 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
         if missing:
             names = sorted(entry.name for entry in path.iterdir())
             raise ConfigError(
-                f"checkpoint {path}: misses {missing}, has {names[:20]}; is it a checkpoint of "
-                "this family, and whole?"
+                f"checkpoint {path}: expected {missing} in it, got {names[:20]}; is it a complete "
+                "checkpoint of this family?"
             )
 
     used = _used.get()

@@ -255,7 +255,7 @@ class Runner:
             session = self._sessions.get(session_id)
             if session.resetting is not pending:
                 raise UnknownSession(
-                    f"session {session_id!r}: reset anew, or closed, while this reset waited"
+                    f"session {session_id!r}: reset again, or closed, while this reset waited"
                 )
             if self.is_abandoned(pending, session):
                 self._models.release_model(session)

@@ -73,7 +73,7 @@ class Checkpoints:
         adapters = config.get(_ADAPTERS) or {}
         if not isinstance(adapters, Mapping):
             raise ConfigError(
-                f"adapters: expected a folder or hub id by the name of each, got {adapters!r}"
+                f"adapters: expected a folder or a hub id for each name, got {adapters!r}"
             )
 
         conflicts = sorted(

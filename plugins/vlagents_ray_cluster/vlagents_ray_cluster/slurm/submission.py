@@ -272,7 +272,7 @@ def submit(script: Script) -> str:
         ) from error
     except subprocess.TimeoutExpired as error:
         raise SubmissionFailed(
-            f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`"
+            f"sbatch {file}: no answer in {_SBATCH_S:g} s; check with `squeue --me`"
         ) from error
 
     if done.returncode:

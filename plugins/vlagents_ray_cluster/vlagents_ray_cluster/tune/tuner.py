@@ -538,8 +538,8 @@ class Tuner:
                 if variant.changes or points:
                     raise VariantFailed(f"rejected, as {off}")
                 raise VariantFailed(
-                    f"{off}, for the same observations and seeds, so that nothing can be compared "
-                    "with them; let the seed of `reset` determine what is random in the policy, or "
+                    f"{off}, for the same observations and seeds, so nothing can be compared with "
+                    "them; let the seed of `reset` determine what is random in the policy, or "
                     "raise --tolerance"
                 )
 

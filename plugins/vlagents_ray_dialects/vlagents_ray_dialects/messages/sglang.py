@@ -369,7 +369,7 @@ def _one(node: Mapping[Any, Any], index: int, size: int, path: str) -> dict[str,
         elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim):
             if len(value) != size:
                 raise InvalidObservation(
-                    f"{name}: expected one value a robot, {size} in all, got {len(value)}"
+                    f"{name}: expected one value for each robot, {size} in all, got {len(value)}"
                 )
             one[key] = value[index]
         else:
@@ -395,7 +395,7 @@ def _session_names(parameters: Mapping[str, Any]) -> list[str]:
                 f"session_ids: expected 1 to 128 visible ASCII characters each, got {shown(name)}"
             )
     if len(set(names)) != len(names):
-        raise MalformedMessage(f"session_ids: expected each once, got {shown(names)}")
+        raise MalformedMessage(f"session_ids: expected each only once, got {shown(names)}")
     return names
 
 

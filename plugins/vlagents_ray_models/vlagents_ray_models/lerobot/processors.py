@@ -376,7 +376,7 @@ def adapter_processors(
         return None
     if missing:
         raise ConfigError(
-            f"{folder}: expected both pipelines as LeRobot saves them, or none of them, got no "
+            f"{folder}: expected both pipelines as LeRobot saves them, or none of the two, got no "
             f"{missing}; copy it there"
         )
 

@@ -118,7 +118,7 @@ def test_settings_that_do_not_fit(
 def test_a_checkpoint_that_is_not_whole(copied: Callable[[str], Path], file: str) -> None:
     folder = copied("openvla")
     (folder / file).unlink()
-    with pytest.raises(ConfigError, match="misses"):
+    with pytest.raises(ConfigError, match="expected"):
         load("openvla", folder)
 
 
@@ -188,6 +188,7 @@ def test_a_component_of_another_kind(copied: Callable[[str], Path]) -> None:
     (folder / "action_head--100_checkpoint.pt").unlink()
     torch.save(saved, folder / "action_head--100_checkpoint.pt")
     with pytest.raises(
-        ConfigError, match=r"misses \['model.fc2.weight'\], has \['model.fc3.weight'\] too"
+        ConfigError,
+        match=r"expected \['model.fc2.weight'\], got \['model.fc3.weight'\] in addition",
     ):
         load("openvla_oft", folder)
