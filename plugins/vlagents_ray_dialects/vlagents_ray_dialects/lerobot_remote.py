@@ -8,8 +8,8 @@ The keys of a deployment D, an instance I and a session S:
     …/D/instances/I/alive                                       liveliness of the server
     …/D/instances/I/sessions/S/control                          query: reset, invalidate, close
     …/D/instances/I/sessions/S/obs, …/S/act                     observations and their actions
-    …/D/instances/I/sessions/S/language/request                 rejected: no policy here answers
-    text …/D/instances/I/sessions/S/alive                            liveliness of the robot
+    …/D/instances/I/sessions/S/language/request                 rejected: no policy answers text
+    …/D/instances/I/sessions/S/alive                            liveliness of the robot
 
 Zenoh has no key of ours. Where others than trusted robots reach the network, let both sides be
 clients of a Zenoh router, which has TLS and access rules.
