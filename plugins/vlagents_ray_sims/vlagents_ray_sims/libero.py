@@ -664,7 +664,9 @@ def package_folder() -> Path:
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
     if spec is None or spec.origin is None:
-        raise MissingDependency(f"'libero' is a different package; {Libero.cure} installs hf-libero")
+        raise MissingDependency(
+            f"'libero' is a different package; {Libero.cure} installs hf-libero"
+        )
     return Path(spec.origin).parent
 
 
