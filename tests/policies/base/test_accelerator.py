@@ -74,6 +74,7 @@ def test_without_a_gpu_auto_is_the_cpu(monkeypatch: Any, given: str | None) -> N
     with loading_report(lambda _: None) as report:
         assert torch_device("auto").type == "cpu"
     assert report.devices == [{"kind": "cpu", "device": "cpu", "torch": torch.__version__}]
+    assert type(report.devices[0]["torch"]) is str  # readable without torch
 
 
 def test_what_a_gpu_is_is_reported(monkeypatch: Any) -> None:

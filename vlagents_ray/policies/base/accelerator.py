@@ -75,7 +75,9 @@ def torch_device(name: str = "auto") -> Any:
             "a GPU with resources: {num_gpus: 1}"
         ) from error
 
-    described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
+    # `torch.__version__` is of a class of torch, which a process without torch cannot unpickle.
+    version = str(torch.__version__)
+    described = {"kind": device.type, "device": str(device), "torch": version}
     if device.type == "cuda":
         if share:
             torch.cuda.set_per_process_memory_fraction(share, device)
