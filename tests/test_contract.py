@@ -84,6 +84,18 @@ def test_each_difference_is_named(env: Contract, word: str) -> None:
     assert word in found[0]
 
 
+def test_a_missing_camera_is_cured_in_the_env_or_in_the_policy() -> None:
+    [found] = differences(
+        replace(POLICY, cameras={"image": CameraSpec()}),
+        replace(ENV, cameras={"wrist": CameraSpec(), "front": CameraSpec()}),
+    )
+    assert found.endswith("or set the policy's `cameras`, such as {image: front}")
+    [found] = differences(
+        replace(POLICY, cameras={"image": CameraSpec()}), replace(ENV, cameras={})
+    )
+    assert found.endswith("add or rename a camera of the env")
+
+
 def test_all_differences_are_told_at_once() -> None:
     with pytest.raises(ContractMismatch) as caught:
         require_match(POLICY, replace(ENV, gripper=False, control_hz=5, state={}))

@@ -241,9 +241,12 @@ def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
     for name, needed in (policy.cameras or {}).items():
         provided = env.cameras.get(name)
         if provided is None:
+            cure = "add or rename a camera of the env"
+            if env.cameras:
+                cure += f", or set the policy's `cameras`, such as {{{name}: {min(env.cameras)}}}"
             yield (
                 f"camera {name!r}: the policy needs it, the env provides {sorted(env.cameras)}; "
-                "add or rename a camera of the env"
+                f"{cure}"
             )
         elif _differ(needed.height, provided.height) or _differ(needed.width, provided.width):
             yield (

@@ -346,3 +346,15 @@ def test_the_plan_is_printed_without_asking_any_policy(
     assert ": unknown" in text
     assert "(no earlier episodes of 4 of 4 cases)" in " ".join(text.split())
     assert not settings.out.exists(), "nothing is written"
+
+
+def test_a_time_that_leaves_out_some_cases_is_a_lower_bound(
+    config: Callable[..., EvalConfig],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "150")
+    url = "http://127.0.0.1:9"
+    play(config(episodes=3, policy_url=url))
+    print_plan(config(envs=[LINE, OTHER_LINE], episodes=9, policy_url=url))
+    assert ": at least 0:00:0" in " ".join(capsys.readouterr().out.split())

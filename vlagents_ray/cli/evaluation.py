@@ -479,6 +479,8 @@ def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> Non
     unknown = sum(row.seconds is None for row in forecast)
     if unknown == len(forecast):
         time = "unknown"
+    elif unknown:
+        time = f"at least {time}"
     without_episodes = ""
     if unknown:
         cases_in_total = counted(len(forecast), "case")
