@@ -305,16 +305,21 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         [told] = differences(Contract(state={"joints": StateSpec(21)}), self.ENV)
         assert told == (
             "state 'joints': the policy needs 21 numbers, the env provides 7; if it was trained on "
-            "several parts, set the policy's `state` to them in their order: [joints, tquat, "
-            "xyzrpy, gripper] has 21 numbers here"
+            "several parts, set the policy's `state` to them in the order of the training: "
+            "[joints, tquat, xyzrpy, gripper] has 21 numbers here"
         )
+
+    def test_the_parts_have_the_order_of_the_env(self) -> None:
+        env = Contract(state={"xyz_axis_angle": StateSpec(6), "gripper_qpos": StateSpec(2)})
+        [told] = differences(Contract(state={"joints": StateSpec(8)}), env)
+        assert "[xyz_axis_angle, gripper_qpos] has 8 numbers" in told
 
     def test_all_choices_are_told_where_there_are_several(self) -> None:
         [told] = differences(Contract(state={"q": StateSpec(8)}), self.ENV)
         assert "the env provides ['joints', 'tquat', 'xyzrpy']" in told
         assert (
-            "`state` to them in their order: [joints, gripper] or [tquat, gripper] have 8 numbers "
-            "here"
+            "`state` to them in the order of the training: [joints, gripper] or [tquat, gripper] "
+            "have 8 numbers here"
         ) in told
 
     def test_where_none_fit_the_policy_is_another_ones(self) -> None:

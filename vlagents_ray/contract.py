@@ -289,7 +289,7 @@ def _parts_cure(dim: int | None, env: Contract) -> str:
     """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are
     none.
     """
-    dims = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
+    dims = {name: spec.dim for name, spec in (env.state or {}).items() if spec.dim}
     if env.gripper:
         dims["gripper"] = 1
     if dim is None or len(dims) > _MAX_STATE_PARTS:
@@ -308,8 +308,8 @@ def _parts_cure(dim: int | None, env: Contract) -> str:
         listed += " or others"
     verb = "has" if len(matches) == 1 else "have"
     return (
-        "if it was trained on several parts, set the policy's `state` to them in their order: "
-        f"{listed} {verb} {dim} numbers here"
+        "if it was trained on several parts, set the policy's `state` to them in the order of the "
+        f"training: {listed} {verb} {dim} numbers here"
     )
 
 
