@@ -14,6 +14,7 @@ from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, Pol
 from vlagents_ray.chunking import player as player_module
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.chunking.timeliness import Timeliness, TimeShare, in_words
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, Overloaded, TooManyRequests
 from vlagents_ray.interface import (
     AGE_MS,
     EXECUTED_AGE,
@@ -189,6 +190,32 @@ def test_a_request_reports_the_ticks_since_the_last_one_and_the_slack() -> None:
     last = driver.request(2)
     ticks, starved = last[TICKS]
     assert (ticks, starved) == (5, 2)  # the rows of the first answer ended
+    driver.close()
+
+
+@pytest.mark.parametrize(
+    ("failure", "next_report"),
+    [
+        (TooManyRequests("over 5 requests a second"), [3, 0]),
+        (Overloaded("no memory"), [3, 0]),
+        (PolicyUnavailable("no replica"), [3, 0]),
+        (ConnectionLost("closed"), [3, 0]),
+        # The server may have counted the ticks of this request.
+        (DeadlineExceeded("after 2 s"), [2, 0]),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_the_ticks_of_a_rejected_request_are_reported_again_with_the_next_one(
+    failure: Exception, next_report: list[int]
+) -> None:
+    driver = Driver(4)
+    for _ in range(3):
+        driver.tick()
+    assert driver.request(1)[TICKS] == [1, 0]
+    driver.agent.failure = failure
+    driver.answer()
+    driver.tick()
+    assert driver.request(2)[TICKS] == next_report
     driver.close()
 
 

@@ -44,7 +44,16 @@ from vlagents_ray.chunking.fallback import (
 )
 from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidInput,
+    NotReset,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    VLAgentsError,
+)
 from vlagents_ray.interface import (
     AGE_MS,
     CAUSE,
@@ -75,6 +84,8 @@ _MAX_REPLACEMENTS = 256
 _TIMED_TICKS = 10  # the number of ticks from whose intervals the rate of the loop is measured
 _KEPT_WIRE = 0.9  # the part of the longest time on the way that is left after another answer
 _LONGEST_REPLAN_MS = 1e9  # the longest delay of a request that a server may ask for
+# After these errors no replica has counted the ticks that the request reported.
+_REJECTED = (TooManyRequests, Overloaded, PolicyUnavailable)
 
 
 class AsyncCaller:
@@ -282,6 +293,7 @@ class ChunkPlayer(Agent):
         self._begins_again = False
         self.timeliness = Timeliness()
         self._reported = (0, 0)  # ticks and starved ticks that earlier requests have reported
+        self._reported_before = (0, 0)  # the same without the last request
         self._executed_age_ms: float | None = None  # of the last row since the last request
         # When the last ticks began, s of `time.monotonic`.
         self._tick_begins: deque[float] = deque(maxlen=_TIMED_TICKS)
@@ -517,6 +529,8 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
+        if isinstance(answer, _REJECTED):
+            self._reported = self._reported_before
         self._reason = unanswered(answer)
         self._begins_again = False
 
@@ -568,6 +582,7 @@ class ChunkPlayer(Agent):
             timeliness, (ticks, starved) = self.timeliness, self._reported
             info[SLACK] = self._slack_ms()
             info[TICKS] = [timeliness.ticks - ticks, timeliness.starved - starved]
+            self._reported_before = self._reported
             self._reported = timeliness.ticks, timeliness.starved
             if self._executed_age_ms is not None:
                 info[EXECUTED_AGE] = self._executed_age_ms
