@@ -117,6 +117,18 @@ def test_an_alert_in_the_documentation_names_series_and_labels_that_the_server_e
         assert names(expression) <= exported.keys()
 
 
+def test_no_increase_is_computed_of_a_counter_that_begins_with_its_first_event() -> None:
+    """The series of a rare event has no earlier value, so the first event is no increase. A replica
+    whose policy hung is replaced, so there is no second one.
+    """
+    expressions = [expression for expression, _ in queries()]
+    expressions += re.findall(r"`(\w+\([^`]*ray_vlagents[^`]*)`", MONITORING)
+    rare = {"ray_vlagents_hung_calls_total", "ray_vlagents_out_of_memory_total"}
+    using_rare = [expression for expression in expressions if names(expression) & rare]
+    assert len(using_rare) == 4
+    assert not any(re.search(r"\b(increase|rate)\(", expression) for expression in using_rare)
+
+
 def test_every_metric_of_the_server_is_on_the_dashboard_and_in_the_documentation(
     exported: dict[str, Series],
 ) -> None:
