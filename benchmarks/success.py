@@ -115,7 +115,7 @@ class Way:
 
 
 def ways() -> list[Way]:
-    """Return all ways, the standard first."""
+    """Return all transports and settings, the standard one first."""
     return [
         Way(STANDARD),
         Way("again", equal=True),
@@ -388,7 +388,7 @@ def main(
             row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]
         ]:
             raise VLAgentsError(
-                f"actions differ in {broken}, expected those of {STANDARD!r}, bit-identical"
+                f"expected the actions of {STANDARD!r}, bit-identical, got others in {broken}"
             )
 
 

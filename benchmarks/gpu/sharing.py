@@ -19,7 +19,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 SHARE = 0.5
-_OVER = 0.6  # share of the memory that a replica with half of it cannot allocate
+_OVER = 0.6  # share of the memory: more than a replica with half of it may allocate
 _MPS = "nvidia-cuda-mps-control"
 _PIPES, _LOGS = "CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY"
 

@@ -951,8 +951,8 @@ def misbehave_at_gateway(endpoint: str, name: str, where: Where, end: float) -> 
 
 
 _MEMORY = LocalAddress.REQUEST
-# What a process of this user sends to the socket of the shared memory: before a key, or after it,
-# and whether again.
+# What a process of this user sends to the socket of the shared memory: whether it sends a key
+# first, the bytes, and whether it sends them repeatedly.
 NEAR: dict[str, tuple[bool, bytes, bool]] = {
     "nothing": (False, b"", False),
     "closed at once": (False, b"", False),

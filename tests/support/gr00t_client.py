@@ -37,7 +37,7 @@ def encode_packed(value: Any) -> Any:
 
 
 def decode_n15(value: Any) -> Any:
-    """N1.5, whose configs are JSON texts."""
+    """The server of N1.5, whose configs are JSON texts."""
     if "__ModalityConfig_class__" in value:
         return modality_config(**json.loads(value["as_json"]))
     return decode(value)

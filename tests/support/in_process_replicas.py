@@ -94,7 +94,7 @@ class Replicas:
             engine.close()
 
     def hand_over(self, number: int) -> int:
-        """As when that one stops: how many sessions the others took."""
+        """Hand the sessions of a replica over, as if it stopped; return how many the others took."""
         held = self.engines[number].sessions.ids()
         asyncio.run_coroutine_threadsafe(self.migrators[number].hand_over(), self._loop).result(30)
         others = [engine for engine in self.engines if engine is not self.engines[number]]

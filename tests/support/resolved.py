@@ -97,7 +97,7 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
         "--format",
         "pylock.toml",
     ]
-    # It would look for that Python, which resolving does not need.
+    # uv would look for that Python, which it does not need to resolve requirements.
     command += ["--no-python-downloads"]
     command += ["--python-version", python, "--python-platform", PLATFORM, *words]
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:

@@ -168,7 +168,7 @@ class RobotControl:
 
     @contextlib.contextmanager
     def command(self) -> Iterator[Held | None]:
-        """Yield why the robot must not be commanded; None if one command may be sent within this
+        """Yield the reason why no command may be sent; None if one command may be sent within this
         context.
         """
         with self._commanding:

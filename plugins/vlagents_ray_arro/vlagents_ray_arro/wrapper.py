@@ -495,8 +495,8 @@ class Arro(Wrapper):
         phrases = self.config.objects or ([instruction] if instruction else [])
         if not phrases:
             raise InvalidObservation(
-                "instruction: expected one that names the things to show, got none; give one, or "
-                "set `objects`"
+                "instruction: expected a text that names the objects to show, got none; pass an "
+                "instruction, or set `objects`"
             )
         tracks = self.tracking.begin([obs.cameras[name] for name in names], phrases)
         for name, track in zip(names, tracks, strict=True):

@@ -295,8 +295,8 @@ class PolicyServer:
     ) -> None:
         if not isinstance(transport, ServerAddress):
             raise ConfigError(
-                f"transport: expected ServerAddress, got {type(transport).__name__}; import both "
-                "names"
+                f"transport: expected ServerAddress, got {type(transport).__name__}; import "
+                "ServerAddress and PolicyServer from vlagents_ray_learn.torchrl"
             )
         self.transport = transport
         self._factory = policy_factory

@@ -473,7 +473,7 @@ def test_after_a_capture_that_failed_the_thread_is_on_its_stream_again(cuda: Fak
 
 
 class Waiting(Agent):
-    """Waits for its whole device in each call."""
+    """A policy that waits for its whole device in each call."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         torch.cuda.synchronize()

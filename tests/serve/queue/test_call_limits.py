@@ -153,7 +153,8 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
         engine.health.check()
     engine.notice_hung()
     engine.notice_hung()
-    # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
+    # The hanging call must not be repeated elsewhere, where it would hang again. A call that had
+    # not begun may be.
     assert isinstance(begun.get(timeout=10).error, OutcomeUnknown)
     assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
     late: queue.SimpleQueue[Reply] = queue.SimpleQueue()  # it was checked just before

@@ -480,7 +480,9 @@ class _ProxiedProbe:
                 return False
 
             address = read_address(StreamAddress, metadata.get("stream"))
-            if address is None:  # the replicas cannot be told apart, so that none is left
+            if (
+                address is None
+            ):  # the replicas cannot be distinguished, so no other one is left to try
                 return True
             if is_first:
                 self._replicas.add(address)

@@ -58,9 +58,9 @@ class Store(AbstractContextManager["Store"]):
         """Open the results in `plan.out`, or begin new ones.
 
         Raises:
-            ConfigError: There are results and `plan.resume` is off, or they have other settings,
-                or another program and `plan.accept_changes` is off, or another evaluation is
-                writing to them.
+            ConfigError: The folder has results and `plan.resume` is off, their settings differ,
+                their code or files differ and `plan.accept_changes` is off, or another evaluation
+                is writing to them.
             StorageFailed: The folder cannot be written to.
         """
         self.cases = plan.cases

@@ -145,7 +145,7 @@ class Account:
 
 
 class Charge:
-    """The charge of one message: for how many of its requests its sender's key has been charged.
+    """The charge of one message: the number of its requests that were charged to the sender's key.
     Not thread-safe.
     """
 

@@ -570,9 +570,9 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
         short = [name for name in _BOUNDS if name in bounds and bounds[name].numel() < width]
         if missing or short:
             raise ConfigError(
-                f"checkpoint: {file}: expected {width} finite numbers each in {missing or short} "
-                f"of {key!r}, got {sorted(bounds)}; without them its inputs and actions are "
-                "wrong: save it with its dataset's statistics"
+                f"checkpoint: {file}: expected {width} finite numbers in each of "
+                f"{missing or short} of {key!r}, got {sorted(bounds)}; without them its "
+                "inputs and actions are wrong: save it with its dataset's statistics"
             )
 
 
