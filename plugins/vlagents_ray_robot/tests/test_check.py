@@ -202,6 +202,17 @@ def test_the_command_checks_a_simulated_arm_without_a_person(
     )
 
 
+def test_without_the_permission_to_move_the_report_names_the_option(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("builtins.input", lambda _: "")
+    with closing(simulated_arm("franka")) as arm:
+        counting = Counting(arm)
+        report = examine(counting, operator=Operator(move=False), clock=arm.clock)
+    assert counting.commands == 0
+    assert report.skipped["order"] == "nothing may move without --move"
+
+
 def test_a_person_is_asked_before_each_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     asked, answers = list[str](), iter(["y", "n", "", "y"])
     monkeypatch.setattr("builtins.input", lambda question: asked.append(question) or next(answers))

@@ -69,13 +69,15 @@ class Operator:
         move: Whether the robot may move; otherwise the operator agrees to no motion.
     """
 
+    may_move = True  # whether the operator is asked to agree at all
+
     def __init__(self, *, move: bool = True) -> None:
-        self._move = move
+        self.may_move = move
 
     def agrees(self, motion: str) -> bool:
         """Return whether the robot may make this motion now."""
         question = f"The robot will do this: {motion}. Is its space free?"
-        return self._move and _ask(question) is True
+        return self.may_move and _ask(question) is True
 
     def holds_card(self, camera: str | None) -> bool:
         """Hold something red in the upper left quarter of the picture of a camera.
@@ -394,6 +396,8 @@ class _Suite:
         self._motion = motion if agrees else ""
         if self._operator is None:
             self.skip_others("no operator agreed to a motion")
+        elif not agrees and not self._operator.may_move:
+            self.skip_others("nothing may move without --move")
         elif not agrees:
             self.skip_others(f"the operator did not agree to {motion}")
         return agrees
@@ -955,8 +959,8 @@ def _undeclared(contract: Contract) -> str:
     return (
         f"the motion cannot be checked, as {reason}. Give the class a `contract`, such as "
         "Contract(state={'joints': StateSpec(6, 'rad')}, action=ActionSpec(dim=6, space='joint', "
-        "delta=False)), or check by the contract of a policy (--policy URL); topics of ROS state "
-        "only targets, by a measured pose as their `stop`; see docs/arms.md"
+        "delta=False)), or check it against the contract of a policy (--policy URL). A robot behind "
+        "topics of ROS never declares `space`, so it needs --policy; see docs/arms.md"
     )
 
 
