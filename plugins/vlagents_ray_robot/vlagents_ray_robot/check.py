@@ -959,8 +959,8 @@ def _undeclared(contract: Contract) -> str:
     return (
         f"the motion cannot be checked, as {reason}. Give the class a `contract`, such as "
         "Contract(state={'joints': StateSpec(6, 'rad')}, action=ActionSpec(dim=6, space='joint', "
-        "delta=False)), or check it against the contract of a policy (--policy URL). A robot behind "
-        "topics of ROS never declares `space`, so it needs --policy; see docs/arms.md"
+        "delta=False)), or check it against the contract of a policy (--policy URL). A robot "
+        "behind topics of ROS never declares `space`, so it needs --policy; see docs/arms.md"
     )
 
 
