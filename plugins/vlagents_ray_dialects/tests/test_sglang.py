@@ -246,7 +246,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: asking(["task 1"] * 8, parameters={"session_ids": ["one"]}),
         "session_ids: expected one for each of 8 observations, got 1",
     ),
-    "a session twice": (lambda: batch([7, 8], ["one", "one"]), "expected each once"),
+    "a session twice": (lambda: batch([7, 8], ["one", "one"]), "expected each id only once"),
     "a session without a name": (lambda: batch([7, 8], ["one", ""]), "visible ASCII"),
     "no list of sessions": (
         lambda: asking(parameters={"session_ids": "one"}),

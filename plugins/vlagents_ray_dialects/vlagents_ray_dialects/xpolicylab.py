@@ -356,7 +356,7 @@ class _Connection:
             MessageTooLarge: The connection has too many environments.
         """
         if len(set(indices)) != len(indices):
-            raise MalformedMessage(f"env_idx: expected each only once, got {shown(indices)}")
+            raise MalformedMessage(f"env_idx: expected each index only once, got {shown(indices)}")
         most = self._dialect.context.limits.requests
         number = len(self._environments.keys() | set(indices))
         if number > most:
@@ -415,7 +415,7 @@ class _Connection:
             MalformedMessage: One is named twice.
         """
         if len(set(indices)) != len(indices):
-            raise MalformedMessage(f"env_idx: expected each only once, got {shown(indices)}")
+            raise MalformedMessage(f"env_idx: expected each index only once, got {shown(indices)}")
 
         waiting = []
         missing = [] if indices else ["any environment"]

@@ -395,7 +395,7 @@ def _session_names(parameters: Mapping[str, Any]) -> list[str]:
                 f"session_ids: expected 1 to 128 visible ASCII characters each, got {shown(name)}"
             )
     if len(set(names)) != len(names):
-        raise MalformedMessage(f"session_ids: expected each only once, got {shown(names)}")
+        raise MalformedMessage(f"session_ids: expected each id only once, got {shown(names)}")
     return names
 
 
