@@ -209,6 +209,7 @@ def test_a_planner_that_is_down_is_named_with_its_error_and_asked_again(
     obs = ticks.run(0.1)
     assert obs.info[SUBTASK] == "4"
     assert not hasattr(ticks.robot, "holds")
+    assert ticks.planner.infos[-1][TICKS] == [4, 3], "no replica has counted the earlier ones"
 
 
 def test_an_answer_without_a_text_as_its_subtask_is_not_used(

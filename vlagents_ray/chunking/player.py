@@ -44,16 +44,7 @@ from vlagents_ray.chunking.fallback import (
 )
 from vlagents_ray.chunking.timeliness import Timeliness
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import (
-    ConfigError,
-    InvalidAction,
-    InvalidInput,
-    NotReset,
-    Overloaded,
-    PolicyUnavailable,
-    TooManyRequests,
-    VLAgentsError,
-)
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
 from vlagents_ray.interface import (
     AGE_MS,
     CAUSE,
@@ -84,8 +75,6 @@ _MAX_REPLACEMENTS = 256
 _TIMED_TICKS = 10  # the number of ticks from whose intervals the rate of the loop is measured
 _KEPT_WIRE = 0.9  # the part of the longest time on the way that is left after another answer
 _LONGEST_REPLAN_MS = 1e9  # the longest delay of a request that a server may ask for
-# After these errors no replica has counted the ticks that the request reported.
-_REJECTED = (TooManyRequests, Overloaded, PolicyUnavailable)
 
 
 class AsyncCaller:
@@ -292,8 +281,6 @@ class ChunkPlayer(Agent):
         # or moved, or the guard rejected a row.
         self._begins_again = False
         self.timeliness = Timeliness()
-        self._reported = (0, 0)  # ticks and starved ticks that earlier requests have reported
-        self._reported_before = (0, 0)  # the same without the last request
         self._executed_age_ms: float | None = None  # of the last row since the last request
         # When the last ticks began, s of `time.monotonic`.
         self._tick_begins: deque[float] = deque(maxlen=_TIMED_TICKS)
@@ -529,8 +516,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        if isinstance(answer, _REJECTED):
-            self._reported = self._reported_before
+        self.timeliness.failed(answer)
         self._reason = unanswered(answer)
         self._begins_again = False
 
@@ -579,11 +565,8 @@ class ChunkPlayer(Agent):
             info[DEADLINE] = self.settings.timeout_s * 1e3
 
         if self._caller is not None:  # otherwise the robot waits for each answer
-            timeliness, (ticks, starved) = self.timeliness, self._reported
             info[SLACK] = self._slack_ms()
-            info[TICKS] = [timeliness.ticks - ticks, timeliness.starved - starved]
-            self._reported_before = self._reported
-            self._reported = timeliness.ticks, timeliness.starved
+            info[TICKS] = self.timeliness.report()
             if self._executed_age_ms is not None:
                 info[EXECUTED_AGE] = self._executed_age_ms
                 self._executed_age_ms = None

@@ -15,9 +15,12 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from vlagents_ray.errors import Overloaded, PolicyUnavailable, TooManyRequests
 from vlagents_ray.interface import AGE_MS, IN_TIME
 
 KEPT_AGES = 10_000  # the number of ages that are kept: 1,000 s at 10 Hz
+# After these errors no replica has counted the ticks that the request reported.
+_REJECTED = (TooManyRequests, Overloaded, PolicyUnavailable)
 
 
 class TimeShare(NamedTuple):
@@ -53,6 +56,8 @@ class Timeliness:
         self.ticks = 0  # at which the policy was to act
         self.starved = 0  # those of them without a row
         self._ages_ms: deque[float] = deque(maxlen=KEPT_AGES)
+        # Ticks and starved ticks that requests have reported, with and without the last request.
+        self._reported = self._reported_before = (0, 0)
 
     def add(self, *, in_time: bool, age_ms: float | None = None) -> None:
         """Count a tick at which the policy was to act.
@@ -81,6 +86,20 @@ class Timeliness:
         """Count ticks that passed while the loop was busy, such as with waiting for an answer."""
         self.ticks += ticks
         self.starved += ticks
+
+    def report(self) -> list[int]:
+        """Return the ticks, and the starved ones, since the last report, for the next request."""
+        self._reported_before = self._reported
+        self._reported = self.ticks, self.starved
+        ticks, starved = self._reported_before
+        return [self.ticks - ticks, self.starved - starved]
+
+    def failed(self, error: Exception) -> None:
+        """Report the ticks of the last request again with the next one, if no replica has counted
+        them, as this error of the request shows.
+        """
+        if isinstance(error, _REJECTED):
+            self._reported = self._reported_before
 
     @property
     def time_share(self) -> TimeShare:

@@ -101,7 +101,6 @@ class RobotWithPlanner(RobotWrapper):
 
     def _begin(self) -> None:
         self._timeliness = Timeliness()
-        self._reported = (0, 0)  # ticks and starved ticks that earlier requests have reported
         self._asked_s = 0.0  # time of the observation of the last request
         self._due_s = 0.0  # time of the next request
         self._answer: dict[str, Any] = {}  # the newest answer, as the info of an observation
@@ -197,6 +196,7 @@ class RobotWithPlanner(RobotWrapper):
             except InvalidAction as error:
                 self._fail(error)
         else:
+            self._timeliness.failed(answer)
             self._fail(answer)
 
     def _take(self, act: Act) -> None:
@@ -234,15 +234,12 @@ class RobotWithPlanner(RobotWrapper):
         if not caller.idle:
             return
 
-        ticks, starved = self._reported
-        timeliness = self._timeliness
-        self._reported = timeliness.ticks, timeliness.starved
         self._asked_s = now
         request = {
             # A later answer would be too old to be used.
             DEADLINE: 1e3 * self._max_age_s,
             SLACK: 1e3 * self._period_s,
-            TICKS: [timeliness.ticks - ticks, timeliness.starved - starved],
+            TICKS: self._timeliness.report(),
             FURTHER_MODEL: True,  # the policy's server counts the robot
         }
         caller.ask(stamped(copied(obs), request))
