@@ -372,8 +372,8 @@ def _use(use: Results) -> str:
         for name, one in sorted(use.items(), key=lambda one: one[1]["server"]["cpu_ms"])
     ]
     text = (
-        "CPU time of the same calls, without the CPU time of the idle processes, and how often a "
-        "thread of client or server waited or was preempted:"
+        "The table shows the CPU time of the same calls, without the CPU time of the idle "
+        "processes, and how often a thread of the client or the server waited or was preempted:"
     )
     return f"{text}\n\n{table_markdown(('system', *USE_COLUMNS), rows)}"
 

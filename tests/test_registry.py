@@ -96,7 +96,9 @@ class InstalledFrom:
 @pytest.fixture
 def installed_from(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str | None], None]]:
     def install(record: str | None) -> None:
-        monkeypatch.setattr(registry.metadata, "distribution", lambda _: InstalledFrom(record))
+        # A checkout on the path has no record.
+        found = [InstalledFrom(None), InstalledFrom(record)]
+        monkeypatch.setattr(registry.metadata, "distributions", lambda **_: found)
         registry._checkout.cache_clear()
 
     yield install

@@ -327,19 +327,17 @@ def _checkout() -> tuple[Path | None, bool]:
     """Return the folder from which pip installed this package, None if it was an archive, and
     whether it is used in place.
     """
-    try:
-        # PEP 610
-        record = metadata.distribution(CORE).read_text("direct_url.json")
-    except metadata.PackageNotFoundError:  # the package is on PYTHONPATH only
-        record = None
-    if record is None:
-        return None, False
-    origin = json.loads(record)
-    if "dir_info" not in origin:
-        return None, False
-    folder = Path(unquote(urlsplit(origin["url"]).path))
-    is_editable = bool(origin["dir_info"].get("editable"))
-    return (folder, is_editable) if (folder / "pyproject.toml").is_file() else (None, False)
+    # A checkout in the working directory may be found, too, without pip's record (PEP 610).
+    for found in metadata.distributions(name=CORE):
+        record = found.read_text("direct_url.json")
+        if record is None:
+            continue
+        origin = json.loads(record)
+        if "dir_info" in origin:
+            folder = Path(unquote(urlsplit(origin["url"]).path))
+            if (folder / "pyproject.toml").is_file():
+                return folder, bool(origin["dir_info"].get("editable"))
+    return None, False
 
 
 def names(kind: str) -> list[str]:

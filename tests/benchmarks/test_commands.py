@@ -51,7 +51,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (hop, ["--python", "nowhere"], "nowhere"),
         (learners, ["--learners", "nobody"], "nobody"),
         (learners, ["--seeds", "first"], "first"),
-        (report, ["--page", "nowhere.md"], "nowhere.md"),
+        (report, ["--page", "nowhere/tables.md"], "nowhere"),
         (policy, ["noop", "--batch", "0"], "from 1"),
         (policy, ["noop", "--state-dim", "joints=some"], "joints"),
         (policy, ["noop", "--set", "colour=blue"], "colour"),
@@ -65,7 +65,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (throughput, ["--clients", "few"], "few"),
         (throughput, ["--set", "base_ms=1"], "--policy"),
         (throughput, ["--peers", "openpi", "--policy", "scripted"], "noop"),
-        (torchrl, ["--source", "nowhere"], "want a checkout of TorchRL"),
+        (torchrl, ["--source", "nowhere"], "expected a checkout of TorchRL"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:

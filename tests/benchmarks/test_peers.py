@@ -285,7 +285,7 @@ def test_a_peer_does_not_get_the_settings_of_our_running_server(
 
 
 def test_peers_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"vlagent'.*want some of"):
+    with pytest.raises(ConfigError, match=r"expected only \[.*got \['vlagent'\]"):
         peer_clients(["vlagent"], tmp_path)
     assert peer_clients([], tmp_path) == ([], {}, {})
 

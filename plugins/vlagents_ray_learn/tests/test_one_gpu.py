@@ -242,7 +242,7 @@ def test_without_a_gpu_in_common_the_object_store_is_used_and_the_log_says_why(
     np.testing.assert_equal(replica.ask("values"), pushed)
     assert [type(sent) for sent in app.sent] == [SharedValues, list]
     assert (
-        f"replica replica can copy only memory of GPU {GPU}, and the learner's is on GPU "
+        f"replica replica can copy only memory of GPU {GPU}, but the learner's memory is on GPU "
         "GPU-another"
     ) in caplog.text
     assert another.handles == 0

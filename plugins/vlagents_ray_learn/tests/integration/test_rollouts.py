@@ -106,7 +106,7 @@ def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(
     write(version, 1)
     with (
         Rollouts(RolloutPlan(LINE, served.url, want=["logprob", "entropy"])) as found,
-        pytest.raises(NotOffered, match=r"some of \['logprob', 'value'\], .* got \['entropy'\]"),
+        pytest.raises(NotOffered, match=r"only \['logprob', 'value'\], .* got \['entropy'\]"),
     ):
         next(found)
     assert found.stats.retries == 0
