@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
-# Of these, each figure is one of a GPU, also where no card is named.
+# On this page, each figure counts as measured on a GPU, even where no card is named.
 GPU_PAGE = DOCS / "gpu.md"
 
 CARD = re.compile(r"\b(?:A100|H100|H200|B200|L4|L40S?|RTX \w+)\b")

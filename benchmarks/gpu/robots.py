@@ -71,7 +71,10 @@ def act_together(pipes: Sequence[Any], seconds: float) -> dict[str, Any]:
 
 
 def _drive(pipe: Any, url: str, contract: Contract | None, seed: int) -> None:
-    """Act for the times that the pipe brings, until it is closed; a separate process."""
+    """Call the policy for each number of seconds that the pipe delivers, until it is closed.
+
+    This function runs in a separate process.
+    """
     die_with_parent()
     from vlagents_ray.client import RemoteAgent
 

@@ -77,7 +77,7 @@ class Block:
     peers: bool = False  # it is for the peers' Python
     ray: bool = False  # it starts Ray
     file: str | None = None  # under which name it is saved, in place of being run
-    output: str = ""  # what the page shows of what it prints
+    output: str = ""  # the part of its output that the page shows
 
     def __str__(self) -> str:
         return f"line-{self.line}"

@@ -166,7 +166,7 @@ def test_a_viewer_of_rerun_gets_what_runs(
     with viewer, viewer.episode("ep0", "stack the cups"):
         for tick in range(TICKS):
             viewer.add(frame(tick))
-    # Its end says that all has arrived.
+    # `close` has reported no error, so the viewer has received all frames.
     assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
 
 

@@ -140,7 +140,7 @@ class RobotWithPlanner(RobotWrapper):
             except VLAgentsError as error:
                 error.args = (f"planner: {error}",)
                 raise
-            self._caller = AsyncCaller(self._planner)  # which closes the planner from now on
+            self._caller = AsyncCaller(self._planner)  # its `close` closes the planner
             stack.pop_all()
         self._due_s = self._asked_s + self._period_s
         return self

@@ -180,7 +180,7 @@ def on_host(value: Any) -> Any:
 
 
 def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
-    """Exchange the numbers of contiguous tensors in their memory, with little further memory.
+    """Swap the values of contiguous tensors in place, with little additional memory.
 
     Args:
         first: The tensors by name.

@@ -89,7 +89,7 @@ class Actor:
         self.version: int | None = None  # version of the last pushed weights
         self._weights = weights
         self._label: Label | None = None
-        # observation, action, whether an operator's.
+        # Observation, action, and whether the action is an operator's.
         self._frames: list[tuple[Obs, np.ndarray, bool]] = []
         self._steps = 0  # steps of all episodes
         self._error: Exception | None = None  # of the thread, raised by the next episode or `close`

@@ -564,7 +564,7 @@ class GR00TDialect(PortDialect):
         return self._key_reader.submit(gr00t.read_token, payload, self.context.limits).result()
 
     def add_client(self, connection: GR00TConnection) -> None:
-        """Make a connection with a valid key a client.
+        """Register a connection with a valid key as a client.
 
         Raises:
             PolicyUnavailable: There are too many clients.

@@ -43,7 +43,7 @@ def test_a_checkout_is_imported_from(
 def test_a_checkout_that_is_named_is_taken_though_a_folder_elsewhere_has_the_packages_name(
     checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The folder of the checkout itself may have that name, and Python imports any folder as a
+    """The checkout's own folder may have the package's name, and Python imports any folder as a
     package.
     """
     (checkout / "here" / NAME).mkdir(parents=True)

@@ -496,8 +496,8 @@ class Network:
         return next(name for name in self.graph.outputs if name not in other_outputs)
 
     def chunk(self, outputs: Arrays) -> np.ndarray:
-        """Return the action in a row's outputs as a new array (H, D) float32, in the model's
-        numbers.
+        """Return the action in the outputs for one observation as a new array (H, D) float32, not
+        yet unnormalized.
         """
         output = outputs[self.action]
         dim = output.shape[-1] if output.ndim else 1

@@ -79,7 +79,7 @@ def serve(made: list[Adapted]) -> Iterator[Callable[..., Engine]]:
 
 
 def told(engine: Engine, session: str, **kwargs: Any) -> dict[str, Any]:
-    """What a reset says."""
+    """Reset a session, and return the info of the reply."""
     reply = begin(engine, session, **kwargs).get(timeout=120)
     if reply.error is not None:
         raise reply.error

@@ -302,7 +302,7 @@ def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
     assert info is not None
     state = SessionState.from_info(info)
     with pytest.raises(UnknownSession, match="version 1 of the weights"):
-        there.engine.moves.adopt("a", state)  # nobody acts with it there
+        there.engine.moves.adopt("a", state)  # no session uses version 1 there
     for one in (here, there):
         one.push(3)
     here.reset("a")

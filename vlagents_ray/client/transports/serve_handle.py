@@ -219,7 +219,7 @@ class HandleTransport:
             ray.cancel(pending)
             raise no_answer(f"serve://{self._app}", timeout_s) from error
         except ray.exceptions.RayError as error:
-            # The replica is gone, or its node with the frame or the answer.
+            # The replica is gone, or the node that held the frame or the answer.
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:

@@ -35,7 +35,7 @@ def _inverse_norms(vectors: Tensor) -> Tensor:
 
 
 class _Eye(nn.Module):
-    """Encodes the images of a camera as tokens, and these as keys and values for each look.
+    """Encodes a camera's images as tokens, and the tokens as the keys and values of each `_Look`.
 
     Patches are normalised before and after their projection (arXiv 2302.01327), since they differ
     in few pixels.

@@ -73,7 +73,7 @@ _CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + STAMP_SPACE
 _INLINE = 64 * 1024  # a longer reply is sent in a memory file
 _KEY_S = 5.0  # time within which a client must send its key
 _KEY_BYTES = 4096  # maximum size of a key
-# Number of memory files with views held by the policy above which requests are copied.
+# A request is copied if the policy already holds views of this many memory files.
 _MAX_VIEWS = 8
 
 _read_buffer = ReadBuffer(_MESSAGE_BYTES)  # each message is processed before the next one is read

@@ -289,7 +289,7 @@ def _is_in_wheel(file: importlib.metadata.PackagePath) -> bool:
 
 
 def _overrides(requirements: Path, scratch: Path) -> list[Path]:
-    """Return files with replacements of requirements for a machine without a GPU."""
+    """Return uv's override files for a machine without a GPU: CPU builds, and our torch."""
     overrides = []
     cpu_builds = requirements.with_suffix(f".cpu{requirements.suffix}")
     if cpu_builds.is_file():

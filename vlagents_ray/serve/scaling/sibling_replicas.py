@@ -129,8 +129,7 @@ class SiblingReplica(Peer):
     ) -> Any:
         try:
             if self.name not in self._initialized:
-                # Serve answers a request to a replica that is not initialized with a traceback in
-                # its log.
+                # A request to a replica that is not initialized makes Serve log a traceback.
                 if not await asyncio.wait_for(
                     private.replica_is_initialized(self._actor), _INITIALIZED_S
                 ):

@@ -333,7 +333,7 @@ def _above(entries: Sequence[_StackValue]) -> int:
 
 
 def _finished(value: Any) -> Any:
-    """Return the value that a container stores for a value on the stack."""
+    """Return a value on the stack in its stored form: in place of a `Reduced`, its object."""
     if not isinstance(value, Reduced):
         return value
     if value.value is None:

@@ -426,7 +426,7 @@ def _size(parameters: Mapping[str, Any], observation: Mapping[str, Any], name: s
 
 
 def _request_id(payload: Mapping[str, Any]) -> str | None:
-    """Return the id that the client gave the request; None if it gave none that a log may have."""
+    """Return the client's id of the request; None if there is none that may be logged."""
     for key in ("request_id", "id"):
         name = payload.get(key)
         if isinstance(name, str) and name and is_name(name):

@@ -248,7 +248,7 @@ class Dropped(FaultyArm):
 
 
 class Doubled(FaultyArm):
-    """The bus repeats each command, of an arm that takes deltas."""
+    """The bus of an arm that takes deltas sends each command twice."""
 
     def apply(self, action: np.ndarray) -> None:
         self.arm.apply(action)
