@@ -277,8 +277,8 @@ def only_application(name: str, config: Deployment) -> Application:
     if len(config.applications) != 1:
         names = [app.name for app in config.applications]
         raise ConfigError(
-            f"{name}: expected one application, got {names}; serve it and give the URL of one of "
-            "them"
+            f"{name}: expected one application, got {names}; serve the file, and give "
+            "the URL of one of its applications"
         )
     return config.applications[0]
 

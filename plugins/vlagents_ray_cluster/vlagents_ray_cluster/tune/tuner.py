@@ -49,7 +49,7 @@ class TuningGoal:
                 "ms, got none; set it"
             )
         if self.kind == "throughput" and self.p99_ms is not None:
-            raise ConfigError("--p99-ms: is for --for robots; leave it out")
+            raise ConfigError("--p99-ms: applies only to --for robots; leave it out")
 
 
 @dataclass(frozen=True, slots=True)
