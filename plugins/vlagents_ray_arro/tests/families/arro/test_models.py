@@ -231,9 +231,9 @@ def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: P
 @pytest.mark.parametrize(
     ("kind", "name", "file", "message"),
     [
-        ("segmenter", "sam2", "model.safetensors", "misses .*safetensors"),
-        ("tracker", "sam2", "processor_config.json", "misses .*processor_config"),
-        ("detector", "grounding_dino", "config.json", "misses .*config.json"),
+        ("segmenter", "sam2", "model.safetensors", "expected .*safetensors.* got"),
+        ("tracker", "sam2", "processor_config.json", "expected .*processor_config.* got"),
+        ("detector", "grounding_dino", "config.json", "expected .*config.json.* got"),
     ],
 )
 def test_a_checkpoint_that_is_not_whole_is_refused(

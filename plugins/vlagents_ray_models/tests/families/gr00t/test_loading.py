@@ -110,8 +110,8 @@ MODALITIES = ("processor_config.json", "processor_kwargs", "modality_configs")
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (without("config.json"), r"misses \['config.json'\]"),
-        (without("model.safetensors"), r"misses \['\*.safetensors'\]"),
+        (without("config.json"), r"expected \['config.json'\]"),
+        (without("model.safetensors"), r"expected \['\*.safetensors'\]"),
         (
             without("processor_config.json"),
             "expected processor_config.json, got .*save the checkpoint's processor",

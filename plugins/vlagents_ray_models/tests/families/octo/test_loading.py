@@ -88,8 +88,8 @@ def _elsewhere(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_without("config.json"), r"misses \['config.json'\]"),
-        (_without("dataset_statistics.json"), r"misses \['dataset_statistics.json'\]"),
+        (_without("config.json"), r"expected \['config.json'\]"),
+        (_without("dataset_statistics.json"), r"expected \['dataset_statistics.json'\]"),
         (lambda folder: shutil.rmtree(folder / "7"), "expected a step"),
         (lambda folder: shutil.rmtree(folder / "7" / "default"), "could not load"),
         (_elsewhere, "could not load.*no-t5"),
