@@ -393,4 +393,4 @@ def test_each_command_of_a_plugin_that_is_not_installed_names_its_distribution()
         assert status == 2
         words = " ".join(output.split())
         assert f"command {command.replace('.', ' ')!r} is in {distribution}" in words
-        assert f"pip install {distribution}" in words
+        assert registry.pip_install(distribution=distribution) in words

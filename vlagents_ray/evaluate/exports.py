@@ -56,11 +56,11 @@ COLUMNS = (
         "identifies the episode by everything that determines it, including the weights",
         "full_key",
     ),
-    _of_case("policy", "string", "its name in the evaluation"),
+    _of_case("policy", "string", "name of the policy in the evaluation"),
     _of_case("step", "integer", "training step, in a sweep over checkpoints"),
     _of_result("checkpoint", "string", "checkpoint that the policy reported at the reset"),
     _of_result(
-        "weights", "string", "digest of the weights loaded from it; null if the policy reports none"
+        "weights", "string", "digest of the checkpoint's weights; null if the policy reports none"
     ),
     _of_result(
         "policy_version",
@@ -75,7 +75,7 @@ COLUMNS = (
     _of_result(
         "first_policy_version", "integer", "version of the weights used for the first action"
     ),
-    _of_case("suite", "string", "its name in the evaluation"),
+    _of_case("suite", "string", "name of the suite in the evaluation"),
     _of_case("env", "string", "full name, with the task"),
     Column(
         "episode",

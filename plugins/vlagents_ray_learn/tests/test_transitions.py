@@ -20,6 +20,7 @@ from vlagents_ray.evaluate.plan.cases import plan_cases
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan_jobs
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.registry import pip_install
 from vlagents_ray_learn import rollouts as recording
 from vlagents_ray_learn.columns import answers, arrays
 from vlagents_ray_learn.rollouts import TransitionRecorder
@@ -301,5 +302,7 @@ def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state(
 
 def test_without_pyarrow_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(MissingDependency, match=r"vlagents-ray-learn\[rollouts\]"):
+    with pytest.raises(
+        MissingDependency, match=re.escape(pip_install("rollouts", "vlagents-ray-learn"))
+    ):
         TransitionRecorder(None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,7 @@ from vlagents_ray.errors import (
     NotReset,
 )
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import pip_install
 from vlagents_ray_learn import as_vector_env
 from vlagents_ray_learn.vector_env import BatchVectorEnv, observation_space
 
@@ -324,7 +326,9 @@ def test_maniskill_on_the_cpu() -> None:
 def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "vlagents_ray_learn.vector_env")
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(MissingDependency, match=r"vlagents-ray-learn\[rollouts\]"):
+    with pytest.raises(
+        MissingDependency, match=re.escape(pip_install("rollouts", "vlagents-ray-learn"))
+    ):
         __import__("importlib").import_module("vlagents_ray_learn.vector_env")
 
 
