@@ -1,10 +1,11 @@
-"""The tables of README and docs/ about policies and environments: `python tests/support/tables.py`
-writes them.
+"""The tables of README and docs/ that follow from the code: `python tests/support/tables.py` writes
+them.
 
 It also writes examples/plugin, by the skeleton of `vlagents-ray init plugin`, and published.json.
 
-They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME
--->` and `<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
+They are made from the registry, from lists in the code and from what tests have verified, and lie
+between `<!-- table: NAME -->` and `<!-- /table -->`. So are the pages in the navigation of
+mkdocs.yml.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from programs import others, ran, settings
 from verified import FURTHER_PAGES, RUN_WITH, marked, notes
 
 from vlagents_ray.cli.init import render
+from vlagents_ray.evaluate import exports
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import CORE, RegistryEntry, entries
 
@@ -192,6 +194,13 @@ def learners(*names: str) -> list[str]:
     return list(table_rows(LEARNERS, names))
 
 
+def columns() -> Iterator[str]:
+    """Yield the rows of the columns of an exported table."""
+    yield from ("| column | type | meaning |", "|---|---|---|")
+    for column in exports.COLUMNS:
+        yield f"| `{column.name}` | {column.type} | {column.meaning} |"
+
+
 _RAPTOR = (
     "a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | "
     f"{verified('RAPTOR')}"
@@ -216,6 +225,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
         "settings": list(settings()),
         "others": list(others()),
     },
+    "docs/evaluation/exports.md": {"columns": list(columns())},
     "docs/benchmarks/index.md": {"environments": list(environments())},
 }
 

@@ -126,7 +126,11 @@ COLUMNS = (
     _of_result(
         "env_seconds", "number", "duration of the env's reset and all its steps; null on a robot"
     ),
-    _of_result("acts", "integer", "answers of the policy; fewer than steps with chunks"),
+    _of_result(
+        "acts",
+        "integer",
+        "number of answers of the policy; if they are chunks, fewer than `steps`",
+    ),
     _of_result(
         "policy_ms", "number", "median latency of the policy's answers, including transport"
     ),
@@ -143,11 +147,15 @@ COLUMNS = (
     _of_result("timing_ms", "json", "median duration of each stage of an answer on the server"),
     _of_result("transport", "string", "transport of the observations"),
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
-    _of_episode("run", "integer", "number of the run over the plan, from 1"),
+    _of_episode(
+        "run",
+        "integer",
+        "number of the command that ran the episode, from 1; resuming adds one",
+    ),
     Column(
         "finished",
         "time",
-        "time at which it was recorded",
+        "time at which the episode was recorded",
         lambda _, episode: datetime.fromtimestamp(episode.finished, timezone.utc),
     ),
     _of_episode("videos", "json", "paths in the folder of results"),
@@ -172,7 +180,7 @@ COLUMNS = (
         "integer",
         "ticks at which the policy was to act; null where the env waits for the policy",
     ),
-    _of_result("starved", "integer", "of these, ticks without a row of an answer"),
+    _of_result("starved", "integer", "number of these ticks for which no action had arrived"),
     Column("share", "number", "share of the ticks in time, in [0, 1]", _share),
     _of_result("age_p50_ms", "number", "median age of the executed actions"),
     _of_result("age_p95_ms", "number", "their 95th percentile"),
