@@ -1,4 +1,4 @@
-"""What holds for every test."""
+"""Settings, order and fixtures of all tests."""
 
 from __future__ import annotations
 
@@ -50,29 +50,31 @@ __all__ = [
     "pytest_xdist_make_scheduler",
 ]
 
-# No test talks to the world; set before anything that reads them is imported.
+# Tests never use the network. These variables are set before any module that reads them is
+# imported.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
-# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the Rays of
-# a test run.
+# By default Ray starts a worker for each CPU before any task needs it. That takes a second of CPU
+# for each Ray instance of a test run.
 os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
 os.environ.setdefault("RAY_enable_worker_prestart", "0")
-# As on a cluster (cluster/ray/environment.sh): by default Ray's workers have a low priority, and
-# those of one test would wait for whatever else the tests compute.
+# As on a cluster (cluster/ray/environment.sh): by default Ray's workers run at a low priority, so
+# the workers of one test would wait for all other work of the tests.
 os.environ.setdefault("RAY_worker_niceness", "0")
-# A shell that starts a job in the background has it, and all that it starts, ignore Ctrl-C; tests
-# send it to servers.
+# A shell that starts a job in the background makes the job and its children ignore Ctrl-C, which
+# tests send to servers.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 prepare_rendering()
 if (simpler := assets("simpler")) is not None:
-    os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once a process
+    os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once per process
 _RAY_FOLDER = own_ray_folder()
 
-# What takes longest goes first, so that the processes that share the tests end at about the same
-# time. Files that share a Ray follow all files that take long, so that each process starts the
-# shared one once: among those are some that start their own, which takes CPU, and some that wait.
+# The slowest files run first, so that the processes that share the tests end at about the same
+# time. Files that use the shared Ray run after all slow files, so that each process starts the
+# shared Ray only once: some slow files start their own Ray, which takes CPU, and others mostly
+# wait.
 _ORDER = ("hosts", "server", "ray", shared.FIXTURE, "vulkan", "sim", "torch")
 _SHARED = _ORDER.index(shared.FIXTURE)
 _shared_files: set[Path] = set()
@@ -82,13 +84,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--verified",
         action="store_true",
-        help="note what became of tests marked `verifies` and `program`, in JSON",
+        help="record the outcomes of the tests marked `verifies` and `program`, as JSON",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Under `nohup`, this process and each program that a test starts ignore hangups, which tests
-    # send. A program inherits SIG_IGN, but no handler. The processes of pytest-xdist inherit
+    # Under `nohup`, this process and each program that a test starts ignore the hangup signals that
+    # tests send. A program inherits SIG_IGN, but no handler. The processes of pytest-xdist inherit
     # SIG_IGN, and set the handler themselves.
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and not config.getoption(
         "numprocesses", None
@@ -105,17 +107,19 @@ def _ignore_hangup(*_: object) -> None: ...
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out the file if `-m` leaves out all of it."""
+    """Skip the collection of a file if `-m` deselects all of its tests."""
     return left_out(collection_path, config.option.markexpr) or None
 
 
 def pytest_collectstart() -> None:
-    """Collect no garbage until all tests are collected: what that makes lives to the end."""
+    """Disable garbage collection until all tests are collected, since the collected objects live
+    until the end.
+    """
     gc.disable()
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Mark what uses the shared Ray, and the tier."""
+    """Add the marker of the shared Ray, and the marker of the test's tier."""
     if shared.FIXTURE in getattr(item, "fixturenames", ()):
         item.add_marker("ray")
         _shared_files.add(item.path)
@@ -123,12 +127,12 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the tests in order: those of a file stay together, unless they run alone, and share
-    what it starts.
+    """Sort the tests. The tests of a file stay together and share what the file starts, except
+    tests that run alone.
     """
     places: dict[str, int] = {}
     for item in items:
-        if " at 0x" in item.nodeid:  # processes that share the tests must collect the same
+        if " at 0x" in item.nodeid:  # processes that share the tests must collect identical names
             raise pytest.UsageError(
                 f"{item.nodeid}: got an address in a test's name; name its parameters with ids="
             )
@@ -140,14 +144,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     took = seconds(config)
 
     def phase(name: str) -> int:
-        """Of a unit: before those that share a Ray, among them, or after them."""
+        """Return -1 if the unit runs before the files that use the shared Ray, 0 for these files,
+        and 1 if it runs after them.
+        """
         if places[name] == _SHARED:
             return 0
         return -1 if places[name] < _SHARED or took[name] else 1
 
     def order(item: pytest.Item) -> tuple[bool, int, float, int]:
         name = unit(item.nodeid)
-        # Alone when there is nothing left to wait for.
+        # A test that runs alone comes last, when no other test is left.
         alone = item.get_closest_marker("alone") is not None
         return alone, phase(name), -took[name], places[name]
 
@@ -155,14 +161,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, but only that of tests."""
+    """Turn garbage collection on again, but only for objects that tests make."""
     freeze_heap()
     gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what this machine cannot run; end the shared Ray before a file that does not share
-    it.
+    """Skip a test that this machine cannot run, and stop the shared Ray before a file that does not
+    use it.
     """
     skip_what_is_missing(item)
     if item.path not in _shared_files:
@@ -171,8 +177,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def commands_built_once() -> Iterator[None]:
-    """Build the commands of an application once in a process. Typer's runner, which calls it in a
-    process as often as tests want, would build all of them for each call.
+    """Build the commands of an application once per process. Otherwise Typer's test runner would
+    build all commands again for each call.
     """
     with pytest.MonkeyPatch.context() as patch:
         build = functools.cache(typer.main.get_command)
@@ -182,16 +188,16 @@ def commands_built_once() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def shared_ray() -> None:
-    """Ray in this process, as other files use it too; `shared_ray.shared_server` serves policies
-    on it.
+    """Start the Ray instance that several test files share; `shared_ray.shared_server` serves
+    policies on it.
     """
     shared.start()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def levels_of_loggers() -> Iterator[None]:
-    """Let no file change what the next one logs: `ray.init` sets the level of Ray's logger for
-    the whole process.
+    """Restore the levels of all loggers after each file, since `ray.init` sets the level of Ray's
+    logger for the whole process.
     """
     loggers = [
         one for one in logging.root.manager.loggerDict.values() if isinstance(one, logging.Logger)
@@ -204,7 +210,7 @@ def levels_of_loggers() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Wait for the test's turn before its time is taken."""
+    """Wait until the test may run, before its duration is measured."""
     with turn(item), nothing_else(item):
         return (yield)
 
@@ -214,6 +220,6 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Leave nothing behind."""
+    """Delete the Ray folder of this test run."""
     if _RAY_FOLDER is not None:
         shutil.rmtree(_RAY_FOLDER, ignore_errors=True)

@@ -1,8 +1,9 @@
-"""What the site needs beyond docs/: pages and files that stand elsewhere in the repository, at
-their own paths.
+"""Hooks of MkDocs that add pages and files from outside docs/ to the site, at their paths in the
+repository.
 
-Links are written as a checkout has them, so that they also work where the Markdown is read as it
-is. On the site, docs/ is the root, and a link out of it leads to a copy of what it names.
+Links in the Markdown are relative paths in the repository, so that they also work in a checkout and
+on GitHub. On the site, docs/ is the root, and a link to a file outside docs/ leads to a copy of
+that file.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Leave out what is said to the tests, and turn links to where the site has what they name."""
+    """Remove comments that only tests read, and rewrite links to the paths on the site."""
     here = page.file.src_uri
 
     def turned(link: re.Match[str]) -> str:
         path = _path(here, link["path"])
         if (ROOT / path).is_dir():
-            return link["text"]  # the site has no listings
+            return link["text"]  # the site has no listings of folders
         uri = posixpath.relpath(path.removeprefix("docs/"), posixpath.dirname(here) or ".")
         return f"[{link['text']}]({uri}{link['anchor'] or ''})"
 
@@ -60,9 +61,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_nav(nav: Any, config: Any, files: Files) -> None:
-    """Write llms.txt, which programs read that look something up for somebody: each page, and
-    what it is about.
-    """
+    """Write llms.txt, an index of all pages for language models, with the subject of each page."""
     lines = [f"# {config['site_name']}", "", f"> {config['site_description']}"]
     for section in nav.items:
         lines += ["", f"## {section.title}", ""]
@@ -71,13 +70,13 @@ def on_nav(nav: Any, config: Any, files: Files) -> None:
 
 
 def _pages(section: Any) -> list[Any]:
-    """The pages of a section, and those of the sections in it."""
+    """Return the pages of a section and of its subsections."""
     return [page for child in section.children or [] for page in (child, *_pages(child))]
 
 
 def _entry(page: Any) -> str:
-    """A page's line: its title, where it stands, and its first sentence, which a page in HTML
-    does not have.
+    """Return a page's line in llms.txt: its title, its path, and its first sentence, which
+    generated HTML pages lack.
     """
     if not page.file.is_documentation_page():
         return f"- [{page.title}]({page.file.dest_uri})"
@@ -95,6 +94,6 @@ def _entry(page: Any) -> str:
 
 
 def _path(page: str, link: str) -> str:
-    """The path in the repository of what a page of the site links to."""
+    """Return the path in the repository of the target of a link."""
     folder = posixpath.dirname(page if page in PAGES else f"docs/{page}")
     return posixpath.normpath(posixpath.join(folder, link))

@@ -1,8 +1,8 @@
-"""The recording that index.html runs: `python docs/demo/record.py` runs the reference policy, and
-writes session.js.
+"""Record the session that index.html replays: `python docs/demo/record.py` runs the reference
+policy, and writes session.js.
 
-The policy is served, and asked over a WebSocket, as by a robot. Each act returns a chunk of eight
-rows, of which four are executed. States are those of the simulator, in its base frame
+The policy is served, and called over a WebSocket, like by a robot. Each call returns a chunk of
+eight rows, of which four are executed. The states are those of the simulator, in its base frame
 (`vlagents_ray.envs.tabletop`).
 """
 
@@ -25,13 +25,14 @@ FILE = Path(__file__).with_name("session.js")
 CHECKPOINT = Path(__file__).parents[2] / "examples/reference/checkpoint"
 POLICY = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
 TASKS, SEEDS = ("pick_place", "slide", "stack"), range(4)
-EXECUTE = 4  # rows of each chunk
+EXECUTE = 4  # executed rows of each chunk
 STAGES = ("decode_ms", "queue_ms", "inference_ms", "encode_ms", "wire_ms")
-_HEAD = "const SESSION = "  # a script, as a page that was opened as a file may not read others
+# The recording is a script, since a page that was opened as a file may not read other files.
+_HEAD = "const SESSION = "
 
 
 def main() -> None:
-    """Play all episodes by a server, and write them."""
+    """Run all episodes through a server, and write the recording."""
     served = deployment("reference", config=POLICY)
     with (
         running_server(served, num_cpus=2) as server,
@@ -45,17 +46,17 @@ def main() -> None:
         "rates": {task: rates[f"tabletop/{task}"] for task in TASKS},
         "episodes": episodes,
     }
-    # An episode in each.
+    # Write one episode per line.
     lines = json.dumps(recording, separators=(",", ":")).replace('{"task"', '\n{"task"')
     FILE.write_text(f"{_HEAD}{lines};\n")
 
 
 def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
-    """Return an episode, which ends when it is solved, or truncated."""
+    """Return one episode, which ends when the task is solved or the episode is truncated."""
     with Tabletop(task, cameras=("front", "wrist"), width=64, height=64) as env:
         obs, _ = env.reset(seed=seed)
         agent.reset(obs, env.instruction, seed=seed)
-        scene = env._world  # no observation has all of it
+        scene = env._world  # no observation contains the complete state of the scene
         states, acts, over, info = [state(scene)], [], False, {"success": False}
         while not over:
             act = agent.act(obs)
@@ -63,7 +64,8 @@ def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
             total, *stages = [
                 round(timing.get(stage, 0.0), 3) for stage in ("round_trip_ms", *STAGES)
             ]
-            # All digits that float32 has, so that the actions, run again, give the same states.
+            # Keep all digits of float32, so that the same actions produce the same states when they
+            # are replayed.
             rows = [[float(f"{number:.9g}") for number in row] for row in act.rows()]
             acts.append(
                 {"step": len(states) - 1, "round_trip_ms": total, "ms": stages, "rows": rows}
@@ -90,8 +92,8 @@ def play(agent: Agent, task: str, seed: int) -> dict[str, Any]:
 
 
 def state(scene: world.TabletopWorld) -> list[float]:
-    """Return x, y, z of the fingertips and the gap, m; the number of the held puck, or -1; x, y,
-    z of each puck, m.
+    """Return x, y and z of the fingertips and the gap in m, the index of the held puck or -1, and
+    x, y and z of each puck in m.
     """
     held = next((i for i, puck in enumerate(scene.pucks) if puck is scene.held_puck), -1)
     pucks = [place for puck in scene.pucks for place in (puck.x, puck.y, puck.z)]
@@ -102,7 +104,9 @@ def state(scene: world.TabletopWorld) -> list[float]:
 
 
 def geometry() -> dict[str, Any]:
-    """Return the sizes that the page draws by, m and rad, and the steps of a second."""
+    """Return the sizes with which the page draws the scene, in m and rad, and the control rate in
+    Hz.
+    """
     with Tabletop() as env:
         hz = env.contract.control_hz
     return {
@@ -119,7 +123,7 @@ def geometry() -> dict[str, Any]:
 
 
 def recorded() -> dict[str, Any]:
-    """Read session.js."""
+    """Return the recording in session.js."""
     read: dict[str, Any] = json.loads(FILE.read_text().removeprefix(_HEAD).rstrip(";\n"))
     return read
 

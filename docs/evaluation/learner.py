@@ -1,5 +1,5 @@
-"""A policy for the picture of the report: the scripted expert, with a hand that steadies over
-training.
+"""A simulated learner for the picture of the report: the scripted expert, whose error shrinks with
+the training step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from vlagents_ray.policies.scripted import Scripted
 
 
 class LearnerConfig(BaseModel, extra="forbid"):
-    """What an expert has, and how far training got."""
+    """Task of the scripted expert, training step of the checkpoint, and size of the error."""
 
     task: str | None = None
     checkpoint_step: int = Field(default=0, ge=0)
@@ -24,8 +24,8 @@ class LearnerConfig(BaseModel, extra="forbid"):
 
 
 class Learner(Scripted):
-    """Adds to each action of an episode the same drift, which halves every 5000 steps of
-    training.
+    """Adds a constant drift to all actions of an episode. The drift's standard deviation halves
+    every 5000 training steps.
     """
 
     Config: ClassVar[type] = LearnerConfig

@@ -1,5 +1,5 @@
-"""Stable-Baselines3's PPO on an environment of this package: prints steps and mean return, and
-learns Pendulum.
+"""Train Pendulum, an environment of this package, with PPO of Stable-Baselines3, and print the
+steps and the mean return.
 
 pip install stable-baselines3 '.[learn,sim]'
 python stable_baselines.py
@@ -19,8 +19,8 @@ from vlagents_ray_learn import as_vector_env
 
 
 class StableBaselinesEnv(VecEnv):
-    """A `gymnasium.vector.VectorEnv` with autoreset "same_step", as Stable-Baselines3's own kind
-    of vector env.
+    """Adapts a `gymnasium.vector.VectorEnv` with autoreset "same_step" to the interface of
+    Stable-Baselines3's `VecEnv`.
     """
 
     def __init__(self, envs: Any) -> None:
@@ -64,7 +64,7 @@ class StableBaselinesEnv(VecEnv):
 
 
 class Curve(BaseCallback):
-    """Prints the mean return of the last episodes after each iteration."""
+    """Prints the mean return of the latest episodes after each rollout."""
 
     def _on_step(self) -> bool:
         return True
@@ -76,7 +76,7 @@ class Curve(BaseCallback):
 
 
 def main(steps: int = 72_000) -> None:
-    """Train for so many steps."""
+    """Train for `steps` environment steps."""
     options = {"cameras": {}, "unit_actions": True}
     envs = as_vector_env("gymnasium/Pendulum-v1", 8, observation="state", env_options=options)
     settings: dict[str, Any] = {

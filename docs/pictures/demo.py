@@ -1,9 +1,9 @@
-"""The moving picture of the README: `python -m docs.pictures.demo` serves the reference policy to
-four simulated robots, films the live page and one of the robots, evaluates the policy, and writes
-demo.gif.
+"""Make the animated picture of the README: `python -m docs.pictures.demo` serves the reference
+policy to four simulated robots, films the live page and one of the robots, evaluates the policy,
+and writes demo.gif.
 
-The policy gets the pictures of 64 px that it was trained with. The same actions are applied to a
-second environment with the same seed, whose larger pictures are shown. Chromium is needed.
+The policy receives images of 64 px, as in its training. The same actions are applied to a second
+environment with the same seed, whose larger images are shown. The script needs Chromium.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ from vlagents_ray.serve.launch.server import running_server
 
 ROOT = Path(__file__).parents[2]
 FILE = Path(__file__).with_name("demo.gif")
-WIDTH, HEIGHT, CAPTION = 960, 540, 44  # px; CAPTION of a line above the picture
-LIVE = 560  # px of the live page's width; the scene has the rest
-PAGE_WIDTH = 840  # px of CSS of the live page, which shows two cards side by side
+WIDTH, HEIGHT, CAPTION = 960, 540, 44  # px; CAPTION is the height of the line above the picture
+LIVE = 560  # px; width of the live page, beside which the scene takes the remaining width
+PAGE_WIDTH = 840  # CSS px; at this width the live page shows two cards side by side
 FRAME_MS = 110
 FRAMES = 68
-EXECUTE = 4  # rows of each chunk
-# As in deployments/reference.yaml, but with all rows of a chunk. Its path is that of a checkout.
+EXECUTE = 4  # executed rows of each chunk
+# The settings of deployments/reference.yaml, but the policy returns all rows of a chunk. The path
+# is relative to a checkout.
 POLICY = {"checkpoint": "examples/reference/checkpoint", "embodiment": "tabletop"}
-ROBOTS = {"stack": 7, "pick_place": 3, "slide": 5, "lift": 11}  # task: seed; the first is filmed
-STILL_MS = 1900  # still of each part of the report
+# task: seed; the first robot is filmed
+ROBOTS = {"stack": 7, "pick_place": 3, "slide": 5, "lift": 11}
+STILL_MS = 1900  # duration of the still of each part of the report
 PAPER, INK, SOFT, ACCENT = "#ffffff", "#1b1f24", "#59636e", "#0060a8"
 SERVE = ("Serve a policy to many robots", "vlagents-ray serve deployments/reference.yaml")
 EVALUATE = ("Evaluate its checkpoints", "vlagents-ray eval examples/evaluations/compare.yaml")
@@ -47,7 +49,7 @@ _FONTS = ("DejaVuSans-Bold.ttf", "DejaVuSansMono.ttf", "DejaVuSans.ttf")
 
 
 class Robot:
-    """A simulated robot with a session, which begins its episode again once it is over."""
+    """A simulated robot with a session. It begins a new episode when the previous one ends."""
 
     def __init__(
         self, stack: ExitStack, url: str, task: str, seed: int, side: int | None = None
@@ -73,7 +75,7 @@ class Robot:
         self.outcome = ""
 
     def step(self) -> None:
-        """Make one step of the episode, or wait a second before the next episode."""
+        """Run one step of the episode, or wait a second before the next episode."""
         if self.outcome:
             self._pause -= 1
             if self._pause <= 0:
@@ -92,7 +94,7 @@ class Robot:
 
 
 def film(page: Page) -> Iterator[Image.Image]:
-    """Yield the frames of the live page beside a robot."""
+    """Yield frames that show the live page next to a robot."""
     served = deployment("reference", config=POLICY)
     side = WIDTH - LIVE - 24
     with running_server(served, num_cpus=2) as server, ExitStack() as stack:
@@ -118,7 +120,7 @@ def film(page: Page) -> Iterator[Image.Image]:
 
 
 def wait_for_cards(page: Page, number: int) -> None:
-    """Wait until the live page shows all sessions."""
+    """Wait until the live page shows `number` sessions."""
     cards = "document.querySelectorAll('#sessions article').length"
     limit = time.monotonic() + 30
     while page.value(cards) < number:
@@ -144,13 +146,13 @@ def _live_frame(live: Image.Image, robot: Robot) -> Image.Image:
 
 
 def report_frames(page: Page, folder: Path) -> Iterator[Image.Image]:
-    """Evaluate, and yield a frame for each part of the report."""
+    """Run an evaluation, and yield a frame for each part of its report."""
     command = [sys.executable, "-m", "vlagents_ray", "eval", "examples/evaluations/compare.yaml"]
     subprocess.run([*command, "--out", str(folder)], check=True, cwd=ROOT)  # noqa: S603
     height = HEIGHT - CAPTION
     page.open(folder / "report.html", width=WIDTH, height=height, scheme="light")
     page.value("document.documentElement.style.scrollbarWidth = 'none'")
-    for title in ("h1", "h2"):  # its figures, then the table of success
+    for title in ("h1", "h2"):  # the report's figures, then its table of success rates
         page.value(
             f"document.querySelector('{title}').scrollIntoView({{behavior: 'instant'}});"
             "scrollBy({top: -16, behavior: 'instant'})"
@@ -181,7 +183,7 @@ def _font(kind: int, size: int) -> ImageFont.FreeTypeFont:
 
 
 def write_gif(frames: Sequence[Image.Image], durations: Sequence[int], file: Path) -> None:
-    """Write frames with one palette; pixels that do not change are transparent, as that is
+    """Write the frames with one palette. Unchanged pixels are transparent, which makes the file
     smaller.
     """
     samples = [np.asarray(frame.resize((WIDTH // 2, HEIGHT // 2))) for frame in frames[::10]]
@@ -189,7 +191,7 @@ def write_gif(frames: Sequence[Image.Image], durations: Sequence[int], file: Pat
     palette = Image.fromarray(np.concatenate(samples)).quantize(
         255, Image.Quantize.MEDIANCUT, kmeans=2
     )
-    # Means of the page's colours are tinted: keep these as they are.
+    # The palette averages similar colours, which would tint the page's own colours: restore these.
     colours = np.array(palette.getpalette()).reshape(-1, 3)
     for exact in map(ImageColor.getrgb, (PAPER, "#f6f7f9", INK)):
         colours[np.abs(colours - exact).sum(axis=1).argmin()] = exact
@@ -218,7 +220,7 @@ def write_gif(frames: Sequence[Image.Image], durations: Sequence[int], file: Pat
 
 
 def main() -> None:
-    """Film the live page, then show the report."""
+    """Write a GIF of the live page and of the report."""
     with tempfile.TemporaryDirectory() as name, browser(Path(name, "profile")) as page:
         frames = list(film(page))
         durations = [FRAME_MS] * len(frames)

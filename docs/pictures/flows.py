@@ -1,6 +1,6 @@
-"""The pictures of an observation's path to the policy: `python docs/pictures/flows.py` writes them.
-
-Every text stands on its own colour, so that one file is readable on a light page and on a dark one.
+"""Draw the pictures of an observation's path to the policy: `python docs/pictures/flows.py` writes
+them. Each text has its own background colour, so that one file is readable on light and on dark
+pages.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _svg(title: str, width: int, rows: int, parts: Sequence[str]) -> str:
 
 
 def _column(x: int, width: int, label: str, boxes: Sequence[Box], *, rows: int) -> list[str]:
-    """Return a group of boxes with a label, centred among the rows of the picture."""
+    """Return a group of boxes with a label, centred vertically in a picture of `rows` rows."""
     offset = (rows - len(boxes)) * _ROW_HEIGHT // 2
     top = _box_top(0) + offset
     height = (len(boxes) - 1) * _ROW_HEIGHT + _BOX_HEIGHT
@@ -107,7 +107,7 @@ def _box_top(row: int) -> int:
 
 
 def _middle(*, rows: int) -> int:
-    """Return the height of the middle of a picture."""
+    """Return the vertical middle of a picture."""
     return (_box_top(0) + _box_top(rows - 1) + _BOX_HEIGHT) // 2
 
 

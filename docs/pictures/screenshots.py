@@ -1,6 +1,6 @@
-"""The pictures of the live page and of the report: `python -m docs.pictures.screenshots` serves the
-reference policy to two simulated robots, runs docs/evaluation/picture.yaml, and photographs both
-pages in light and dark. Chromium is needed.
+"""Make the pictures of the live page and of the report: `python -m docs.pictures.screenshots`
+serves the reference policy to two simulated robots, runs docs/evaluation/picture.yaml, and takes
+pictures of both pages in the light and the dark colour scheme. The script needs Chromium.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from vlagents_ray.serve.launch.server import running_server
 
 EVALUATION = ROOT / "docs/evaluation"
 SCHEMES = ("light", "dark")
-REPORT = (1200, 900)  # px of each part
-# Each part by the heading at its top.
+REPORT = (1200, 900)  # px; size of each picture of the report
+# Each part of the report, with the heading at its top.
 PARTS = {
     "success": None,
     "comparison": "Comparison",
     "curve": "Learning curve",
     "failures": "Failures",
 }
-LIVE_WIDTH = 840  # px: two cards side by side
-CALLS = 4  # calls of each robot before the live page is photographed
-# A video that is not loaded shows a spinner.
+LIVE_WIDTH = 840  # px; at this width the live page shows two cards side by side
+CALLS = 4  # calls of each robot before the picture of the live page is taken
+# A video that has not been loaded shows a spinner.
 _VIDEOS = """Promise.all([...document.querySelectorAll("video")].slice(0, 8).map((video) => {
   video.controls = false;
   video.preload = "auto";
@@ -48,7 +48,7 @@ _QUIET = "document.documentElement.style.scrollbarWidth = 'none'"
 
 
 def photograph_live(page: Page) -> None:
-    """Photograph the live page of a server with two robots."""
+    """Take a picture of the live page of a server with two robots."""
     with (
         running_server(deployment("reference", config=POLICY), num_cpus=2) as server,
         ExitStack() as stack,
@@ -67,7 +67,7 @@ def photograph_live(page: Page) -> None:
 
 
 def photograph_report(page: Page, report: Path) -> None:
-    """Photograph three parts of a report."""
+    """Take pictures of three parts of a report."""
     width, height = REPORT
     for scheme in SCHEMES:
         page.open(report, width=width, height=height, scheme=scheme)
@@ -87,17 +87,17 @@ def photograph_report(page: Page, report: Path) -> None:
 
 
 def save(png: bytes, file: Path) -> None:
-    """Write a picture with a palette, which takes a third of the space."""
+    """Write a picture with a palette, which makes the file a third as large."""
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=3).save(file, optimize=True)
 
 
 def evaluate(out: Path) -> None:
-    """Play the evaluation of the report, whose policy is in its folder."""
+    """Run the evaluation of the report; its policy is in the folder EVALUATION."""
     command = [sys.executable, "-m", "vlagents_ray", "eval", "picture.yaml", "--out", str(out)]
     paths = filter(None, [str(EVALUATION), os.environ.get("PYTHONPATH")])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    # Our own command.
+    # The command is this project's own.
     subprocess.run(command, check=True, cwd=EVALUATION, env=environment)  # noqa: S603
 
 
@@ -106,7 +106,7 @@ def main(
         Path | None, typer.Option(help="Results of picture.yaml, if they are there already.")
     ] = None,
 ) -> None:
-    """Photograph the live page and the report."""
+    """Take the pictures of the live page and of the report."""
     with tempfile.TemporaryDirectory() as name, browser(Path(name, "profile")) as page:
         if run is None:
             run = Path(name, "run")

@@ -1,5 +1,5 @@
-"""The pictures of terminals: `COMMAND | python docs/pictures/terminal.py "COMMAND" FILE` draws the
-output of a command, with its colours, as an SVG.
+"""Draw the pictures of terminals: `COMMAND | python docs/pictures/terminal.py "COMMAND" FILE` draws
+the output of a command, with its colours, as an SVG.
 
     export FORCE_COLOR=1 COLUMNS=88
     vlagents-ray eval tabletop --policy scripted --episodes 20 --out runs/first |
@@ -11,7 +11,7 @@ output of a command, with its colours, as an SVG.
         "vlagents-ray robot check mujoco:so101_new_calib.xml --robot-set like=so101" \\
         docs/pictures/check.svg
 
-Its background is dark in both colour schemes, as that of many terminals.
+The background is dark in both colour schemes, like in many terminals.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from rich.console import Console
 from rich.segment import Segment
 from rich.text import Text
 
-COLUMNS, CHARACTER, LINE, MARGIN = 88, 8.43, 20, 16  # columns; px at a font size of 14 px
+# number of columns; width of a character, height of a line and margin in px, at a font size of 14
+# px
+COLUMNS, CHARACTER, LINE, MARGIN = 88, 8.43, 20, 16
 PAPER, INK, PROMPT = "#12161b", "#e8ebef", "#5fd3a3"
 COLOURS = {
     "green": "#5fd3a3",
@@ -38,7 +40,8 @@ COLOURS = {
     "blue": "#6cb6f0",
     "magenta": "#e79bc9",
 }
-_WORDS = re.compile(r"\S+( \S+)*")  # without the spaces of columns, which an SVG may not keep
+# Groups of words without the spaces between columns, since an SVG may not keep these spaces.
+_WORDS = re.compile(r"\S+( \S+)*")
 _FONTS = "ui-monospace, SFMono-Regular, Menlo, Consolas, 'DejaVu Sans Mono', monospace"
 
 
@@ -47,7 +50,7 @@ def draw(command: str, output: str) -> str:
 
     Args:
         command: The command, shown after a prompt.
-        output: What it printed, with ANSI codes for colours.
+        output: The command's output, with ANSI codes for colours.
     """
     prompt = Text("$ ", PROMPT)
     prompt.append(command, f"bold {INK}")
@@ -75,7 +78,9 @@ def draw(command: str, output: str) -> str:
 
 
 def _drawn(segment: Segment, column: int, y: int) -> list[str]:
-    """Return the words of a segment, each group at its column, whatever the font's width is."""
+    """Return the words of a segment, each group at its own column, so that the columns align with
+    any font.
+    """
     style = segment.style
     attributes = ""
     if style is not None and style.color is not None:

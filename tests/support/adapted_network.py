@@ -1,8 +1,6 @@
-"""A small network whose layers LoRA adapters change, as a policy; a deployment names it
-`adapted_network:Small`.
-
-Adapters are written as PEFT saves them, with random values, and merged into a network for
-comparison.
+"""A policy with a small network whose layers LoRA adapters change. Deployments name it
+`adapted_network:Small`. Functions below write adapters with random values, in PEFT's format, and
+merge them into a network for comparison.
 """
 
 from __future__ import annotations
@@ -25,14 +23,12 @@ LAYERS = ("see", "look", "head.0", "head.2")
 
 
 class Small(ModelPolicy):
-    """A network that sees two views of a state at once, as numbers and as images, and adds
-    noise.
-    """
+    """A network that processes two views of a state, as numbers and as images, and adds noise."""
 
     Config = ModelConfig
     adaptable = True
     trainable = network = "model"
-    passes: ClassVar[list[int]] = []  # the number of rows of each
+    passes: ClassVar[list[int]] = []  # number of rows in each forward pass
 
     @property
     def contract(self) -> Contract:
@@ -64,7 +60,7 @@ class Small(ModelPolicy):
         states = torch.from_numpy(np.stack([rows[i].frames[-1] for i in firsts]))
         with torch.inference_mode():
             with self.adapters.rows([rows[i].adapter for i in firsts]):
-                # Two entries for each observation.
+                # Each observation has two entries.
                 views = torch.stack([states, -states], 1).flatten(0, 1)
                 image = torch.cat([views, -views, views**2], 1).view(-1, 3, 2, 2)
                 both = self.model["see"](views) + self.model["look"](image).mean((2, 3))
@@ -83,12 +79,13 @@ def base(tmp_path: Path) -> Path:
 
 
 def pairs(network: Any, layers: Sequence[str], rank: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """A and B of these layers of a torch module, by PEFT's names; they change results by as much
-    as the layers do.
+    """Return random LoRA matrices A and B for these layers of a torch module, named like in PEFT.
+    They change results about as much as the layers themselves.
     """
     rng, modules, found = np.random.default_rng(seed), dict(network.named_modules()), {}
     for layer in layers:
-        outputs, *inputs = modules[layer].weight.shape  # of a convolution: with the kernel
+        # a convolution also has the dimensions of its kernel
+        outputs, *inputs = modules[layer].weight.shape
         ups = (outputs, rank, *(1 for _ in inputs[1:]))
         for name, shape, fan in (("A", (rank, *inputs), np.prod(inputs)), ("B", ups, rank)):
             values = (rng.standard_normal(shape) / np.sqrt(fan)).astype(np.float32)
@@ -97,7 +94,9 @@ def pairs(network: Any, layers: Sequence[str], rank: int, seed: int = 0) -> dict
 
 
 def save(folder: Path, values: Mapping[str, np.ndarray], **config: Any) -> Path:
-    """An adapter of that folder, with lora_alpha 2 r unless the config says something else."""
+    """Write an adapter to `folder`, with lora_alpha 2 r unless `config` overrides it; return the
+    folder.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     rank = len(next(value for name, value in values.items() if ".lora_A." in name))
     usual = {

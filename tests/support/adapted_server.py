@@ -1,4 +1,4 @@
-"""A server of two LoRA adapters over one base, for tests of the core and of plug-ins."""
+"""A server with two LoRA adapters of one base, for tests of the core and of plug-ins."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ RANKS = {"stack": 4, "pour": 2}
 
 
 def policy(folder: Path) -> Small:
-    """Return the base alone, initialized."""
+    """Return the initialized base policy, without adapters."""
     base_alone = Small.from_config({"checkpoint": str(folder)})
     base_alone.initialize()
     return base_alone
 
 
 def save_adapters(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Return the adapters by name, and save them in folders of that name beside the base."""
+    """Save each adapter in a folder of its name next to the base, and return the adapters by name."""
     network = policy(folder).model
     adapters = {name: pairs(network, LAYERS, rank, seed=rank) for name, rank in RANKS.items()}
     for name, adapter in adapters.items():
@@ -34,7 +34,7 @@ def save_adapters(folder: Path) -> dict[str, dict[str, np.ndarray]]:
 
 @contextmanager
 def serving_adapters(folder: Path) -> Iterator[Server]:
-    """Serve the base in `folder` and the adapters beside it."""
+    """Serve the base in `folder` and the adapters next to it."""
     choices = {name: {"adapter": str(folder.parent / name)} for name in RANKS}
     config = {"checkpoint": str(folder)}
     checkpoints = {"choices": choices}
@@ -43,6 +43,6 @@ def serving_adapters(folder: Path) -> Iterator[Server]:
 
 
 def observation(seed: int) -> Obs:
-    """Return the joints that belong to a seed."""
+    """Return an observation with random joints for a seed."""
     joints = np.random.default_rng(seed).normal(size=DIM)
     return Obs(state={"joints": joints.astype(np.float32)})

@@ -1,5 +1,5 @@
-"""A replica with API keys in this process, and the outcome of a request to each of its
-endpoints, as one word.
+"""A replica with API keys in this process, and functions that send a request to each of its
+endpoints and return the outcome as one word.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ from vlagents_ray_learn.weights_endpoint import weights_routes
 ANSWER_S = 10.0
 LIMITS = MessageLimits(body_bytes=2**20)
 _NUMBERS = itertools.count()
-_WORDS = {  # words of refusals, where a protocol has no code
+_WORDS = {  # patterns in the messages of rejections, for protocols without error codes
     "401": r"revoked|expired|not known|needs an API key",
     "403": r"is for \[",
     "429": r"requests a second|may hold \d+ sessions|sessions here",
@@ -95,11 +95,11 @@ _WORDS = {  # words of refusals, where a protocol has no code
 
 
 class Done(list[str]):
-    """What the policy was asked for, of all sessions."""
+    """Marks of the requests that reached the policy, in all sessions."""
 
 
 class Recorder(Agent):
-    """Notes by which marks it was reached."""
+    """A policy that records the marks of the requests that reach it."""
 
     def __init__(self) -> None:
         self.done = Done()
@@ -119,7 +119,7 @@ class Recorder(Agent):
 
 @dataclass
 class Visitor:
-    """Who comes with one of the credentials, and a mark by which its request is known."""
+    """A client with one kind of credential, and a mark that identifies its request."""
 
     replica: KeyedReplica
     credential: str
@@ -131,16 +131,16 @@ class Visitor:
 
     @property
     def shown(self) -> str | None:
-        """What it shows once it has become what it is."""
+        """Return the key that the client sends after `become`."""
         return {"none": None, "wrong": "vlr_wrong"}.get(self.credential, self.token)
 
     @property
     def ends(self) -> bool:
-        """Does its connection end?"""
+        """Return whether the server ends this client's connection."""
         return self.credential in ("expired", "revoked", "another application's")
 
     def become(self) -> None:
-        """Make the key, which was a right one so far, what the credential says."""
+        """Turn the key, which was valid so far, into the kind that the credential names."""
         changes: dict[str, dict[str, Any]] = {
             "expired": {"expires": 1.0},
             "revoked": {"revoked": True},
@@ -154,7 +154,7 @@ class Visitor:
         self.replica.known.change(self.name, **changes[self.credential])
         for keys in (self.replica.known.keys, self.replica.at_gateway):
             if self.credential == "over its rate":
-                # The end of a rejected WebSocket has been charged to it.
+                # The end of a rejected WebSocket has already been charged to the key.
                 with contextlib.suppress(TooManyRequests):
                     keys.check(self.token, "app").take_request()
             if self.credential == "over its sessions":
@@ -164,18 +164,18 @@ class Visitor:
 
 
 class KeyedReplica:
-    """An engine, and everything that stands before it."""
+    """An engine and all servers and middleware in front of it."""
 
     def __init__(
         self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path
     ) -> None:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
-        # Of a busy machine: each test changes keys, and needs them changed.
+        # Each test changes keys, and the changes must be read in time even on a busy machine.
         patch.setattr(api_keys, "_WAIT_S", 60.0)
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
         self.known = ChangingKeys()
-        self.at_gateway = self.known.another()  # of another process
+        self.at_gateway = self.known.another()  # the keys as another process reads them
         self.policy = Recorder()
         self.engine = Engine(self.policy, EngineSettings(session_limit=5000))
         self.priorities: dict[str, str] = {}
@@ -192,7 +192,8 @@ class KeyedReplica:
         )
         metadata = METADATA | {"policy_version": None, "weights": None}
         context = PartContext(self.engine, "this", "here", lambda: metadata)
-        parts = open_parts(PartArgs(weights=None), context)  # its routes have another receiver
+        # its routes for weights are replaced by routes with another receiver
+        parts = open_parts(PartArgs(weights=None), context)
         stack.callback(parts.close)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *parts.routes()]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
@@ -217,7 +218,7 @@ class KeyedReplica:
         stack.callback(self._close)
 
     def visitor(self, credential: str) -> Visitor:
-        """Somebody new."""
+        """Return a client with a new key."""
         return Visitor(self, credential)
 
     def _close(self) -> None:
@@ -261,7 +262,7 @@ class KeyedReplica:
     def _on_own_port(
         self, stack: contextlib.ExitStack, name: str, near: bool, check: Any, **settings: Any
     ) -> int:
-        """Serve a dialect of the gateway; returns its port."""
+        """Serve a dialect of the gateway, and return its port."""
         cls, port = dialect_class(name), free_port()
         context = GatewayContext("app", partial(self._agent, near), LIMITS, 100, 2.0, None, check)
         dialect = cls(name, cls.Config(port=port, **settings), context)
@@ -279,7 +280,7 @@ class _Near(ShmTransport):
 def plasma_server(
     engine: Engine, limits: MessageLimits, patch: pytest.MonkeyPatch, folder: Path
 ) -> Any:
-    """The plasma endpoint, with channels that hold a frame as it is."""
+    """Return a plasma endpoint whose channels contain frames as they are."""
     import ray
 
     from vlagents_ray.serve.endpoints.plasma import PlasmaServer
@@ -297,7 +298,7 @@ def plasma_server(
 
 
 class PlasmaChannel:
-    """What a client wrote, by the channel's key."""
+    """A channel whose frame is the one that the client wrote under the channel's key."""
 
     frames: ClassVar[dict[bytes, bytes]] = {}
 
@@ -313,20 +314,20 @@ class PlasmaChannel:
 
 @contextlib.contextmanager
 def keyed_replica(folder: Path) -> Iterator[KeyedReplica]:
-    """One, for as many visitors as want."""
+    """Yield a replica for any number of clients."""
     with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
         yield KeyedReplica(stack, patch, folder)
 
 
 Attempt = Callable[[Visitor, str], str]
-"""Tries a request before, with or after the credential; returns what was answered: a status,
+"""Sends a request before, with or after the credential, and returns the outcome: an HTTP status,
 "done" or "ended".
 """
 
 
 def over_http(method: str, path: str, **options: Any) -> Attempt:
-    """A request of HTTP. `session`: a session has been reset with the key while it was right; `own`:
-    it goes to the replica's own port.
+    """Return an attempt over HTTP. With `session`, the client first resets a session while its key
+    is still valid. With `own`, the request goes to the replica's own port.
     """
 
     def attempt(visitor: Visitor, _when: str) -> str:
@@ -365,8 +366,8 @@ def over_http(method: str, path: str, **options: Any) -> Attempt:
 def over_websocket(
     path: str, message: Callable[[str], bytes], read: Callable[[bytes | str], str | None]
 ) -> Attempt:
-    """A WebSocket: `message` asks for what the mark says, `read` gives what a message says of
-    it, if anything.
+    """Return an attempt over a WebSocket. `message` encodes a request with a mark; `read` returns
+    the outcome that a received message contains, or None if it contains none.
     """
 
     def attempt(visitor: Visitor, when: str) -> str:
@@ -396,13 +397,13 @@ def over_websocket(
                 protocol.receive_data(_some(connection))
             if when == "with":
                 if protocol.state is State.OPEN and not path.startswith("own"):
-                    # Uvicorn drops what comes in one segment with a handshake.
+                    # Uvicorn drops a message that arrives in the same segment as the handshake.
                     connection.sendall(asked)
                 return _answer(protocol, connection, read)
             said = "" if protocol.handshake_exc is None else _answer(protocol, connection, read)
             if not refused:
                 visitor.become()
-            with contextlib.suppress(OSError):  # it may be cut off already
+            with contextlib.suppress(OSError):  # the server may already have closed the connection
                 connection.sendall(asked)
                 said = said or _answer(protocol, connection, read)
             if visitor.ends:
@@ -417,7 +418,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def _until_closed(connection: socket.socket) -> str:
-    """All that comes; fails if the server does not hang up."""
+    """Read until the server closes the connection, and fail if it does not."""
     with contextlib.suppress(ConnectionError):
         while connection.recv(65536):
             pass
@@ -427,12 +428,12 @@ def _until_closed(connection: socket.socket) -> str:
 def _some(connection: socket.socket) -> bytes:
     data = connection.recv(65536)
     if not data:
-        raise ConnectionError("the server hung up without a word")
+        raise ConnectionError("the server closed the connection without an answer")
     return data
 
 
 def _until_ended(protocol: ClientProtocol, connection: socket.socket) -> None:
-    """The server's goodbye, which is answered; fails if it does not come."""
+    """Read and answer the server's close frame, and fail if it does not arrive."""
     with contextlib.suppress(ConnectionError):
         while protocol.state is State.OPEN and (data := connection.recv(65536)):
             protocol.receive_data(data)
@@ -464,7 +465,9 @@ def _answer(
 
 
 def status_of(text: str) -> str:
-    """Of a refusal: `code: what it says`, or what it says alone."""
+    """Return the HTTP status that matches the text of a rejection, `code: message` or the message
+    alone.
+    """
     code = text.partition(":")[0].removeprefix("Server error: ")
     if code in BY_CODE:
         return str(BY_CODE[code].status)
@@ -480,7 +483,7 @@ def _read_reply(data: bytes | str) -> str:
 def _read_map(data: bytes | str) -> str | None:
     if isinstance(data, str):
         return status_of(data)
-    return "done" if b"actions" in data else None  # what it says first
+    return "done" if b"actions" in data else None  # the server's first message is its metadata
 
 
 def _read_vla_eval(data: bytes | str) -> str:
@@ -490,7 +493,7 @@ def _read_vla_eval(data: bytes | str) -> str:
 
 
 def over_shm(visitor: Visitor, when: str) -> str:
-    """Shared memory."""
+    """Send a request over shared memory."""
     address = visitor.replica.local.address
     if when != "after":
         visitor.become()
@@ -510,7 +513,7 @@ def over_shm(visitor: Visitor, when: str) -> str:
             visitor.become()
         try:
             [reply] = transport.call([Request("reset", Obs(), visitor.mark)], ANSWER_S)
-        except VLAgentsError:  # cut off
+        except VLAgentsError:  # the server closed the connection
             return "ended"
         if when == "after" and visitor.ends:
             with pytest.raises(VLAgentsError, match=r"closed|reset|pipe"):
@@ -519,7 +522,7 @@ def over_shm(visitor: Visitor, when: str) -> str:
 
 
 def over_plasma(visitor: Visitor, _when: str) -> str:
-    """A plasma channel."""
+    """Send a request through a plasma channel."""
     visitor.become()
     key = visitor.name.encode().ljust(28, b"\0")
     PlasmaChannel.frames[key] = encode_requests([Request("reset", Obs(), visitor.mark)])
@@ -532,7 +535,7 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
 
 
 def over_handle(visitor: Visitor, _when: str) -> str:
-    """The actor's own entry point, as a Serve handle calls it."""
+    """Call the entry point of the actor that a Serve handle calls."""
     visitor.become()
     frame = encode_requests([Request("reset", Obs(), visitor.mark)])
     [reply] = decode_replies(answer_to_frame(visitor.replica.engine, LIMITS, visitor.name, frame))
@@ -540,7 +543,9 @@ def over_handle(visitor: Visitor, _when: str) -> str:
 
 
 def over_gr00t(near: bool) -> Attempt:
-    """GR00T's gateway, to a replica on its own host, or on another."""
+    """Return an attempt through GR00T's gateway, with a replica on the same host (`near`) or on
+    another.
+    """
 
     def attempt(visitor: Visitor, when: str) -> str:
         observation = {
@@ -567,7 +572,7 @@ def over_gr00t(near: bool) -> Attempt:
 
 
 def over_vlagents(visitor: Visitor, _when: str) -> str:
-    """vlagents' gateway, which asks for no key."""
+    """Send a request through vlagents' gateway, which requires no key."""
     visitor.become()
     with Client(visitor.replica.vlagents) as client:
         client.act(document(1, visitor.mark))
@@ -575,7 +580,7 @@ def over_vlagents(visitor: Visitor, _when: str) -> str:
 
 
 def over_lerobot(visitor: Visitor, _when: str) -> str:
-    """LeRobot's gateway, which asks for no key."""
+    """Send a request through LeRobot's gateway, which requires no key."""
     visitor.become()
     with AsyncClient(visitor.replica.lerobot).begin() as client:
         client.act(robot_saw(0, task=visitor.mark))
@@ -583,7 +588,7 @@ def over_lerobot(visitor: Visitor, _when: str) -> str:
 
 
 def over_lerobot_remote(visitor: Visitor, _when: str) -> str:
-    """The gateway of LeRobot's remote inference, which asks for no key."""
+    """Send a request through the gateway of LeRobot's remote inference, which requires no key."""
     visitor.become()
     with RemoteRobot(visitor.replica.lerobot_remote).begin() as robot:
         robot.act(1, visitor.mark)
@@ -591,13 +596,13 @@ def over_lerobot_remote(visitor: Visitor, _when: str) -> str:
 
 
 class _Receiving:
-    """Notes the names of weights that are pushed, as the policy notes marks."""
+    """Receives pushes of weights, and records the names of the weights as marks."""
 
     def __init__(self, replica: KeyedReplica) -> None:
         self._replica = replica
 
     def read_header(self, header: bytes, options: Any) -> dict[str, ValueSpec]:
-        """All fit."""
+        """Accept any names and shapes."""
         return read_header(header)
 
     async def push_received(self, values: Any, options: Any) -> PushResult:
@@ -607,14 +612,14 @@ class _Receiving:
         return PushResult(1, "", ("replica",))
 
     async def rest_all(self, rest: Any) -> None:
-        """It is awake."""
+        """Do nothing, since the replica is awake."""
 
     async def versions(self) -> list[int]:
         return [1]
 
 
 def _with_scope(scope: str, without_scope: Attempt) -> Attempt:
-    """The same, with keys of this scope."""
+    """Return the same attempt with a key of this scope."""
 
     def attempt(visitor: Visitor, when: str) -> str:
         visitor.replica.known.change(visitor.name, scopes=[scope])
@@ -693,10 +698,10 @@ def _read_sglang(data: bytes | str) -> str | None:
     answer = openpi_codec.decode(data)
     if "error" in answer:
         return status_of(answer["error"])
-    return "done" if "data" in answer else None  # what it says first
+    return "done" if "data" in answer else None  # the server's first message is its metadata
 
 
-# By the endpoint's name in docs/access.md.
+# The keys are the names of the endpoints in docs/access.md.
 ATTEMPTS: dict[str, Attempt] = {
     "`GET /healthz`": over_http("GET", "/healthz"),
     "`GET /v1/metadata`": over_http("GET", "/v1/metadata"),

@@ -1,4 +1,4 @@
-"""An ASGI application on a port of this machine."""
+"""ASGI applications served at a local port."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vlagents_ray.serve.ports import free_port
 
 @contextlib.contextmanager
 def served(app: ASGIApp) -> Iterator[int]:
-    """Its port."""
+    """Serve `app`, and yield the port."""
     port = free_port()
     server = uvicorn.Server(
         uvicorn.Config(app, port=port, log_level="critical", lifespan="off", ws="websockets-sansio")
@@ -42,7 +42,7 @@ def served(app: ASGIApp) -> Iterator[int]:
 def policy_server(
     agent: Agent, asked: Counter[str] | None = None, **metadata: Any
 ) -> Iterator[int]:
-    """The port of a server of a policy, without Ray; `asked` counts the paths of its requests."""
+    """Serve a policy without Ray, and yield the port; `asked` counts the requests by path."""
     engine = Engine(agent)
     engine.start()
     about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION, **metadata}

@@ -1,4 +1,4 @@
-"""A headless Chromium that tests look at pages with, by its DevTools protocol."""
+"""A headless Chromium with which tests open pages, controlled through its DevTools protocol."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WAIT_S = 60
 
 
 class Page:
-    """One tab; `said` is what its console printed, `asked` the addresses that it requested."""
+    """One tab. `said` has the messages of its console, `asked` the addresses that it requested."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -32,7 +32,7 @@ class Page:
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Ask the browser for something, and wait for its answer."""
+        """Call a DevTools method, and return its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
         while True:
@@ -43,9 +43,7 @@ class Page:
                 return message["result"]
 
     def open(self, path: Path | str, *, width: int, scheme: str, height: int = 900) -> None:
-        """Load a file or an address, in a window of this size, for a reader who prefers this
-        colour scheme.
-        """
+        """Open a file or a URL in a window of this size, with this preferred colour scheme."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -65,7 +63,7 @@ class Page:
                 return
 
     def value(self, expression: str) -> Any:
-        """What an expression of JavaScript is there, once it has settled; None if it is
+        """Return the value of a JavaScript expression, which may be a promise; None if it is
         undefined.
         """
         found = self.call(
@@ -75,12 +73,14 @@ class Page:
         return found["result"].get("value")
 
     def picture(self, clip: dict[str, float] | None = None) -> bytes:
-        """A PNG of the window, or of a part of the page: x, y, width, height and scale."""
+        """Return a PNG of the window, or of the part `clip` of the page: x, y, width, height and
+        scale.
+        """
         part = {} if clip is None else {"clip": clip, "captureBeyondViewport": True}
         return base64.b64decode(self.call("Page.captureScreenshot", format="png", **part)["data"])
 
     def pdf(self) -> bytes:
-        """The page as it is printed, on A4."""
+        """Return the page as a PDF, as it is printed on A4."""
         return base64.b64decode(
             self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)["data"]
         )
@@ -95,7 +95,7 @@ class Page:
 
 @contextmanager
 def browser(profile: Path) -> Iterator[Page]:
-    """Chromium with a profile of its own, and an empty page in it."""
+    """Start Chromium with a new profile, and yield an empty page."""
     assert CHROMIUM is not None
     switches = [
         "--headless",
@@ -114,7 +114,7 @@ def browser(profile: Path) -> Iterator[Page]:
     try:
         line = next(line for line in process.stderr if "DevTools listening on" in line)
         address = line.rpartition(" ")[2].strip()
-        # While it draws a large page, a browser answers no ping.
+        # A browser that draws a large page does not answer pings.
         with connect(address, max_size=None, proxy=None, ping_interval=None) as socket:
             targets = _ask(socket, "Target.getTargets")["targetInfos"]
             page = next(one["targetId"] for one in targets if one["type"] == "page")

@@ -6,8 +6,8 @@ import numpy as np
 
 
 def rendered(height: int = 224, width: int = 224) -> np.ndarray:
-    """Flat areas, saturated colours and hard edges: the hardest for coders that halve the
-    colour.
+    """Return an image with flat areas, saturated colours and hard edges, the hardest content for
+    codecs that subsample colour.
     """
     y, x = np.mgrid[0:height, 0:width]
     image = np.zeros((height, width, 3), np.uint8)
@@ -18,6 +18,8 @@ def rendered(height: int = 224, width: int = 224) -> np.ndarray:
 
 
 def psnr(image: np.ndarray, other: np.ndarray) -> float:
-    """dB, over all three channels; infinite for equal images."""
+    """Return the peak signal-to-noise ratio in dB over all three channels, infinite for equal
+    images.
+    """
     error = np.mean((image.astype(float) - other) ** 2)
     return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))

@@ -1,4 +1,4 @@
-"""A private certificate authority, made with openssl."""
+"""A private certificate authority for tests, made with openssl."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Authority:
-    """Signs certificates into its folder."""
+    """A certificate authority that writes signed certificates to its folder."""
 
     folder: Path
     name: str
 
     @property
     def file(self) -> Path:
-        """Its own certificate."""
+        """Path of the authority's own certificate."""
         return self.folder / f"{self.name}.pem"
 
     def sign(self, whom: str, addresses: str = "IP:127.0.0.1") -> tuple[Path, Path]:
-        """A certificate and its key."""
+        """Return the paths of a new certificate and of its key."""
         certificate, key = (
             self.folder / f"{self.name}-{whom}.pem",
             self.folder / f"{self.name}-{whom}.key",
@@ -63,7 +63,7 @@ _CURVE = ("ec", "-pkeyopt", "ec_paramgen_curve:prime256v1")
 
 
 def authority(folder: Path, name: str) -> Authority:
-    """A new one."""
+    """Return a new certificate authority."""
     made = Authority(folder, name)
     key = made.file.with_suffix(".key")
     _openssl(

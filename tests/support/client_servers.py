@@ -1,5 +1,5 @@
-"""Servers for the tests of clients in other languages, over a policy of their own in this
-process, without Ray.
+"""Servers for the tests of clients in other languages. They run a test policy in this process,
+without Ray.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ ROWS = 4
 
 
 class Told(Agent):
-    """Acts with what it was told, so that a client can say whether all of it arrived.
+    """A policy whose actions contain the values that it received, so that a client can check that
+    all of them arrived.
 
-    Each of the ROWS rows of its chunk has: the acts of the episode so far, the row's number, the
-    gripper, the mean of the camera `front`, and the first number of the state `joints`; -1 for what
-    is missing.
+    Each of the ROWS rows of its chunk has: the number of earlier calls in the episode, the row's
+    number, the gripper, the mean of the camera `front`, and the first number of the state `joints`;
+    -1 for a missing value.
     """
 
     @property
@@ -60,7 +61,7 @@ class Told(Agent):
 
 @contextlib.contextmanager
 def client_servers() -> Iterator[dict[str, str]]:
-    """Yield the variables that the tests of a client read.
+    """Yield the environment variables that the tests of a client read.
 
     VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the
     same policy without that port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which

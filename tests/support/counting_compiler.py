@@ -1,5 +1,5 @@
-"""A backend of torch.compile that runs what Dynamo traced: it counts the programs that it makes,
-and can spoil some.
+"""A backend of torch.compile that runs Dynamo's traced graph in eager mode. It counts the programs
+that it makes, and can change their results.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from vlagents_ray.policies.compilation import Compilation
 
 
 class CountingCompiler:
-    """Makes programs without code for this machine, whose compiler would take minutes."""
+    """Returns programs that run uncompiled, since the real compiler would take minutes."""
 
     def __init__(self) -> None:
-        self.rows: list[int] = []  # rows of each program
-        # Of the results of programs, by their rows.
+        self.rows: list[int] = []  # number of rows of each program
+        # Changes to the results of programs, by number of rows.
         self.change: dict[int, Callable[[Any], Any]] = {}
         self.calls = 0  # calls of programs
 
@@ -38,7 +38,7 @@ class CountingCompiler:
 
 @contextmanager
 def counting_compiler() -> Iterator[CountingCompiler]:
-    """Let all policies compile with a `CountingCompiler`."""
+    """Let all policies compile with a new `CountingCompiler`."""
     with pytest.MonkeyPatch.context() as patch:
         compiler = CountingCompiler()
         patch.setattr(Compilation, "backend", compiler)

@@ -1,4 +1,4 @@
-"""The C++ client in a separate process, which a test tells what to do."""
+"""The C++ client in a separate process, whose calls a test controls."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ANSWER_S = 60
 
 @functools.cache
 def no_compiler() -> str | None:
-    """Why the client cannot be built here; None if it can."""
+    """Return why the client cannot be built here; None if it can."""
     if shutil.which("cmake") is None or shutil.which("c++") is None:
         return "no CMake, or no C++ compiler"
     found = subprocess.run(
@@ -37,14 +37,14 @@ def no_compiler() -> str | None:
 
 
 def _includes() -> list[str]:
-    """Of the places where CMake looks for packages, too."""
+    """Return the include options of all folders in which CMake looks for packages."""
     prefixes = os.environ.get("CMAKE_PREFIX_PATH", "").split(os.pathsep)
     return [f"-I{prefix}/include" for prefix in prefixes if prefix]
 
 
 def build(folder: Path) -> Path:
-    """Install the client below `folder`, and build its test programs as a user's project does;
-    returns their folder.
+    """Install the client in `folder`, and build its test programs like a user's project would;
+    return the folder of the programs.
     """
     installed, programs = folder / "installed", folder / "programs"
     prefixes = os.pathsep.join(
@@ -73,7 +73,7 @@ def _sanitized() -> list[str]:
 
 
 class CppError(Exception):
-    """An exception of the client's."""
+    """An exception that the client threw."""
 
     def __init__(self, code: str, detail: str, retry_after_s: float | None = None) -> None:
         super().__init__(f"{code}: {detail}")
@@ -81,12 +81,12 @@ class CppError(Exception):
 
 
 class CppClient:
-    """The client. Each method of the driver is a call with its arguments
-    (clients/cpp/tests/driver.cpp).
+    """The C++ client. Each method of its driver (clients/cpp/tests/driver.cpp) is a call with
+    arguments.
     """
 
     def __init__(self, programs: Path, url: str = "", **options: Any) -> None:
-        """Start it, and with a `url` make a `Client`, with `ahead` also a `ChunkPlayer`."""
+        """Start the driver. With a `url`, also create a `Client`, and with `ahead` a `ChunkPlayer`."""
         self._process = subprocess.Popen(
             [programs / "driver"],
             stdin=subprocess.PIPE,
@@ -98,7 +98,7 @@ class CppClient:
             self.call("connect", url=url, **options)
 
     def begin(self, do: str, **arguments: Any) -> None:
-        """Begin a call whose outcome `result` gives."""
+        """Begin a call; `result` returns its outcome."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"do": do, **arguments}) + "\n")
         self._process.stdin.flush()
@@ -117,7 +117,7 @@ class CppClient:
         return self.result()
 
     def peak_mb(self) -> float:
-        """Most memory that its process has had."""
+        """Return the peak memory of the client's process, in MB."""
         status = Path(f"/proc/{self._process.pid}/status").read_text()
         return float(status.partition("VmHWM:")[2].split()[0]) / 1000
 
@@ -136,6 +136,7 @@ class CppClient:
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        _, said = self._process.communicate(timeout=_ANSWER_S)  # it ends with its input
+        # the driver ends when its input ends
+        _, said = self._process.communicate(timeout=_ANSWER_S)
         if kind is None:
             assert (self._process.returncode, said) == (0, "")

@@ -1,4 +1,4 @@
-"""A server that takes nothing of what its client sends, or only a little now and then."""
+"""A server that reads nothing from its clients, or only a few bytes from time to time."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
-_PERIOD_S = 0.05  # between two reads
-_WINDOW_BYTES = 2**16  # what the kernel takes in place of the server
+_PERIOD_S = 0.05  # time between two reads
+_WINDOW_BYTES = 2**16  # bytes that the kernel receives although the server does not read
 
 
 @contextlib.contextmanager
@@ -22,14 +22,14 @@ def deaf_server(
     greeting: bytes | None = b"",
     context: ssl.SSLContext | None = None,
 ) -> Iterator[int]:
-    """Accept connections, and read at most `read_bytes` of each in every twentieth of a second;
-    yields the port.
+    """Accept connections, read at most `read_bytes` bytes from each every 50 ms, and yield the
+    port.
 
     Args:
-        read_bytes: 0 reads nothing.
-        greeting: The first message over a WebSocket, or none if it is empty; None for a server
-            without WebSockets, which takes no handshake either.
-        context: The certificate of a server with TLS.
+        read_bytes: Bytes of each read; 0 reads nothing.
+        greeting: The first message over a WebSocket; if it is empty, no message is sent. None for a
+            server without WebSockets, which does not read a handshake either.
+        context: The TLS context of the server, or None for a server without TLS.
     """
     ended = threading.Event()
 

@@ -1,5 +1,5 @@
-"""All dialects of the server's own port over one engine, and those with a port of their own over
-others.
+"""Fixtures that serve all dialects: those of the server's own port over one engine, and those with
+a separate port over other engines.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ def one_replica() -> Iterator[Replicas]:
 
 @pytest.fixture
 def open_dialect(replicas: Replicas) -> Iterator[OpenPort]:
-    """Serve the clients of a dialect with a port of its own, by its name; returns the port.
+    """Return a function that serves a dialect with a separate port, by the dialect's name.
+    The function returns the port.
 
-    `policy` is what the policy states of itself, such as its contract.
+    The argument `policy` is the policy's metadata, such as its contract.
     """
     dialects: list[PortDialect] = []
 

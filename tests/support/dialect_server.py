@@ -1,4 +1,4 @@
-"""Dialects over an engine in this process, without Ray, and what their clients send."""
+"""Dialects over an engine in this process, without Ray, and the messages of their clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vlagents_ray_dialects.messages import xpolicylab as xpolicylab_codec
 
 LIMITS = MessageLimits(body_bytes=300_000, pixels=64 * 64)
 METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}
-ALL: dict[str, Any] = {  # those on the server's own port, with settings where tests need them
+ALL: dict[str, Any] = {  # the dialects of the server's own port, with the settings that tests need
     **{name: {} for name in names("dialects") if issubclass(dialect_class(name), RouteDialect)},
     "openpi": {"mapping": "openpi-libero", "metadata": {"reset_pose": [0.5]}},
     "roboarena": {"mapping": "openpi-libero"},
@@ -47,7 +47,7 @@ def serving(
 
 
 def client_of(engine: Engine, dialects: dict[str, Any], keys: Keys | None = None) -> TestClient:
-    """A client of the dialects over an engine."""
+    """Return a test client of the dialects over an engine."""
     routes = dialect_routes(
         DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS)
     )
@@ -91,19 +91,19 @@ def seen(pixel: int, task: str = "task 1") -> dict[str, Any]:
 
 
 def xpolicylab(kind: str, message_id: str = "m-1", **payload: Any) -> bytes:
-    """A message of an XPolicyLab client."""
+    """Return a message of an XPolicyLab client."""
     labels = {"evaluation_id": "evaluation", "trial_id": "trial"}
     return xpolicylab_codec.encode(xpolicylab_codec.Frame(kind, message_id, labels, payload))
 
 
 def xpolicylab_observation(pixel: int, task: str = "task 1", **more: Any) -> dict[str, Any]:
-    """An observation of an XPolicyLab client."""
+    """Return an observation of an XPolicyLab client."""
     state = {"left_arm_joint_state": np.ones(3)}
     vision = {"cam_head": {"color": image(pixel)}}
     return {"vision": vision, "state": state, "instruction": task, **more}
 
 
 def xpolicylab_error(data: bytes) -> str | None:
-    """The code of the error in an answer to an XPolicyLab client; None if it is none."""
+    """Return the error code in an answer to an XPolicyLab client; None if the answer is no error."""
     frame = xpolicylab_codec.decode(data, Budget(LIMITS))
     return frame.payload["details"]["code"] if frame.kind == "error" else None

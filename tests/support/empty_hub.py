@@ -1,4 +1,4 @@
-"""Hugging Face's hub, as a stand-in that has no repository."""
+"""A stand-in for Hugging Face's hub that contains no repository."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 
 
 def empty_hub(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str | None]]:
-    """Replace the hub's package; return the repositories and commits that are asked for, as they
-    come.
-    """
+    """Replace the hub's package; return a growing list of the requested repositories and commits."""
     asked: list[tuple[str, str | None]] = []
 
     def download(name: str, revision: str | None) -> str:

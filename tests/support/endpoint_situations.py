@@ -1,16 +1,15 @@
 """The bytes of each endpoint in each situation: what a client sends, and the complete answer.
 
-`SITUATIONS` are the rows, and each `Endpoint` is a column. The answers are recorded in
-tests/golden/endpoints, a file for each endpoint, as tests/golden describes: the recorded bytes are
-sent, whatever today's encoders write, and everything that the server sends until the end of the
-connection is compared, with the handshakes and the heads of frames. `tests.golden.masks` zeroes
-what varies by nature: ids that are drawn at random, times, the headers Date and Server, and which
-memory files are free again.
+`SITUATIONS` are the rows of a table, and each `Endpoint` is a column. The answers are
+recorded in tests/golden/endpoints, a file for each endpoint, in the format of tests/golden: the
+recorded bytes are sent, independent of today's encoders, and everything that the server sends until
+the end of the connection is compared, with the handshakes and the heads of frames.
+`tests.golden.masks` zeroes values that differ in each run: random ids, times, the headers Date and
+Server, and the list of free memory files.
 
-The endpoints of the core are below, in `CORE`; each plug-in has those of its own.
-
-An endpoint at which clients have API keys also has the messages of a client with a key, of each of
-the kinds `MESSAGES`, and how many requests are charged to the key for them.
+The endpoints of the core are in `CORE` below; each plug-in defines its own endpoints. For an
+endpoint whose clients have API keys, `costs` has the messages of a client with a key for each kind
+in `MESSAGES`, and the number of requests that they charge to the key.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Request
 
 FOLDER = Path(__file__).parents[1] / "golden" / "endpoints"
-RECORD = "python -m pytest tests/golden --record endpoints/"  # and the name of the endpoint
+RECORD = "python -m pytest tests/golden --record endpoints/"  # the name of the endpoint follows
 WRONG_KEY = "vlr_wrong"
 
 SITUATIONS = (
@@ -62,7 +61,7 @@ SITUATIONS = (
     "stop of the server",
 )
 
-# Kinds of messages, of which a control frame is the only one that costs nothing.
+# Kinds of messages. Only a control frame is free.
 MESSAGES = (
     "reset",
     "act",
@@ -76,11 +75,11 @@ _RATE = 1000.0  # rate of the key whose charges are counted, requests/s
 
 @dataclass(frozen=True)
 class Cost:
-    """Messages of the client "a", and what they cost.
+    """Messages of the client "a", and the number of requests that they cost.
 
     Args:
-        requests: The requests that are charged to its key.
-        steps: From the beginning of its connection, with the answer to the last message.
+        requests: The number of requests that are charged to the client's key.
+        steps: The steps from the beginning of its connection to the answer to the last message.
     """
 
     requests: int
@@ -89,16 +88,16 @@ class Cost:
 
 @dataclass(frozen=True)
 class Endpoint:
-    """One endpoint, and what its clients do in each situation.
+    """One endpoint, and the steps of its clients in each situation.
 
     Args:
-        name: Of its file, and in the ids of tests.
-        line: Of `tests.golden.replica.Server.line`.
+        name: The name of the recorded file, which is also part of the tests' ids.
+        line: The argument of `tests.golden.replica.Server.line`.
         situations: The steps by situation.
-        not_applicable: The reason by situation, for those that this endpoint does not have.
-        settings: Of `tests.golden.replica.Server`, in all situations.
-        costs: What a key is charged, by the kinds `MESSAGES`, or the reason why there is no such
-            message. Empty if clients have no keys, which is the reason for "wrong key".
+        not_applicable: The reason for each situation that this endpoint does not have.
+        settings: The settings of `tests.golden.replica.Server` in all situations.
+        costs: The cost of each kind in `MESSAGES`, or the reason why the endpoint has no such
+            message. Empty if the endpoint has no keys; then `not_applicable` has "wrong key".
     """
 
     name: str
@@ -123,12 +122,16 @@ class Endpoint:
             )
 
     def cost(self, kind: str) -> Cost | None:
-        """What a message of that kind costs; None if there is none."""
+        """Return the messages of that kind and their cost; None if the endpoint has no such
+        message.
+        """
         cost = self.costs[kind]
         return cost if isinstance(cost, Cost) else None
 
     def played_cost(self, kind: str, folder: Path) -> float:
-        """Send the messages of that kind to a new server; returns what was charged to the key."""
+        """Send the messages of that kind to a new server; return the number of requests charged to
+        the key.
+        """
         cost = self.cost(kind)
         assert cost is not None
         settings = {**self.settings, "keys": True, "rate": _RATE}
@@ -141,7 +144,7 @@ class Endpoint:
             return requests_charged(server.keys, KEY.removeprefix("vlr_"))
 
     def scenario(self, situation: str) -> Trace:
-        """What is sent, without the answers."""
+        """Return the messages of a situation, without their answers."""
         settings = dict(self.settings)
         if situation == "wrong key":
             settings["keys"] = True
@@ -150,7 +153,7 @@ class Endpoint:
 
 
 def cases(endpoints: Sequence[Endpoint]) -> list[tuple[Endpoint, str]]:
-    """Each endpoint with each of its situations."""
+    """Return each endpoint with each of its situations."""
     pairs = []
     for endpoint in endpoints:
         pairs += [(endpoint, each) for each in SITUATIONS if each in endpoint.situations]
@@ -158,7 +161,7 @@ def cases(endpoints: Sequence[Endpoint]) -> list[tuple[Endpoint, str]]:
 
 
 def costs(endpoints: Sequence[Endpoint]) -> list[Any]:
-    """Each endpoint whose clients have keys, with each kind of message that it has."""
+    """Return each endpoint whose clients have keys, with each kind of message that it has."""
     rows = []
     for endpoint in endpoints:
         for kind in endpoint.costs:
@@ -168,14 +171,14 @@ def costs(endpoints: Sequence[Endpoint]) -> list[Any]:
 
 
 def require_cost(endpoint: Endpoint, kind: str, folder: Path) -> None:
-    """Fail unless the messages of that kind cost exactly what the table says."""
+    """Fail unless the messages of that kind cost exactly the number in the table."""
     cost = endpoint.cost(kind)
     assert cost is not None
     assert endpoint.played_cost(kind, folder) == cost.requests
 
 
 def case_ids(endpoints: Sequence[Endpoint]) -> list[str]:
-    """The ids of the tests of `cases`."""
+    """Return the ids of the tests of `cases`."""
     return [f"{endpoint.name}-{situation}" for endpoint, situation in cases(endpoints)]
 
 
@@ -183,7 +186,7 @@ def require_recorded_answers(endpoint: Endpoint, situation: str, folder: Path) -
     """Send the recorded bytes to a new server; fail if an answer differs from the recorded one."""
     recorded = {trace.name: trace for trace in read(endpoint.name, FOLDER)}
     command = f"{RECORD}{endpoint.name}"
-    assert situation in recorded, f"{endpoint.name}, {situation}: not recorded; `{command}` does"
+    assert situation in recorded, f"{endpoint.name}, {situation}: not recorded; run `{command}`"
 
     trace = recorded[situation]
     difference = differences(trace, trace.played(endpoint.line, folder))
@@ -194,20 +197,20 @@ def require_recorded_answers(endpoint: Endpoint, situation: str, folder: Path) -
 
 
 def require_each_situation_recorded(endpoint: Endpoint) -> None:
-    """Fail unless the file has what the table has, in its order."""
+    """Fail unless the recorded file has the situations of the table, in the same order."""
     recorded = [trace.name for trace in read(endpoint.name, FOLDER)]
     assert recorded == [name for name in SITUATIONS if name in endpoint.situations]
 
 
 def record(endpoint: Endpoint, folder: Path) -> None:
-    """Write the file of an endpoint again."""
+    """Record the file of an endpoint again."""
     traces = []
     for _, situation in cases([endpoint]):
         traces.append(endpoint.scenario(situation).played(endpoint.line, folder))
     write(endpoint.name, traces, FOLDER)
 
 
-# Steps that several protocols have.
+# Steps that several protocols share.
 
 
 def finishes(who: str = "a") -> Step:
@@ -216,7 +219,7 @@ def finishes(who: str = "a") -> Step:
 
 
 def handshake(path: str, key: str | None = None) -> bytes:
-    """The handshake of a WebSocket; `{path}` is that of the replica's own port."""
+    """Return the handshake of a WebSocket; the path `{path}` is the path of the replica's own port."""
     authorization = "" if key is None else f"Authorization: Bearer {key}\r\n"
     return (
         f"GET {path} HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -225,11 +228,11 @@ def handshake(path: str, key: str | None = None) -> bytes:
     ).encode()
 
 
-PING = b"\x89\x80" + bytes(4)  # a client's ping
+PING = b"\x89\x80" + bytes(4)  # a ping from a client
 
 
 def websocket_frame(payload: bytes) -> bytes:
-    """A client's binary frame, whose mask is zero."""
+    """Return a client's binary frame, whose mask is zero."""
     size = len(payload)
     if size < 126:
         length = bytes([0x80 | size])
@@ -244,7 +247,7 @@ NO_FRAME = b"\xff\xff no frame of a WebSocket"
 NO_HTTP = b"neither HTTP nor a WebSocket\r\n\r\n"
 
 
-# The endpoints of the core. A client has one connection, which is named like the client: "a", "b".
+# The endpoints of the core. Each client has one connection, which has the client's name: "a", "b".
 
 NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "shared_memory": {"metadata": "its clients read the metadata over HTTP"},
@@ -265,13 +268,13 @@ NOT_APPLICABLE: dict[str, dict[str, str]] = {
 }
 
 Say = Callable[[str, Request], ScenarioMessage]
-"""What the client of that name sends for a request."""
+"""Returns the message that the client of that name sends for a request."""
 OTHER_SHAPES = (
     seen(cameras={"front": PIXELS[:4]}),
     seen(state={"joints": np.zeros(3, np.float32)}),
 )
 UNKNOWN_SESSIONS = (act(), act(session="another"))
-# Requests of one message; closing a session is free beside other requests.
+# Several requests of one message. Closing a session is free next to other requests.
 SEVERAL = [
     *(reset(session=session) for session in ("x", "y", "z")),
     Request("close", session="x"),
@@ -288,7 +291,7 @@ def _episode_steps(
 ) -> dict[str, list[Steps]]:
     """The situations that every endpoint of our own protocol has.
 
-    `polled` is whether the policy's thread alone answers what is late: when it is free again.
+    `polled` is whether only the policy's thread answers late requests, as soon as it is free again.
     """
 
     def asked_by(who: str, *requests: Request) -> list[Steps]:
@@ -301,7 +304,8 @@ def _episode_steps(
         asked_by("b", reset()),
         Send("a", say("a", asked("wait"))),
         server("is acting"),
-        Send("b", say("b", act(deadline_ms=0.001))),  # over before any server gets to it
+        # the deadline has passed before any server reads the request
+        Send("b", say("b", act(deadline_ms=0.001))),
     ]
     if polled:
         answers = [server("acts on"), gets("a"), gets("b")]
@@ -347,7 +351,7 @@ def _websocket(name: str, line: str, path: str) -> Endpoint:
     }
 
     def sends(requests: int, *frames: bytes) -> Cost:
-        """The cost of frames after the handshake with the key."""
+        """Return the cost of frames after the handshake with the key."""
         return Cost(requests, [connect("a", KEY), asks(*((each,) for each in frames))])
 
     first = say("a", reset())[0]
@@ -372,7 +376,7 @@ def _unix(name: str, line: str) -> Endpoint:
         return []
 
     def in_memory(data: bytes) -> tuple[bytes, bytes]:
-        """A message about a frame that no encoder writes."""
+        """Return a message about a frame that no encoder would write."""
         if line == "plasma":
             return PlasmaAddress.REQUEST.pack(b"a".ljust(28, b"."), 0), data
         return LocalAddress.REQUEST.pack(9, 0, len(data)), data
@@ -386,7 +390,7 @@ def _unix(name: str, line: str) -> Endpoint:
             [Send("c", (KEY.encode(),)), asks(reset(), who="c"), finishes("c")],
         ],
         "garbage": [asks(reset(), (b"garbage",), in_memory(b"garbage!"), act()), finishes()],
-        # A message arrives as a whole, but the frame in the memory may not.
+        # A message always arrives complete, but the frame in the memory may be incomplete.
         "half a message, then close": [
             [asks(reset(), half), finishes()],
             [asks(reset(), who="b"), finishes("b")],
@@ -399,7 +403,7 @@ def _unix(name: str, line: str) -> Endpoint:
         return Endpoint(name, line, applicable, reasons)
 
     def sends(requests: int, *messages: ScenarioMessage) -> Cost:
-        """The cost of messages after the key."""
+        """Return the cost of messages after the key."""
         return Cost(requests, [Send("a", (KEY.encode(),)), asks(*messages)])
 
     costs: dict[str, Cost | str] = {
@@ -430,7 +434,7 @@ def _handle(name: str) -> Endpoint:
 
 
 Body = Callable[[Request], tuple[str, bytes]]
-"""Returns the content type and the body of a request over HTTP."""
+"""Returns the content type and the body of an HTTP request."""
 
 
 def _http(
@@ -477,7 +481,7 @@ def _http(
     }
 
     def sends(requests: int, *messages: Request) -> Cost:
-        """The cost of requests with the key."""
+        """Return the cost of requests with the key."""
         posts = [say("a", message, authorization=f"Bearer {KEY}") for message in messages]
         return Cost(requests, asks(*posts))
 
@@ -540,6 +544,6 @@ CORE = (
     _http("own_port_http", _frame_body, OTHER_SHAPES, HTTP[1]),
     _http("http_frame", _frame_body, OTHER_SHAPES),
     _http("http_form", _form_body, OTHER_SHAPES),
-    # A document has no images.
+    # A JSON document has no images.
     _http("http_json", _json_body, OTHER_SHAPES[1:], contract="state only"),
 )

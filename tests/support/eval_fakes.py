@@ -1,4 +1,4 @@
-"""A tiny env and agent that workers import by name, with troubles to order."""
+"""A tiny environment and policy that workers import by name, with faults on demand."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ OTHER_LINE = "eval_fakes:OtherLine"
 SPARING_LINE = "eval_fakes:SparingLine"
 DRIFTING_LINE = "eval_fakes:DriftingLine"
 CLINGING = "eval_fakes:Clinging"
-EVERY = -1  # seed
+EVERY = -1  # `lost_on` for all seeds
 HURRY = "VLAGENTS_RAY_TEST_HURRY"  # variable, see `Unhurried`
-# With which other processes find this module.
+# Search path with which other processes import this module.
 PYTHONPATH = f"{Path(__file__).parent}:{Path(__file__).parents[2]}"
 
 
 class Line(EvalEnv):
-    """A point on a line is to be brought to 0 within 10 steps; from far away it cannot be.
+    """A point on a line must reach 0 within 10 steps, which is impossible from far away.
 
-    `trouble` maps a kind to the seeds in whose fourth step it happens, once for each seed: a file
-    in `folder` remembers. Kinds: "raise", "exit", "hang" (asleep), "freeze" (asleep, holding the
-    interpreter), and "gate", which waits for the file `folder/open`.
+    `trouble` maps a kind of fault to the seeds in whose fourth step it occurs, once for each seed:
+    a file in `folder` marks it. Kinds: "raise", "exit", "hang" (sleep forever), "freeze" (sleep
+    forever while holding the GIL), and "gate", which waits for the file `folder/open`.
     """
 
     max_steps = 10
@@ -132,7 +132,7 @@ class Line(EvalEnv):
 
 
 class SevenLine(Line):
-    """For policies with seven numbers in an action; it takes the first."""
+    """An environment for policies with seven numbers in an action; it uses the first."""
 
     @property
     def contract(self) -> Contract:
@@ -140,18 +140,20 @@ class SevenLine(Line):
 
 
 class Clinging(Line):
-    """Never closes."""
+    """An environment whose `close` never returns."""
 
     def close(self) -> None:
         threading.Event().wait()
 
 
 class OtherLine(Line):
-    """The same under another name."""
+    """The same environment under another name."""
 
 
 class SparingLine(Line):
-    """Renders what is looked at alone; `rendered` is how many images all of them have made."""
+    """An environment that renders only observations that are used; `rendered` counts the images of
+    all instances.
+    """
 
     rendered = 0
 
@@ -164,7 +166,7 @@ class SparingLine(Line):
 
 
 class DriftingLine(SparingLine):
-    """No two of its episodes begin alike."""
+    """An environment whose episodes all begin in different states."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -180,14 +182,14 @@ class DriftingLine(SparingLine):
 
 
 class ToZero(Agent):
-    """Steps to zero with some noise of its own; `chunk` rows at a time."""
+    """A policy that steps to zero with random noise, and returns `chunk` rows at a time."""
 
     def __init__(
         self, chunk: int = 1, state_dim: int | None = None, lost_on: int | None = None
     ) -> None:
         self._chunk = chunk
         self._state_dim = state_dim
-        self._lost_on = lost_on  # the seed in whose acts the connection breaks
+        self._lost_on = lost_on  # the seed in whose calls the connection breaks
         self._seed = 0
         self._rng = np.random.default_rng(0)
 
@@ -209,10 +211,10 @@ class ToZero(Agent):
 
 
 class Unhurried(ToZero):
-    """Chunks of a second for a robot at 50 Hz.
+    """A slow policy that returns chunks of one second for a robot at 50 Hz.
 
-    Each takes its time, so that an evaluation lasts until there is the file that the variable
-    `HURRY` names.
+    Each call sleeps, so that an evaluation lasts until the file exists that the variable `HURRY`
+    names.
     """
 
     def __init__(self, takes_s: float = 0.05) -> None:
@@ -220,7 +222,7 @@ class Unhurried(ToZero):
         self._takes_s = takes_s
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        return super().reset(obs, instruction, **{"seed": 0} | kwargs)  # a robot has none
+        return super().reset(obs, instruction, **{"seed": 0} | kwargs)  # a real robot sends no seed
 
     def act(self, obs: Obs) -> Act:
         if not Path(os.environ.get(HURRY, "")).is_file():
@@ -229,7 +231,7 @@ class Unhurried(ToZero):
 
 
 class Silent(ToZero):
-    """Never answers an `act`."""
+    """A policy that never answers an `act`."""
 
     def act(self, obs: Obs) -> Act:
         threading.Event().wait()
@@ -237,7 +239,7 @@ class Silent(ToZero):
 
 
 class Teller(ToZero):
-    """Fails by telling what its process was started with."""
+    """A policy that fails with an error that contains the environment variables of its process."""
 
     def act(self, obs: Obs) -> Act:
         raise PolicyFailed(
@@ -251,10 +253,10 @@ class Teller(ToZero):
 
 
 def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None:
-    """Poll until `true()`; `TimeoutError` if it never is.
+    """Poll until `true()` returns a true value; raise `TimeoutError` after `timeout_s`.
 
-    What takes long to find out, such as whether a process has ended, is asked less often: what is
-    waited for wants CPU.
+    A slow condition, such as whether a process has ended, is polled less often, to leave CPU time
+    to the process.
     """
     deadline = (begun := time.monotonic()) + timeout_s
     while not true():
@@ -265,7 +267,7 @@ def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None
 
 
 class Clock:
-    """Shows what it is set to."""
+    """A clock that returns the time that a test set."""
 
     now = 0.0
 
@@ -274,7 +276,7 @@ class Clock:
 
 
 class SimulatedTime:
-    """A clock that continues when a thread sleeps, in place of the module `time`."""
+    """A stand-in for the module `time` whose clock advances when a thread sleeps."""
 
     now = 0.0
 
