@@ -25,12 +25,12 @@ Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
 HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the size of the body limits a reply's
-VALUES = 20_000  # maximum number of values in a request's JSON; parsing as many takes about 2 ms
+VALUES = 20_000  # maximum number of values in a request's JSON; parsing that many takes about 2 ms
 # JSON that is longer than this is parsed within a budget, which may move it to a decoding thread.
 _INLINE_BYTES = 64 * 1024
 _LONG_VALUES = 1_000_000
 _PLAIN = re.compile(r"[<|][biuf][1248]")
-# Created once, as `json.dumps` creates an encoder per call.
+# The encoder is created once, since `json.dumps` creates one at each call.
 dump = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -120,7 +120,7 @@ def parse_json(
     """Parse JSON text from the network.
 
     Args:
-        text: The text; bytes are UTF-8.
+        text: The text, or its bytes in UTF-8.
         beginning: The beginning of the error message, such as "obs:".
         pairs: Converts the keys and values of each object; its `ValueError`s become
             `MalformedMessage`.
@@ -143,7 +143,7 @@ def parse_json(
     max_values = _LONG_VALUES if long else VALUES
     if len(data) > 2 * max_values:  # each value takes at least two characters
         marks: tuple[Any, ...] = (",", "[", "{") if isinstance(data, str) else (b",", b"[", b"{")
-        # Parsing would need far more memory and time than the length suggests.
+        # Parsing such a text would need far more memory and time than its length suggests.
         if sum(map(data.count, marks)) > max_values:
             raise MessageTooLarge(
                 f"message: expected at most {max_values} values in its JSON, got more; send "
@@ -154,14 +154,15 @@ def parse_json(
         decoded = data if isinstance(data, str) else data.removeprefix(codecs.BOM_UTF8).decode()
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
-            # This raises an error for an unpaired surrogate.
+            # `encode` raises an error for an unpaired surrogate.
             json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"{beginning} not JSON ({error})") from error
     return value
 
 
-# Arrays in messages have only booleans, integers and floats, and their number of bytes must match.
+# Arrays in messages contain only booleans, integers or floats, and the number of bytes must match
+# the shape.
 
 
 def is_plain(dtype: Any) -> bool:

@@ -49,7 +49,7 @@ _OPTIONAL: dict[str, Any] = {
     "deadline_ms": None,
 }
 _WITH_OBS = ("reset", "act")
-_RESET_PARAMETERS = {"self", "obs", "instruction"}  # names that options of a reset may not have
+_RESET_PARAMETERS = {"self", "obs", "instruction"}  # names that `kwargs` must not contain
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {
@@ -63,7 +63,7 @@ _REQUEST_KEYS = {
     "step",
     *_OPTIONAL,
 }
-_INNER_KEYS = {"prepared"}  # further ones, which only a replica may send, see `INNER_OPS`
+_INNER_KEYS = {"prepared"}  # further keys, which only a replica may send, see `INNER_OPS`
 
 
 def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> bytes:
@@ -104,8 +104,8 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 
 
 class Decoded(NamedTuple):
-    """The requests decoded from a frame, and error replies to those that cannot be read, by their
-    index in the frame.
+    """The requests decoded from a frame, and the error replies to unreadable requests, by the index
+    of the request in the frame.
     """
 
     requests: list[Request]
@@ -189,8 +189,8 @@ def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) 
 
 
 def _step(node: dict[str, Any]) -> Any:
-    """Return the `step` of a request or reply. It is sent as text, since some JSON parsers round
-    numbers above 2**53.
+    """Return the `step` of a request or reply. The step is sent as text, since some JSON parsers
+    round numbers above 2**53.
     """
     step = node.get("step")
     if step is None:
@@ -203,10 +203,10 @@ def _step(node: dict[str, Any]) -> Any:
 
 
 def check_request(request: Request, limits: MessageLimits) -> Request:
-    """Check the types and sizes that JSON itself does not enforce, and return the request. It may
-    come from any format.
+    """Check the types and sizes that JSON itself does not enforce, and return the request. The
+    request may have been decoded from any format.
     """
-    # A reference is an object in JSON, and may be an array, bytes or a number.
+    # A JSON object may be a reference to an array, bytes or a number.
     if not isinstance(request.kwargs, dict):
         raise MalformedMessage(f"kwargs: expected an object, got {type(request.kwargs).__name__}")
     if request.contract is not None and not isinstance(request.contract, dict):
@@ -259,9 +259,9 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
     """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    If `arrived` is set, the time at which the requests arrived (s, of `time.perf_counter()`), the
-    `timing` of replies without an error also has `encode_ms` and `total_ms`. They exclude only the
-    final joining of the frame.
+    `arrived` is the time of `time.perf_counter()` at which the requests arrived, s. If it is set,
+    the `timing` of each reply without an error also has `encode_ms` and `total_ms`, which exclude
+    only the final joining of the frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()
@@ -269,7 +269,7 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
 
     if len(nodes) > 1 and sum(map(len, (*nodes, *writer.blobs))) > DEFAULT_LIMITS.body_bytes:
         error = MessageTooLarge(
-            f"replies: expected at most {DEFAULT_LIMITS.body_bytes} bytes together, got more; "
+            f"replies: expected at most {DEFAULT_LIMITS.body_bytes} bytes in total, got more; "
             "request fewer at once"
         )
         error_replies = [Reply(reply.request_id, error=error) for reply in replies]
@@ -282,7 +282,8 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
             if reply.error is None:
                 reply.timing |= times_ms
 
-    # The timing is encoded last, in a separate loop, so that it includes the encoding of the rest.
+    # The timing is encoded last, in a separate loop, so that it includes the encoding of everything
+    # else.
     for i, reply in enumerate(replies):
         if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
             times = ",".join(
@@ -318,7 +319,7 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
 
 
 def decode_replies(data: Buffer) -> list[Reply]:
-    """Decode the replies in a frame, which has at least one."""
+    """Decode the replies in a frame, which contains at least one reply."""
     header, blobs = unpack(data, DEFAULT_LIMITS)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:

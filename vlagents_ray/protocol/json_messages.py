@@ -123,7 +123,7 @@ def plain_values(value: Any) -> Any:
         return None
     if isinstance(value, (bytes, bytearray, memoryview)):
         return base64.b64encode(value).decode()
-    # Other sequences, such as a deque, are lists in a frame.
+    # A frame also encodes other sequences, such as a deque, as lists.
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [plain_values(item) for item in value]
     return value

@@ -31,7 +31,7 @@ STEP_HEADER = "x-step"
 PRIORITY_HEADER = "x-priority"
 MOST_DEADLINE_MS = 1e9  # the longest deadline: 11 days
 NAME_CHARACTERS = 128  # maximum length of a session's or a request's id
-STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable part
+STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable name
 # Maximum size of a WebSocket message: uvicorn's limit, which Serve does not allow to change.
 STREAM_BYTES = 16 * 2**20
 
@@ -64,13 +64,13 @@ Op = Literal[
     "wake",
 ]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
-# These run while the policy acts, and use no session; see `BackgroundCalls`.
+# These operations run while the policy computes actions, and use no session; see `BackgroundCalls`.
 BACKGROUND_OPS: tuple[Op, ...] = ("ability", "make_weights", "read_weights", "sleep", "wake")
-# These are executed at once, by the thread that has read them; they use no session of their
+# The thread that reads these operations executes them immediately; they use no session of their
 # connection.
 IMMEDIATE_OPS: tuple[Op, ...] = ("prepare", "gpu_memory", "gpu_work")
-# Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain
-# pickles.
+# Only a replica may send these operations, to the process that runs its policy; "export" and
+# "adopt" contain pickles.
 INNER_OPS: tuple[Op, ...] = (
     *(*OPS, "call", "export", "adopt", "weights"),
     *IMMEDIATE_OPS,
@@ -102,12 +102,13 @@ class Request:
     """
 
     op: Op
-    # For reset, act and prepare; for call: its argument that is an observation.
+    # The observation of a reset, act or prepare; for call: the argument that is an observation.
     obs: Obs | None = None
     instruction: str | None = None  # reset only
     # For reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`;
     # for call and ability: see `AbilityCall`; for other `BACKGROUND_OPS`: see `BackgroundCalls`;
-    # for prepare: the number of the observation, to be stored, or dropped if `obs` is None.
+    # for prepare: the number under which the observation is stored. If `obs` is None, the stored
+    # observation with that number is dropped.
     kwargs: dict[str, Any] = field(default_factory=dict)
     # Reset only: the contract of the robot or the environment, which the server compares with the
     # policy's contract.
@@ -123,7 +124,7 @@ class Request:
     # Time from the request's arrival after which the reply is of no use.
     deadline_ms: float | None = None
     # Act only: the number of an observation that "prepare" has stored, in place of `obs`; 0 for
-    # none. Only a replica may send it, as the operation.
+    # none. Only a replica may send it, as for the operation "prepare".
     prepared: int = 0
 
     def drop_observations(self) -> None:
@@ -149,8 +150,8 @@ class Reply:
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Return whether this is the reply to that request, and not to an earlier one. The reply to
-        an unreadable frame has no id.
+        """Return whether this is the reply to `request`, and not to an earlier request. A reply
+        without an id, which answers an unreadable frame, counts as the reply.
         """
         return self.request_id in ("", request.request_id)
 
@@ -170,16 +171,17 @@ class MessageLimits:
     """
 
     body_bytes: int = 64 * 2**20
-    pixels: int = 4096 * 2304  # per image: 4K, for both television and cinema
+    pixels: int = 4096 * 2304  # pixels of one image: 4K, for both television and cinema
     cameras: int = 16
-    state_values: int = 4096  # per part of the proprioception
+    state_values: int = 4096  # values in one part of the state
     depth: int = 8  # nesting depth of `info` and `kwargs`
     items: int = 10_000  # values in `info` and `kwargs` together
     text: int = 16_384  # length of an instruction
     requests: int = 512  # requests in one frame
     history: int = 256  # observations sent with a reset
     reply_bytes: int = 16 * 2**20  # size of the action and the info of one reply
-    # The size of the images and bytes in one request, counted once for each reference to them.
+    # The decoded size of the images and bytes in one request, counted once for each reference to
+    # them.
     decoded_bytes: int = 128 * 2**20
     # The size of all messages that a replica is processing, encoded and decoded.
     in_flight_bytes: int = 512 * 2**20
@@ -194,13 +196,14 @@ class LocalAddress:
 
     socket: str  # name of a Unix socket in the abstract namespace, not in a file system
     boot_id: str  # random id of the machine, which Linux draws at each boot
-    # Whether the first message is the client's API key. It is answered only if it is rejected.
+    # Whether the first message is the client's API key. The server replies to it only if the key is
+    # rejected.
     keyed: bool = False
 
-    # The data of a request are in a memory file of the client, which is sent with the first message
-    # that names it: a frame or, with COMPACT, the arrays of the acts that follow the message's
-    # header (see `vlagents_ray.protocol.shm_layout`). A reply follows its header, or is in a memory
-    # file that is sent with it.
+    # The data of a request are in a memory file of the client. The file's descriptor is sent with
+    # the first message that refers to the file. The data are a frame or, with COMPACT, the arrays
+    # of the acts that follow the message's header (see `vlagents_ray.protocol.shm_layout`). A reply
+    # follows its header, or is in a memory file whose descriptor is sent with the header.
     # REQUEST packs the number of the memory file, flags, and the number of bytes in it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")
     # REPLY packs a bit for each memory file, which is set if the file is free again, and flags.
@@ -208,7 +211,7 @@ class LocalAddress:
     # A flag: the frame of the reply is in the memory file that is sent with the message.
     IN_FILE: ClassVar[int] = 1
     COMPACT: ClassVar[int] = 2  # a flag: the content is in compact form, not a frame
-    # A client sends a ping as a message of one byte, which the server answers by another one.
+    # A ping is a message of one byte from the client; the server replies with another byte.
     PING: ClassVar[bytes] = b"?"
     PONG: ClassVar[bytes] = b"!"
     # Maximum number of memory files of a client. A policy that keeps observations needs more than
@@ -223,8 +226,8 @@ class StreamAddress:
     """
 
     port: int
-    # Path of a WebSocket, below which are those of HTTP. It is unguessable: known only to clients
-    # that may read the metadata.
+    # Path of the WebSocket; the paths for HTTP are below it. It is unguessable, so only clients
+    # that may read the metadata know it.
     path: str
 
     def __post_init__(self) -> None:
@@ -256,7 +259,7 @@ class PlasmaAddress:
 
 
 Address = TypeVar("Address", LocalAddress, StreamAddress, PlasmaAddress)
-_ADDRESS_TYPES = {"str": str, "int": int, "bool": bool}  # by annotation
+_ADDRESS_TYPES = {"str": str, "int": int, "bool": bool}  # by the text of the annotation
 
 
 def read_address(kind: type[Address], document: object) -> Address | None:
@@ -334,7 +337,8 @@ DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
 """Each image with the file from which it was decoded, by the `id` of the image."""
 # Size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`.
 _JSON_FACTOR = 4
-# Limit of the time to decode a request's images, s per byte of `decoded_bytes`: slow PNG files.
+# Limit of the time to decode a request's images, s per byte of `decoded_bytes`. It suffices for
+# PNG files that are slow to decode.
 _DECODING_S = 20e-9
 _LEAST_DECODING_S = 10e-3
 
@@ -402,8 +406,8 @@ class Budget:
         """Count the decoding of images before it begins; raise an error if it exceeds a limit.
 
         Args:
-            seconds: Its estimated time on one core, s.
-            scratch_bytes: Memory that it needs until it ends, in addition to the images, bytes.
+            seconds: Estimated duration of the decoding on one core, s.
+            scratch_bytes: Temporary memory of the decoding, in addition to the images, bytes.
         """
         self._seconds_left -= seconds
         if self._seconds_left < 0:

@@ -3,9 +3,9 @@ same at each step.
 
 An observation's layout (session, priority, names and sizes of cameras and state) is sent once, as
 JSON. Later messages refer to it by its number. The rest of a request is an `ITEM` and its arrays,
-which are stored in sequence in shared memory, each at a multiple of 64. A reply consists of an
-`ANSWER`, the action, and the `WEIGHTS` that acted. All other messages (a reset, `info`, an error)
-are sent as frames; see `vlagents_ray.protocol.frames`.
+which are stored in sequence in shared memory, each at an offset that is a multiple of 64. A reply
+consists of an `ANSWER`, the action, and the `WEIGHTS` that computed the action. All other messages
+(a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 COUNT = struct.Struct("<I")
-# Layout, size of its JSON, step or -1, deadline in ms, gripper, request id.
+# An act: number of its layout, size of the layout's JSON, step or -1, deadline in ms, gripper,
+# request id.
 ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")
-# Request id, step, flags, dimensions, H, D, batch size, times in ms.
+# A reply: request id, step, flags, number of dimensions, H, D, batch size, times in ms.
 ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")
 _DONE, _DRAINING, _POLICY = 1, 2, 4
 # The weights of an answer, after all actions, if the flag _POLICY is set: version, digest.
@@ -113,7 +114,7 @@ class ShmWriter:
 
     def __init__(self) -> None:
         self._known: dict[Any, tuple[int, Layout]] = {}
-        # The layout of the last act of each session; its next act probably has the same one.
+        # The layout of the last act of each session; its next act probably has the same layout.
         self._latest: dict[str, tuple[int, Layout]] = {}
 
     def write(self, requests: Sequence[Request]) -> Written | None:
@@ -170,7 +171,7 @@ class Written:
 
     message: bytes
     size: int  # size of the memory for the arrays, bytes
-    arrays: list[tuple[int, np.ndarray]]  # offset, array
+    arrays: list[tuple[int, np.ndarray]]  # pairs of offset in bytes and array
 
     def parts(self) -> list[Buffer]:
         """Return the content of the memory: the arrays, which are not copied if possible, and the

@@ -175,7 +175,7 @@ class ValueReader:
             self._fresh.discard(index)
         else:  # the recipient of the request may copy each reference
             self._budget.count(image.nbytes)
-            image.flags.writeable = False  # several observations share it
+            image.flags.writeable = False  # several observations share the image
         return image
 
     def _bytes_of(self, index: Any) -> bytes:
@@ -237,7 +237,7 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
 
     reader.decode_images(cameras)
     read_info = reader.value(info)
-    # A reference is an object in JSON, and may be an array, bytes or a number.
+    # A JSON object may be a reference to an array, bytes or a number.
     if not isinstance(read_info, dict):
         raise MalformedMessage(f"obs.info: expected an object, got {described(read_info)}")
     return Obs(
@@ -314,7 +314,9 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
 
 
 def require_obs(obs: Any) -> None:
-    """Raise `InvalidObservation` if a value of a program cannot be sent as an observation."""
+    """Raise `InvalidObservation` if `obs`, a value from a user's program, cannot be sent as an
+    observation.
+    """
     if not isinstance(obs, Obs):
         raise InvalidObservation(
             f"observation: expected an Obs, got {described(obs)}; make one, as in "
@@ -388,8 +390,8 @@ def is_number(value: object) -> bool:
 
 
 def require_plain(value: Any, depth: int) -> None:
-    """Raise an error if a value of another protocol has a type that frames cannot contain, a key
-    that is not text, or more than `depth` levels.
+    """Raise an error if a value decoded from another protocol has a type that frames cannot
+    contain, a key that is not text, or more than `depth` levels.
     """
     if isinstance(value, (dict, list)):
         if depth <= 0:
@@ -422,10 +424,10 @@ def to_text(value: Any) -> str:
 
 
 def from_text(text: str, budget: Budget) -> Any:
-    """Return the value that `to_text` converted.
+    """Return the value from text that `to_text` has written.
 
     Raises:
-        MalformedMessage: It is another text.
+        MalformedMessage: The text does not have that format.
     """
     document = parse_json(text, "value:", long=True)
     try:

@@ -63,18 +63,19 @@ class ReceiveBuffer(StreamReader):
         self._limit = limit
         self._start = 0  # start of the unparsed bytes in `buffer`
         self._between_frames = False  # whether the next byte begins a frame
-        # Whether a frame was only a part of a message. The parser then checks all later frames.
+        # Whether any frame was only a part of a message. If so, the library's parser reads all
+        # later frames.
         self._fragments = False
 
     @property
     def size(self) -> int:
-        """Number of unparsed bytes. On other threads than the thread of `parse`, it is only
-        reliable whether it is 0.
+        """Number of unparsed bytes. On threads other than that of `parse`, only the comparison with
+        0 is reliable.
         """
         return len(self.buffer) - self._start
 
     def attach(self, protocol: Protocol) -> None:
-        """Become the reader of a protocol that has parsed all its bytes so far."""
+        """Become the reader of a protocol that has parsed all bytes received so far."""
         protocol.reader = self
         protocol.parser = Protocol.parse(protocol)  # the old parser reads from the old reader
         next(protocol.parser)
@@ -142,8 +143,8 @@ class ReceiveBuffer(StreamReader):
         return data if n > _SMALL_BYTES else bytearray(data)  # type: ignore[return-value]
 
     def at_eof(self) -> Generator[None, None, bool]:
-        """Return whether the connection has ended, as soon as that is known. If there are unparsed
-        bytes, it has not.
+        """Return whether the connection has ended, once that is known. It has not ended while there
+        are unparsed bytes.
         """
         while not self.size:
             if self.eof:

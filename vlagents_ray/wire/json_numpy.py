@@ -21,8 +21,8 @@ _KEYS = {"__numpy__", "dtype", "shape"}
 
 
 def loads(text: str | bytes, limits: MessageLimits, levels: int = 0) -> Any:
-    """Return the value of a document, nested up to `levels` deeper than the limit; arrays are
-    read-only.
+    """Return the value of a JSON document, whose arrays are read-only. The document may be nested
+    `levels` deeper than the limit.
     """
     if len(text) > limits.body_bytes:
         raise MessageTooLarge(
@@ -44,13 +44,13 @@ def loads(text: str | bytes, limits: MessageLimits, levels: int = 0) -> Any:
 
 
 def dumps(value: Any) -> str:
-    """Return the document of a value; raise `InvalidInput` for an unsupported type."""
+    """Return a value as a JSON document; raise `InvalidInput` for an unsupported type."""
     return json.dumps(value, default=_plain)
 
 
 def rows(value: list[Any]) -> np.ndarray:
-    """Return the array of a list of numbers, lists or arrays; raise `MalformedMessage` if they
-    make none.
+    """Convert a list of numbers, lists or arrays to one array; raise `MalformedMessage` if that is
+    impossible.
     """
     if value and all(isinstance(row, np.ndarray) for row in value):
         shapes = {row.shape for row in value}
@@ -62,16 +62,14 @@ def rows(value: list[Any]) -> np.ndarray:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise MalformedMessage(f"action: no array of numbers ({error})") from error
+        raise MalformedMessage(f"action: expected an array of numbers ({error})") from error
     if array.dtype.kind not in "fiu":
         raise MalformedMessage(f"action: expected numbers, got {array.dtype}")
     return array
 
 
 def decode_base64(data: object, name: str) -> bytes:
-    """Decode base64 in the standard or the URL-safe alphabet; `name` is that of the data in
-    errors.
-    """
+    """Decode base64 in the standard or the URL-safe alphabet; errors call the data `name`."""
     if not isinstance(data, str):
         raise MalformedMessage(f"{name}: expected base64, got {type(data).__name__}")
     try:
@@ -91,7 +89,7 @@ def _hook(node: dict[str, Any]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value that JSON lacks to one that it has."""
+    """Convert an array, a mapping, bytes or a sequence to a value that `json` can encode."""
     if isinstance(value, (np.ndarray, np.generic)):
         if value.dtype.kind not in "biuf":
             raise InvalidInput(

@@ -1,7 +1,7 @@
 """Conversion of another system's observation to an `Obs`, and of our action to theirs: keys,
 layouts, grippers.
 
-A deployment file states a mapping as a preset's name (`presets`), as an object, or as an object
+A deployment file declares a mapping as a preset's name (`presets`), as an object, or as an object
 that names a preset and overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
@@ -14,13 +14,14 @@ that names a preset and overrides some of its fields:
 
 The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`.
 `states|state` is the first of the two that exists. A name and a key that end with `*` match all
-keys with that beginning: `"*": "video/*"`. Left sides are our names, right sides the client's,
-except in `action`, whose left sides are the names that the client reads, and in `instructions`,
-which has the text of each integer that a client sends instead of an instruction. Unknown fields are
-errors; a text is short for an entry with that key and no other field.
+keys with that beginning: `"*": "video/*"`. The left sides are our names, and the right sides are
+the client's keys. There are two exceptions: in `action`, the left sides are the names that the
+client reads; `instructions` contains the text for each integer that a client sends instead of an
+instruction. Unknown fields are errors. A text is short for an entry with that key and no other
+field.
 
-An observation is rejected if the mapping reads nothing of it, or none of the cameras or none of the
-states in it.
+An observation is rejected if the mapping reads nothing in it. It is also rejected if it has cameras
+and the mapping reads none of them, or if it has states and the mapping reads none of them.
 """
 
 from __future__ import annotations
@@ -56,11 +57,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CameraKey:
-    """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is
-    used, the last of T.
+    """The location of an image, (H, W, 3) or (3, H, W) RGB. If the value is (1, T, H, W, 3), the
+    newest image is used, which is the last of T.
 
     Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of
-    the first axis is 3; of `rgba`, (H, W, 4), alpha is dropped.
+    the first axis is 3; from an `rgba` image, (H, W, 4), the alpha channel is dropped.
     """
 
     key: str
@@ -70,8 +71,8 @@ class CameraKey:
 
 @dataclass(frozen=True, slots=True)
 class StateKey:
-    """The location of a vector (D,), from `start` to `stop`; of (1, T, D) the newest vector is
-    used, the last of T.
+    """The location of a vector (D,), of which the values from `start` to `stop` are used. If the
+    value is (1, T, D), the newest vector is used, which is the last of T.
     """
 
     key: str
@@ -82,8 +83,8 @@ class StateKey:
 
 @dataclass(frozen=True, slots=True)
 class GripperKey:
-    """The location of the gripper's opening, and its readings when open and closed, with linear
-    interpolation.
+    """The location of the gripper's reading, and the readings of an open and of a closed gripper.
+    Readings between the two are interpolated linearly.
     """
 
     key: str
@@ -111,8 +112,8 @@ class ActionGripper:
 
 
 def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> dict[str, T]:
-    """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its
-    path, for errors.
+    """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is the
+    path of the entry, for error messages.
     """
     entries = top.get(name) or {}
     if not isinstance(entries, Mapping):
@@ -165,12 +166,12 @@ def without_none(value: Any) -> Any:
 # The following functions use paths into nested observations. `images/wrist` is either that key
 # itself, or `wrist` within `images`; `states|state` is the first of the two that exists.
 
-_SHOWN = 40  # the largest number of keys that an error lists, and of characters of a key
-_LONGEST = 200  # the number of characters of a client's key that are compared
+_SHOWN = 40  # maximum number of keys in an error message, and of characters of each key
+_LONGEST = 200  # number of characters of a client's key that are compared
 
 
 def lookup(nested: Mapping[Any, Any], path: str) -> Any:
-    """Return the value at `path`; None if there is none."""
+    """Return the value at `path`; None if it is missing."""
     if path in nested:
         return nested[path]
     if "|" in path:
@@ -192,8 +193,8 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
 
 
 def keys(nested: Mapping[Any, Any]) -> list[str]:
-    """Return the paths of all values that are not mappings, in order, at most 40, to be listed
-    in an error.
+    """Return the paths of all values that are not mappings, in order, at most 40, for an error
+    message.
     """
     return [short_path(path) for path, _ in islice(leaves(nested), _SHOWN)]
 
@@ -204,8 +205,8 @@ def short_path(path: str) -> str:
 
 
 def leaves(nested: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the paths and values of all values that are not mappings, in order; see
-    `short_path`.
+    """Yield the paths and values of all values that are not mappings, in order. `short_path`
+    shortens such a path.
     """
     for key, value in nested.items():
         path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
@@ -337,8 +338,8 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
     """
     if value.ndim > ndim and value.shape[0] != 1:
         raise InvalidObservation(
-            f"{key!r}: expected one row, got a batch of {value.shape[0]}, {value.shape}; send "
-            "each row by itself"
+            f"{key!r}: expected one row, got a batch of {value.shape[0]}, {value.shape}; send each "
+            "row separately"
         )
     if value.ndim == ndim + 2 and value.shape[1] > 0:
         value = value[:, -1]
@@ -348,11 +349,11 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
 def read_text(
     key: str, value: Any, texts: Mapping[str, str], limits: MessageLimits, *, needed: bool
 ) -> str | None:
-    """Return an instruction: a text, a list or array of one text, or the one of `texts` for an
-    array of one integer.
+    """Return an instruction. The value is a text, a list or array of one text, or an array of one
+    integer, which is the key of a text in `texts`.
 
-    An integer without a text is an error if the instruction is `needed`; if not, there is no
-    instruction.
+    An integer without a text is an error if the instruction is `needed`; otherwise, None is
+    returned.
     """
     while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
         value = value[0]
@@ -386,9 +387,9 @@ class KeyMapping:
     state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)
     gripper: GripperKey | None = None
     instruction: str | None = None
-    # The instructions by the integer that is sent in their place.
+    # The instruction for each integer that a client sends in its place.
     instructions: Mapping[str, str] = field(default_factory=dict)
-    info: Mapping[str, str] = field(default_factory=dict)  # all optional
+    info: Mapping[str, str] = field(default_factory=dict)  # missing values are left out
     action: Mapping[str, ActionRange] = field(default_factory=dict)
     action_gripper: tuple[ActionGripper, ...] = ()
 
@@ -439,16 +440,16 @@ class KeyMapping:
     ) -> tuple[Obs, str | None]:
         """Convert a client's observation.
 
-        An invalid gripper reading is dropped if the policy, by its contract, does not need it.
+        An invalid gripper reading is dropped if the policy's contract does not require the gripper.
 
         Returns:
-            Our observation, whose arrays may be views of those of `flat`, and its instruction; None
-            if there is none.
+            Our observation, whose arrays may be views of the arrays in `flat`, and its instruction,
+            which is None if the observation has none.
 
         Raises:
             MissingCamera, MissingState: A key is missing.
-            InvalidObservation: A value is invalid, or the mapping reads nothing of the observation,
-                or none of the cameras or none of the states in it.
+            InvalidObservation: A value is invalid, or the mapping reads nothing in the observation,
+                none of its cameras or none of its states.
         """
         cameras: dict[str, np.ndarray] = {}
         for name, camera in self.cameras.items():
@@ -480,8 +481,8 @@ class KeyMapping:
         limits: MessageLimits = DEFAULT_LIMITS,
         contract: Contract | None = None,
     ) -> str | None:
-        """Return the instruction of a client's observation, or None without one; raises
-        `InvalidObservation`.
+        """Return the instruction in a client's observation; None if there is none. Raise
+        `InvalidObservation` if it is invalid.
         """
         if self.instruction is None:
             return None
@@ -496,8 +497,8 @@ class KeyMapping:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the
         client's convention.
 
-        `spec`, the action of the policy's contract, has the policy's convention; without it, the
-        commands stay unchanged.
+        `spec`, the action of the policy's contract, contains the policy's convention; without
+        `spec`, the commands stay unchanged.
         """
         rows = np.atleast_2d(np.asarray(action, np.float32))
         if spec is None or spec.gripper_open is None or spec.gripper_closed is None:
@@ -519,21 +520,21 @@ class KeyMapping:
         return rows
 
     def actions(self, action: np.ndarray, spec: ActionSpec | None = None) -> dict[str, np.ndarray]:
-        """Return `rows` by the names that the client reads, each (H, n); as `action` if the
-        mapping names none.
+        """Return the arrays (H, n) that the client reads, by name. If the mapping has no names, all
+        columns have the name `action`.
         """
         rows = self.rows(action, spec)
         return self.columns(rows) or {"action": rows}
 
     def columns(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if
-        the mapping has none.
+        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; an empty dict
+        if the mapping has no names.
         """
         return {name: rows[..., span.start : span.stop] for name, span in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that no observation of this mapping has, each as a sentence
-        with the cure.
+        """Return a sentence, which includes the cure, for each input of the policy that this
+        mapping does not provide.
         """
         if contract is None:
             return []
@@ -575,8 +576,8 @@ class KeyMapping:
         """Log the cameras of a client's observation that the mapping does not read, and the policy
         never receives.
 
-        A message is logged once for all clients of a dialect with the same cameras. This looks at
-        each key: call it when a session begins, not for each observation.
+        A message is logged once for all clients of a dialect with the same cameras. The function
+        examines every key, so call it when a session begins, not for each observation.
         """
         unread = self._unread(flat, may_be_camera)
         if unread:
@@ -594,7 +595,7 @@ class KeyMapping:
         return keys_of_states
 
     def _gripper_keys(self) -> list[str]:
-        """Return the client's key of the gripper, if there is one."""
+        """Return a list of the client's key of the gripper, which is empty if there is none."""
         return [] if self.gripper is None else [self.gripper.key]
 
     def _unread(self, flat: Mapping[str, Any], is_relevant: Callable[[Any], bool]) -> list[str]:
@@ -614,8 +615,8 @@ class KeyMapping:
         return unread
 
     def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:
-        """Raise if `obs` has nothing of the client's observation, or none of its cameras or none
-        of its states.
+        """Raise `InvalidObservation` if `obs` contains nothing from the client's observation, none
+        of its cameras or none of its states.
         """
         camera_keys, state_keys = self._camera_keys(), self._state_keys()
         known = [*camera_keys, *state_keys, *self._gripper_keys()]
@@ -633,7 +634,8 @@ class KeyMapping:
             if unread:
                 raise InvalidObservation(
                     f"observation: expected {mapped_keys}, which the mapping reads, got {unread}; "
-                    f"add them to mapping.{kind}, or to mapping.info if the policy does without"
+                    f"add them to mapping.{kind}, or to mapping.info if the policy does not need "
+                    "them"
                 )
 
     def _opening(
