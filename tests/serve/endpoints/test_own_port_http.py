@@ -21,9 +21,11 @@ from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
 
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.client.transports import http
+from vlagents_ray.client.transports import http, websocket
 from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport
+from vlagents_ray.client.transports.websocket import WebSocketTransport
+from vlagents_ray.errors import ConnectionLost
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, MessageLimits, Request, StreamAddress
@@ -467,6 +469,101 @@ def test_the_client_uses_the_servers_port_if_another_server_has_the_own_one(
         [reply] = transport.call([Request("reset", Obs())], ANSWER_S)
         assert reply.error is None
         transport.close()
+
+
+class OwnPortWithFailures:
+    """A port in front of a replica's own one, which closes each connection without an answer to its
+    request until `fails` is cleared.
+    """
+
+    def __init__(self, behind: StreamAddress) -> None:
+        self._behind = behind
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = StreamAddress(self._listener.getsockname()[1], behind.path)
+        self.fails = threading.Event()
+        self.fails.set()
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client = self._listener.accept()[0]
+                if self.fails.is_set():
+                    with client:
+                        client.recv(1 << 20)
+                    continue
+                server = socket.create_connection(("127.0.0.1", self._behind.port))
+                for source, sink in ((client, server), (server, client)):
+                    threading.Thread(target=self._copy, args=(source, sink), daemon=True).start()
+
+    @staticmethod
+    def _copy(source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError), sink:
+            while data := source.recv(1 << 16):
+                sink.sendall(data)
+
+    def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+
+@pytest.mark.parametrize("failure", ["lost call", "firewall", "full"])
+def test_an_own_port_that_could_not_be_used_is_used_again_later_and_no_call_is_lost_for_it(
+    served_replica: Replica, failure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "AVOIDED_S", 0.2)
+    own_port = OwnPortWithFailures(served_replica.own.address)
+    with contextlib.ExitStack() as stack:
+        stack.callback(own_port.close)
+        url = stack.enter_context(at_both_ports(served_replica, own_port.address))
+        transport = HttpTransport(url, CodecChoice("raw"))
+        stack.callback(transport.close)
+        transport.connect(ANSWER_S)
+        if failure == "lost call":
+            with pytest.raises(ConnectionLost):
+                transport.call([Request("reset", Obs())], ANSWER_S)
+        elif failure == "firewall":
+            transport._own_ports.avoid_all()
+        else:
+            transport._leave_direct()
+        transport.connect(ANSWER_S)
+
+        calls = []
+
+        def call() -> bool:
+            """Return whether the call used the replica's own port."""
+            [reply] = transport.call([Request("reset", Obs())], ANSWER_S)
+            calls.append(reply.error)
+            return transport._direct is not None
+
+        begun = time.monotonic()
+        while time.monotonic() < begun + 0.6:  # at least one ping without an answer
+            assert not call()
+        own_port.fails.clear()
+        wait_for(call)
+        monkeypatch.setattr(transport, "_link", None)  # the server's port
+        assert call()
+        assert set(calls) == {None}
+
+
+def test_a_websocket_tries_an_own_port_behind_a_firewall_again_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried = []
+
+    def dropped(*_: Any) -> None:
+        tried.append(1)
+        raise TimeoutError
+
+    monkeypatch.setattr(websocket, "Stream", dropped)
+    transport = WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))
+    transport._address = StreamAddress(1, "/v1/stream/x")
+    for _ in range(2):
+        assert transport._direct(1.0) is None
+    assert len(tried) == 1
+    transport._try_own_port_at -= websocket.AVOIDED_S
+    assert transport._direct(1.0) is None
+    assert len(tried) == 2
 
 
 def test_a_session_at_the_own_port_continues_without_the_servers_port(

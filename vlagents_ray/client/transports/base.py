@@ -28,6 +28,9 @@ _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 SPIN_S = 150e-6  # s to poll for an answer before sleeping
 # s to wait for a replica's own port: a firewall may drop the packets
 DIRECT_S = 1.0
+# s for which an own port is not used after it could not be: a replica may have been restarting or
+# full, or the network down
+AVOIDED_S = 30.0
 FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is polled for
 
 # The time without an answer after which a replica is pinged, the shortest time between two pings of

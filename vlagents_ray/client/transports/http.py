@@ -3,7 +3,8 @@
 They go to the own port of the replica that the server chooses for this client, which is in the
 metadata. If that port cannot be reached (because of a firewall, a tunnel of one port, or TLS, which
 ends at the proxy), the client uses `POST /v1/<op>` on the server's port, which is slower, with a
-header that leads to the same replica.
+header that leads to the same replica. Later it pings the replica's own port, and uses it after an
+answer.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import select
 import socket
 import ssl
+import threading
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -30,6 +32,7 @@ from vlagents_ray.client.credentials import (
 )
 from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.client.transports.base import (
+    AVOIDED_S,
     DIRECT_S,
     FAST_S,
     PROBE_S,
@@ -111,8 +114,7 @@ class HttpTransport:
         self._answered_by: StreamAddress | None = None
         self._direct: _Link | None = None  # to the own port of the replica that answered
         self._direct_address: StreamAddress | None = None
-        self._failed: set[StreamAddress] = set()  # own ports that did not execute a request
-        self._unreachable = False  # whether this client cannot reach the replicas' own ports
+        self._own_ports = _OwnPorts()
         self._has_answered = False  # whether an own port has answered
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -219,8 +221,8 @@ class HttpTransport:
             path = f"/v1/{op}"
             answer = self._link.exchange("POST", path, frame, headers, left_s(deadline), probe)
             self._answered_by = _address_of_link(self._link.alternate, op)
-            if self._answered_by is not None and self._answered_by not in self._failed:
-                # The replica before this one has ended.
+            if self._answered_by is not None:
+                # The replica before this one has ended, or its own port may be used again.
                 self._set_direct(self._answered_by)
         status, kind, body = answer
         if status == 200:
@@ -234,13 +236,17 @@ class HttpTransport:
             self._direct.close()
             self._direct = self._direct_address = None
         # The port is not encrypted.
-        if address is None or self._url.scheme != "http" or self._unreachable:
+        if address is None or self._url.scheme != "http":
             return
+        if self._own_ports.may_use(address, lambda: self._own_link(address).is_alive()):
+            self._direct, self._direct_address = self._own_link(address), address
+
+    def _own_link(self, address: StreamAddress) -> _Link:
+        """Return a connection to a replica's own port, without opening it."""
         host = self._url.hostname or ""
         name = f"[{host}]" if ":" in host else host
         url = self._url._replace(netloc=f"{name}:{address.port}", path=address.path)
-        self._direct = _Link(url, self._credentials, self._watch)
-        self._direct_address = address
+        return _Link(url, self._credentials, self._watch)
 
     def _open_direct(self, timeout_s: float) -> bool:
         """Connect to the replica's own port; return False if it cannot be reached."""
@@ -249,8 +255,8 @@ class HttpTransport:
         try:
             self._direct.open(min(timeout_s, DIRECT_S))
         except NoReplica as error:
-            # A firewall drops the packets: do not try again.
-            self._unreachable = isinstance(error.__cause__, TimeoutError)
+            if isinstance(error.__cause__, TimeoutError):  # a firewall drops the packets
+                self._own_ports.avoid_all()
             self._leave_direct()
             return False
         return True
@@ -295,7 +301,8 @@ class HttpTransport:
             answer = link.exchange("POST", path, frame, headers, left_s(deadline), link.is_alive)
         except ConnectionLost:
             # The port may belong to a server of another protocol.
-            self._unreachable = not self._has_answered
+            if not self._has_answered:
+                self._own_ports.avoid_all()
             raise
         if _is_executed(answer):
             self._has_answered = True
@@ -306,7 +313,7 @@ class HttpTransport:
     def _leave_direct(self) -> None:
         """Use the server's port instead of an own port that did not execute a request."""
         if self._direct_address is not None:
-            self._failed.add(self._direct_address)
+            self._own_ports.avoid(self._direct_address)
         self._set_direct(None)
 
     def close(self) -> None:
@@ -314,6 +321,58 @@ class HttpTransport:
         self._link.close()
         if self._direct is not None:
             self._direct.close()
+
+
+class _OwnPorts:
+    """Decides which of the replicas' own ports are used.
+
+    A port that could not be used is avoided for `AVOIDED_S`, and then until a ping is answered
+    there. The ping has its own thread and connection, so that no request waits for it or is lost.
+    """
+
+    def __init__(self) -> None:
+        # The earliest time of the next ping, time.monotonic(), by port; the key None is for all.
+        self._ping_at: dict[StreamAddress | None, float] = {}
+        self._lock = threading.Lock()
+
+    def avoid(self, address: StreamAddress) -> None:
+        """Avoid a port that did not execute a request."""
+        with self._lock:
+            self._ping_at[address] = time.monotonic() + AVOIDED_S
+
+    def avoid_all(self) -> None:
+        """Avoid all ports, as this client cannot reach them."""
+        with self._lock:
+            self._ping_at[None] = time.monotonic() + AVOIDED_S
+
+    def may_use(self, address: StreamAddress, is_alive: Callable[[], bool]) -> bool:
+        """Return whether a port may be used. If a ping is due there, begin it.
+
+        Args:
+            is_alive: Pings the port; it returns whether there was an answer.
+        """
+        with self._lock:
+            avoided = [key for key in (None, address) if key in self._ping_at]
+            if not avoided:
+                return True
+            if time.monotonic() < max(self._ping_at[key] for key in avoided):
+                return False
+            for key in avoided:
+                self._ping_at[key] = float("inf")  # until this ping has ended
+        ping = partial(self._ping, avoided, is_alive)
+        threading.Thread(target=ping, name="ping", daemon=True).start()
+        return False
+
+    def _ping(self, keys: Sequence[StreamAddress | None], is_alive: Callable[[], bool]) -> None:
+        is_answered = False
+        try:
+            is_answered = is_alive()
+        finally:
+            with self._lock:
+                for key in keys:
+                    self._ping_at[key] = time.monotonic() + AVOIDED_S
+                    if is_answered:
+                        del self._ping_at[key]
 
 
 class _Link:

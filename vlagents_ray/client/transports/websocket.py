@@ -35,6 +35,7 @@ from vlagents_ray.client.credentials import (
 )
 from vlagents_ray.client.limited_websocket import LimitedWebSocket, SharedConnection
 from vlagents_ray.client.transports.base import (
+    AVOIDED_S,
     DIRECT_S,
     FAST_S,
     PROBE_S,
@@ -402,7 +403,8 @@ class WebSocketTransport:
         self._codec = codec
         self._socket: ProxiedSocket | Stream | None = None
         self._address: StreamAddress | None = None  # the address of the replica that answered
-        self._unreachable = False  # whether this client cannot reach the replicas' own ports
+        # The earliest time at which a replica's own port is tried, time.monotonic().
+        self._try_own_port_at = float("-inf")
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata, once it answers and has accepted the stream."""
@@ -462,7 +464,7 @@ class WebSocketTransport:
         return self._socket
 
     def _direct(self, timeout_s: float) -> Stream | None:
-        if self._address is None or self._unreachable:
+        if self._address is None or time.monotonic() < self._try_own_port_at:
             return None
         try:
             limit_s = min(timeout_s, DIRECT_S)
@@ -474,8 +476,8 @@ class WebSocketTransport:
                 self._credentials.headers,
                 self._watch,
             )
-        except TimeoutError:  # a firewall drops the packets: do not try again
-            self._unreachable = True
+        except TimeoutError:  # a firewall drops the packets
+            self._try_own_port_at = time.monotonic() + AVOIDED_S
         except (OSError, InvalidHandshake) as error:
             logger.debug("%s: port %d: %s", self._url, self._address.port, error)
         return None
