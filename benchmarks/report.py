@@ -46,6 +46,13 @@ Results = Mapping[str, Any]  # results of `collect`
 ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
 THROUGHPUTS = ("throughput", "without_gain")
+# The parts of the figures that may lack systems, in words before the name of a system.
+_MEASUREMENTS = {
+    "rtt": "round trips of",
+    "link": "round trips over the link of",
+    **dict.fromkeys(THROUGHPUTS, "throughput of"),
+    "evaluation": "an evaluation with",
+}
 _WAIT = "wait of a robot, p50 / p99 ms"
 LIMIT_P99 = 3.0
 LIMIT_OF_IDEAL = 0.98
@@ -399,13 +406,20 @@ def _throughput(part: Results) -> str:
 
 
 def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
+    """Yield each system that was not measured, with the measurement and the reason.
+
+    Measurements have their own names of systems, and one that lacks a system does not explain why
+    another lacks it.
+    """
     for name, reason in (results.get("skipped") or {}).items():
         yield f"{name} ({reason})"
-    found: dict[str, str] = {}
-    for part in ("rtt", "link", *THROUGHPUTS, "evaluation"):
-        found |= (results.get(part) or {}).get("skipped", {})
-    for name, reason in found.items():
-        yield f"{name} ({reason.partition(';')[0]})"  # without the cure
+    listed: set[str] = set()
+    for part, measurement in _MEASUREMENTS.items():
+        for name, reason in ((results.get(part) or {}).get("skipped") or {}).items():
+            text = f"{measurement} {name} ({reason.partition(';')[0]})"  # without the cure
+            if text not in listed:
+                listed.add(text)
+                yield text
 
 
 def show_outcomes(lines: Sequence[Outcome]) -> None:

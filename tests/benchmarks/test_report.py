@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.further_tables import FILE, read_tables, replace_rows
 from benchmarks.picture import plot_league, plot_throughput
-from benchmarks.report import DEFAULT, JPEG, outcomes, page_text, section
+from benchmarks.report import DEFAULT, JPEG, _skipped, outcomes, page_text, section
 
 ROOT = Path(__file__).parents[2]
 
@@ -222,6 +222,24 @@ def test_a_new_measurement_replaces_the_table_of_its_title(tmp_path: Path) -> No
     assert f"(`{first.command}`, 2026-12-01):\n\n| robots | ms |" in changed.to_markdown()
     with pytest.raises(KeyError, match="other"):
         replace_rows("other", [], [], "2026-12-01", file)
+
+
+def test_a_system_is_listed_once_for_each_measurement_that_lacks_it() -> None:
+    """Two parts named it differently, so that the list had it twice without a difference to see;
+    and the reason of one part replaced the reason of another.
+    """
+    one_client = {"skipped": {"LeRobot": "its server has one client"}}
+    results = {
+        "throughput": one_client,
+        "without_gain": one_client,
+        "evaluation": {"skipped": {"lerobot": "not installed; install it"}},
+        "link": {"skipped": {"LeRobot": "no route"}},
+    }
+    assert list(_skipped(results)) == [
+        "round trips over the link of LeRobot (no route)",
+        "throughput of LeRobot (its server has one client)",
+        "an evaluation with lerobot (not installed)",
+    ]
 
 
 def test_evaluations_are_judged_where_they_were_measured() -> None:
