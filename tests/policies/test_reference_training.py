@@ -126,3 +126,14 @@ def test_what_was_trained_is_served(
     assert chunk.shape == (4, 4)
     assert policy.contract.action == replace(env.contract.action, low=None, high=None)
     env.step(Act(chunk[0]))
+
+
+@pytest.mark.parametrize(
+    ("capability", "dtype"),
+    [("AVX512", torch.bfloat16), ("AVX2", torch.float32), ("DEFAULT", torch.float32)],
+)
+def test_a_processor_without_avx512_computes_in_float32(
+    train: Any, monkeypatch: pytest.MonkeyPatch, capability: str, dtype: Any
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert train.computing_dtype() == dtype
