@@ -1,4 +1,4 @@
-"""Policies, and the code that model families share.
+"""Policies, and the code that the model families share.
 
-`vlagents_ray.registry` maps the names of policies to their classes.
+`vlagents_ray.registry` maps the name of each policy to its class.
 """

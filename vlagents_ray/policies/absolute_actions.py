@@ -1,6 +1,6 @@
 """The wrapper that makes a policy's relative actions absolute.
 
-It adds the state from which a chunk was computed.
+It adds the state of the robot at the beginning of each chunk.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class AbsoluteActionsConfig(BaseModel, extra="forbid"):
 
     state: list[str] = Field(
         min_length=1,
-        description="Parts of the observation's state to which actions are relative. Together they "
-        "have one number for each relative column of an action.",
+        description="Parts of the observation's state to which actions are relative. Together, "
+        "these parts have one number for each relative column of an action.",
     )
     absolute: list[int] = Field(
         default=[],
@@ -48,17 +48,19 @@ class AbsoluteActions(Wrapper):
     merged, delayed and continued. A leftover plan, which is absolute, is made relative to the state
     of the new observation.
 
-    The checkpoints of LeRobot, openpi and GR00T have processors that do this. The wrapper is for
-    any other policy that was trained with actions relative to the state at the beginning of a
-    chunk. It is not for actions that are each relative to the pose before, such as LIBERO's.
+    The checkpoints of LeRobot, openpi and GR00T have processors that make actions absolute. The
+    wrapper is for any other policy that was trained with actions relative to the state at the
+    beginning of a chunk. It is not for policies in which each action is relative to the previous
+    pose, such as LIBERO's actions.
 
     Args:
-        agent: The policy, with whole chunks of relative actions that add up with states: joints or
-            positions.
+        agent: The policy. It returns whole chunks of relative actions whose sum with the state is
+            meaningful: joints or positions.
         config: The settings.
 
     Raises:
-        ConfigError: The policy returns rows of earlier chunks, or its actions are of another kind.
+        ConfigError: The policy returns single rows of earlier chunks, or its actions are of another
+            kind.
     """
 
     Config: ClassVar[type] = AbsoluteActionsConfig
@@ -142,7 +144,7 @@ class AbsoluteActions(Wrapper):
         return replace(obs, info={**obs.info, LEFTOVER: relative_plan})
 
     def _absolute(self, obs: Obs, act: Act) -> Act:
-        """Return an answer with the state of its observation added to all actions."""
+        """Return an answer in which the state of its observation is added to all actions."""
         origin = self._origin(obs, act.action.shape[-1])
         info = act.info
         if DISTRIBUTION in info:

@@ -1,7 +1,8 @@
-"""The stream of a policy's calls on a GPU, which has priority over pushes and loads.
+"""The CUDA stream of a policy's inference calls, which has priority over pushes of weights and over
+loading.
 
-All threads share torch's default stream, whose priority is the lowest. The kernels of an inference
-call that is queued there take turns with those of a push of weights, or of a checkpoint that is
+All threads share torch's default stream, which has the lowest priority. On that stream, the kernels
+of an inference call would alternate with the kernels of a weight push, or of a checkpoint that is
 loaded on another stream.
 """
 
@@ -19,10 +20,10 @@ T = TypeVar("T")
 
 
 class ActStream:
-    """The stream of all calls of one policy, on whichever thread."""
+    """The CUDA stream of all inference calls of one policy, on any thread."""
 
     def __init__(self, device: Any) -> None:
-        """Create the stream on a GPU, by its name or index."""
+        """Create the stream on a GPU, which is identified by name or index."""
         self._torch = sys.modules["torch"]
         self._device = device
         self._stream = self._torch.cuda.Stream(device, priority=ACT_PRIORITY)
@@ -32,8 +33,8 @@ class ActStream:
         """Return the stream of a loaded policy; None if it does not use a GPU with torch.
 
         Args:
-            report: The report of the policy, which names no device if a policy was not written for
-                it. Such a policy is assumed to use the current GPU.
+            report: The report of the policy. It contains no device if the policy does not report
+                its devices. Such a policy is assumed to use the current GPU.
         """
         torch = sys.modules.get("torch")
         if torch is None or not torch.cuda.is_initialized():
@@ -45,10 +46,11 @@ class ActStream:
 
     @contextmanager
     def selected(self) -> Iterator[None]:
-        """Queue this thread's work on the stream within the context.
+        """Queue this thread's work on the policy's stream within the context.
 
-        It begins after the work that was queued on the thread's own stream before, and later work
-        on that stream begins after it. So a policy may mix calls within and outside of the context.
+        The work begins after all work that was queued earlier on the thread's own stream, and later
+        work on the thread's own stream begins after it. A policy may therefore mix calls inside and
+        outside of the context.
         """
         outer_stream = self._torch.cuda.current_stream(self._device)
         self._wait(self._stream, outer_stream)
@@ -62,7 +64,7 @@ class ActStream:
     def _wait(later: Any, earlier: Any) -> None:
         """Let later work on one stream begin after the work that is queued on another one.
 
-        The failure of a GPU is no error here, since the calls within the context detect it.
+        A failure of the GPU is ignored here, since the calls within the context detect it.
         """
         with suppress(RuntimeError):
             later.wait_stream(earlier)

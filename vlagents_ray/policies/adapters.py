@@ -1,10 +1,11 @@
 """LoRA adapters of one network, with a separate adapter for each row of a batch.
 
 The weights of the network remain those of the base. After each linear layer that an adapter
-changes, a hook adds B[i] A[i] x to the layer's result, where i is the adapter of x's row: two small
-products for all rows of the batch, with the A and B of all adapters in one tensor each. Adapters of
-a smaller rank are padded with zeros, and rows without an adapter use one of zeros. S-LoRA (arXiv
-2311.03285) and Punica (arXiv 2310.18547) serve language models in this way.
+changes, a hook adds B[i] A[i] x to the layer's result, where i is the adapter of x's row. This
+takes two small products for all rows of the batch, since one tensor contains the A of all adapters
+and another tensor contains the B of all adapters. Adapters of a smaller rank are padded with zeros,
+and rows without an adapter use an adapter of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv
+2310.18547) serve language models in this way.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from vlagents_ray.weights.safetensors import read_values
 from vlagents_ray.weights.trainable import converted
 
 ADAPTER = "adapter"  # option of a reset: the name of the session's adapter
-DIGITS = 16  # hexadecimal digits of the fingerprint of a checkpoint
+DIGITS = 16  # number of hexadecimal digits in the fingerprint of a checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,41 +41,46 @@ class LoraAdapter:
 
     source: str = ""  # path or hub id, as in the settings
     weights: str = ""  # SHA-256 of the base's files and the adapter's
-    # The first digits of `weights`; empty if the session acts with the base alone.
+    # The first digits of `weights`; empty if the session uses the base checkpoint alone.
     fingerprint: str = ""
-    revision: str | None = None  # the hub's commit of the adapter
+    revision: str | None = None  # commit of the adapter on the hub
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Checkpoint, digest and commit, for the info of a reset; empty without an adapter."""
+        """The checkpoint, digest and commit, for the info of a reset.
+
+        It is empty without an adapter.
+        """
         if not self.fingerprint:
             return {}
         return {"checkpoint": self.source, "weights": self.weights, "revision": self.revision}
 
 
-# Index of the adapter of each row of this thread's pass, int64; None if no row has an adapter.
+# Index of the adapter of each row in this thread's forward pass, int64; None if no row has an
+# adapter.
 _CHOSEN: ContextVar[Any] = ContextVar("chosen adapters", default=None)
 
 
 class _Values(dict[str, Any]):
     """The values of one adapter by their names in its file, float32 in the memory of the host.
 
-    Setting a value also writes it, rounded, into the tensors that the forward passes read.
+    Setting a value also writes the rounded value into the tensors that the forward passes read.
     """
 
     def __init__(self, index: int) -> None:
-        self.index = index  # in the tensors of all adapters
+        self.index = index  # index of the adapter in the tensors of all adapters
         self.pushed: set[str] = set()  # names whose values a learner has pushed
         self._targets: dict[str, tuple[Any, Any, float]] = {}
 
     def read(self, name: str, value: Any, target: Any, scale: float) -> None:
-        """Set a value of the file.
+        """Set a value that was read from the file.
 
         Args:
             name: The name in the file.
             value: The value.
-            target: The tensor into which the value is written, and later those that replace it.
-            scale: The factor by which values are multiplied before that.
+            target: The tensor into which this value, and each later value that replaces it, is
+                written.
+            scale: The factor by which a value is multiplied before it is written.
         """
         self._targets[name] = value, target, scale
         self[name] = value
@@ -97,7 +103,7 @@ class LoraAdapters:
 
     def __init__(self) -> None:
         self.base = ""  # fingerprint of the base without an adapter
-        # Memory of the base that is on the host while the policy sleeps.
+        # Values of the base that are in the memory of the host while the policy sleeps.
         self.moved: list[tuple[Any, Any]] = []
         self._by_name: dict[str, LoraAdapter] = {}  # name in resets -> adapter
         # Fingerprint -> values. The base has index 0, whose values are zeros.
@@ -106,7 +112,10 @@ class LoraAdapters:
 
     @property
     def ids(self) -> dict[str, str]:
-        """The digest of each adapter with its base, by its name in resets."""
+        """The digest of each adapter together with its base.
+
+        The keys are the names used in resets.
+        """
         return {name: adapter.weights for name, adapter in self._by_name.items()}
 
     @property
@@ -129,8 +138,8 @@ class LoraAdapters:
         Args:
             network: The torch module.
             sources: Name in resets -> path or hub id of the adapter.
-            find: Returns the adapter at a source, and its folder.
-            adapt: Is called with the fingerprint and the folder of each adapter.
+            find: A function that returns the adapter at a source, and its folder.
+            adapt: A function that is called with the fingerprint and the folder of each adapter.
 
         Raises:
             ConfigError: An adapter does not fit the network.
@@ -203,10 +212,11 @@ class LoraAdapters:
         return fingerprint
 
     def weights_info(self, fingerprint: str) -> dict[str, Any]:
-        """Return the info of an answer about its weights, as long as no push has changed any.
+        """Return the info about the weights of an answer, as long as no push has changed any
+        weights.
 
-        After a push, it is empty, and the server reports the version instead. A version of a
-        learner includes all adapters, and a replica that starts later gets all of them.
+        After a push, the info is empty, and the server reports the learner's version instead. That
+        version covers all adapters, and a replica that starts later receives all of them.
         """
         if fingerprint and any(values.pushed for values in self._values.values()):
             return {}
@@ -216,7 +226,8 @@ class LoraAdapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Apply an adapter to each row of the network's passes on this thread, in the context.
+        """Within the context, apply an adapter to each row of the network's forward passes on this
+        thread.
 
         Args:
             fingerprints: The adapter of each row; empty for rows without an adapter.
@@ -237,7 +248,8 @@ class LoraAdapters:
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
         """Add the change of each row's adapter to the output of a layer.
 
-        This is a forward hook. The output has N entries, the same number for each row.
+        This is a forward hook. The first dimension of the output has the same number of entries for
+        each row.
         """
         chosen = _CHOSEN.get()
         if chosen is None:
@@ -259,15 +271,15 @@ class LoraAdapters:
 
 
 def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
-    """Return the change of a convolution's output, by the adapter of each entry.
+    """Return the change that the adapter of each entry adds to a convolution's output.
 
-    The entries are groups of one convolution, which has the other settings of the module.
+    The entries are the groups of one convolution, whose other settings are those of the module.
 
     Args:
         module: The convolution.
         x: Its input, (N, in, H, W).
-        downs: A of each of n adapters, (n, r, in, h, w).
-        ups: B of each adapter, (n, out, r).
+        downs: The matrix A of each of n adapters, (n, r, in, h, w).
+        ups: The matrix B of each adapter, (n, out, r).
         chosen: The index of the adapter of each entry, (N,).
     """
     from torch.nn.functional import conv2d
@@ -290,9 +302,9 @@ _PREFIX = "base_model.model."  # prefix of all names in the file
 _DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
 _BASE = ".base_layer."  # in the names of values of a layer with an adapter
 _LISTED = 5
-# Settings that do not change how a saved LoRA acts, or that are used below. All others must be
-# unset: they select other methods, or parts of the fine-tune that are not a low-rank change of a
-# linear layer.
+# Settings that do not change the effect of a saved LoRA, or that are used below. All other settings
+# must be unset: they select other methods, or parts of the fine-tune that are not a low-rank change
+# of a linear layer.
 _KNOWN = {
     "auto_mapping",
     "base_model_name_or_path",
@@ -320,7 +332,9 @@ _INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")
 
 
 def base_of(folder: Path) -> str | None:
-    """Return the checkpoint on which an adapter was trained; None if its settings name none."""
+    """Return the checkpoint on which an adapter was trained; None if the adapter's settings do
+    not name it.
+    """
     base = _config(folder).get("base_model_name_or_path") or None
     if base is not None and not isinstance(base, str):
         raise ConfigError(
@@ -338,9 +352,9 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
         network: The torch module that the adapter changes.
 
     Returns:
-        Name of the module of each changed layer -> A, B and the scale of B. A is (r, in), or (r,
-        in, height, width) for a convolution. B is (out, r), or (out, r, 1, 1). Both are float32 in
-        the memory of the host.
+        The name of the module of each changed layer -> A, B and the scale of B. A is (r, in), or
+        (r, in, height, width) for a convolution. B is (out, r), or (out, r, 1, 1). A and B are
+        float32 in the memory of the host.
 
     Raises:
         ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or
@@ -396,10 +410,11 @@ def _config(folder: Path) -> dict[str, Any]:
 def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> None:
     """Raise `ConfigError` unless a file contains pairs of A and B.
 
-    It may also contain values of the network, if they are unchanged: if the last layer of a
+    The file may also contain values of the network if they are unchanged: if the last layer of a
     language model has an adapter, PEFT also saves the whole layer.
     """
-    pairs: set[str] = set()  # the names of A and B of each layer of which the file has one
+    # Names of both A and B for each layer of which the file contains A or B.
+    pairs: set[str] = set()
     for key in saved:
         for suffix in (_DOWN, _UP):
             if key.endswith(suffix):
@@ -449,8 +464,8 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
 def _is_adaptable(module: Any) -> bool:
     """Return whether a module is a linear layer or a plain convolution.
 
-    The class must not be a derived one: some derived classes, as in torch's attention, are never
-    called, and only their weights are used.
+    Derived classes are excluded: modules of some derived classes, such as those in torch's
+    attention, are never called, and only their weights are read.
     """
     from torch.nn import Conv2d, Linear
 
@@ -475,13 +490,13 @@ def _layer(
 
     saved_down, saved_up = saved[f"{_PREFIX}{name}{_DOWN}"], saved[f"{_PREFIX}{name}{_UP}"]
     kinds = {saved_down.dtype.kind, saved_up.dtype.kind}
-    if not kinds <= {"f", "V"}:  # V: bfloat16, which numpy lacks
+    if not kinds <= {"f", "V"}:  # "V" is bfloat16, which numpy does not have.
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: expected real numbers, got A {saved_down.dtype} and B "
             f"{saved_up.dtype}; save the adapter without quantization"
         )
 
-    # float32, since B is scaled before it is rounded to the type of the weights.
+    # B is float32, since it is scaled before it is rounded to the type of the weights.
     down = converted(saved_down, empty(0, dtype=float32))
     up = converted(saved_up, empty(0, dtype=float32))
     outputs, *inputs = weight.shape

@@ -15,18 +15,20 @@ _COPIES = (torch.tensor, torch.as_tensor, torch.Tensor.to, torch.Tensor.cuda)
 class Capturable(TorchFunctionMode):  # type: ignore[misc]
     """A core whose later calls reuse the tensors that its first call copied from the host.
 
-    A capture may not copy from the host. The copies are the same in each call, because a core
-    depends on nothing but its arguments. They are identified by their order. A core whose first
-    call copied no elements is called directly: otherwise each operation of a capture, during which
-    acts of other policies wait, would take more time. Casts of weights by `autocast` are not
-    cached: the cache ends with its context, while the graph continues to exist.
+    Copies from the host are not allowed during a capture. The copies are the same in each call,
+    because a core depends on nothing but its arguments, so they are identified by their order. A
+    core whose first call copied no elements is called directly. Otherwise, each operation of a
+    capture would take more time, and inference calls of other policies wait during a capture. The
+    cache of `autocast` for casts of weights is disabled: it is freed at the end of the context,
+    while the graph continues to exist.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__()
         self._function, self._calls = function, 0
         self._was_called = False
-        # The results of calls of `_COPIES`; None if a call copied no elements from the host.
+        # The results of the calls of `_COPIES`. A result is None if the call copied no elements
+        # from the host.
         self._copied: list[Any] = []
 
     def __call__(self, *tensors: Any) -> Any:

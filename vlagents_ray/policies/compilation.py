@@ -1,14 +1,16 @@
 """The compilation of a model's cores, which are compared with the eager pass before they are used.
 
 A core is a function of tensors alone. The first dimension of its arguments is the batch, and their
-other dimensions are fixed. It returns such a tensor, or a tuple of them.
+other dimensions are fixed. It returns one tensor, or a tuple of tensors, with the same first
+dimension.
 
 On a GPU, a core is captured in a CUDA graph for each of a few batch sizes. The program that
-`torch.compile` makes of it, without graph breaks, is captured in a second graph, and the faster
-graph is used. On a CPU there is only torch's program. All programs are made while the policy loads.
+`torch.compile` makes from it, without graph breaks, is captured in a second graph, and the faster
+graph is used. On a CPU, only the program of `torch.compile` is made. All programs are made while
+the policy loads.
 
 A batch between two sizes is padded with copies of its last row, whose results are dropped. A batch
-without a program runs eagerly: its rows have another shape, or it is too large.
+whose rows have another shape, or that is larger than all sizes, has no program and runs eagerly.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ _TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def keep_torch_programs() -> None:
-    """Keep torch's programs in the user's cache, for the next start.
+    """Keep the programs of `torch.compile` in the user's cache, for the next start.
 
     If the user has set `TORCHINDUCTOR_CACHE_DIR`, nothing is changed. Torch writes its default,
     /tmp/torchinductor_USER, into that variable when it first needs it.
@@ -111,25 +113,26 @@ def quantize(policy: Any, kind: Quantization) -> None:
         ) from error
 
 
-ACT_PRIORITY = -1  # of the streams of acts and their graphs; that of all other streams is 0
-_WARM_UP = 3  # calls before the capture, in which libraries allocate their own memory
-_EMPTY = "CUDA Graph is empty"  # in torch's warning
+# Priority of the streams of inference calls and their graphs; all other streams have priority 0.
+ACT_PRIORITY = -1
+_WARM_UP = 3  # number of calls before the capture, in which libraries allocate their own memory
+_EMPTY = "CUDA Graph is empty"  # part of torch's warning
 
 
 class CaptureLock:
-    """Excludes forward passes and pushes of weights while this process captures a CUDA graph.
+    """Blocks forward passes and pushes of weights while this process captures a CUDA graph.
 
-    The lock itself is the context of a forward pass. A call that waits for a whole device ends any
-    capture on that device, with an error on both threads, whatever the mode of the capture. A
-    waiting capture has priority over the next forward pass. While it waits for a push, forward
-    passes continue.
+    The lock itself is the context manager of a forward pass. A call that synchronizes a whole
+    device aborts any capture on that device, with an error on both threads, whatever the mode of
+    the capture. A waiting capture has priority over the next forward pass. While it waits for a
+    push, forward passes continue.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._acting: set[int] = set()  # identifiers of threads
+        self._acting: set[int] = set()  # identifiers of the threads in forward passes
         self._capturing = False  # whether a capture runs, or waits for forward passes to end
-        # The context of a push, in which its thread may also run forward passes.
+        # The context of a push. A thread may also run forward passes within it.
         self.pushes = threading.RLock()
 
     def __enter__(self) -> None:
@@ -148,7 +151,9 @@ class CaptureLock:
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running forward passes and pushes, and block new ones in this context."""
+        """Wait for the end of running forward passes and pushes, and block new ones within this
+        context.
+        """
         if threading.get_ident() in self._acting:
             raise RuntimeError(
                 "a CUDA graph cannot be captured within an act; capture it in Agent.initialize"
@@ -179,20 +184,22 @@ class GraphMemory:
         torch = require("torch")
         self._device = device
         self.pool = torch.cuda.graph_pool_handle()
-        # Torch's own stream for captures is on the device of the first capture of the process. The
-        # kernels of a graph keep the priority of the stream.
+        # Torch's own stream for captures belongs to the device of the first capture in the process.
+        # The kernels of a graph keep the priority of the stream.
         self.stream = torch.cuda.Stream(device, priority=ACT_PRIORITY)
         self._bytes_before = self._reserved()
 
     def taken(self) -> int:
-        """Return the bytes that the process has reserved on the device since the first graph."""
+        """Return the number of bytes that the process has reserved on the device since the first
+        graph.
+        """
         return self._reserved() - self._bytes_before
 
     def _reserved(self) -> int:
         torch = require("torch")
-        # Emptying the cache would end a capture of another thread.
+        # Emptying the cache would abort a capture of another thread.
         with CAPTURES.pushes:
-            # Only memory of tensors and graphs remains reserved.
+            # Only the memory of tensors and graphs remains reserved.
             torch.cuda.empty_cache()
             return int(torch.cuda.memory_reserved(self._device))
 
@@ -213,11 +220,12 @@ class CudaGraph:
         """Capture a function.
 
         Args:
-            function: A function of tensors on one GPU, without other effects. It is kept, since the
-                graph reads its constants.
+            function: A function of tensors on one GPU, without side effects. The object keeps a
+                reference to it, since the graph reads the function's constants.
             inputs: The tensors from which each replay reads, and into which a call copies its
                 inputs.
-            memory: The memory of the policy's graphs; None allocates memory for this graph alone.
+            memory: The memory of the policy's graphs; with None, memory is allocated for this graph
+                alone.
 
         Raises:
             RuntimeError: The capture failed.
@@ -237,8 +245,9 @@ class CudaGraph:
                     function(*inputs)
             current.wait_stream(stream)
 
-            # A capture begins with a wait for the device, and empties torch's cache. Both take
-            # little time then, so that acts of other policies are blocked for the capture alone.
+            # A capture begins with a wait for the device, and empties torch's cache. After this
+            # synchronization, both take little time, so that inference calls of other policies are
+            # blocked only during the capture.
             stream.synchronize()
             with CAPTURES.pushes:
                 torch.cuda.empty_cache()
@@ -246,7 +255,8 @@ class CudaGraph:
             self._graph = torch.cuda.CUDAGraph()
             with CAPTURES.capture(), warnings.catch_warnings(record=True) as caught_warnings:
                 warnings.simplefilter("always")
-                # Other threads continue to prepare requests. Their calls must not end the capture.
+                # Other threads continue to prepare requests. Their CUDA calls must not abort the
+                # capture.
                 with torch.cuda.graph(
                     self._graph, memory.pool, stream, capture_error_mode="thread_local"
                 ):
@@ -288,7 +298,7 @@ class CudaGraph:
         return held
 
     def replay_ms(self) -> float:
-        """Replay the graph with its last inputs; return the GPU's time, milliseconds."""
+        """Replay the graph with its last inputs, and return the time on the GPU, milliseconds."""
         torch = require("torch")
         stream = torch.cuda.current_stream(self._inputs[0].device)
         begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -301,30 +311,37 @@ class CudaGraph:
 
 CompileMode = bool | Literal["auto", "graphs", "max", "require"]
 Scope = Literal["all", "parts", "wholes"]
-"""The cores that are made: all, those without parts, or those with parts."""
+"""The cores whose programs are made: all cores, cores without parts ("parts"), or cores with
+parts ("wholes").
+"""
 
 
 def uses_torch_compile(mode: CompileMode) -> bool:
-    """Return whether a mode makes programs by `torch.compile`; "auto" is not resolved to one."""
+    """Return whether a mode makes programs with `torch.compile`.
+
+    "auto" never resolves to such a mode.
+    """
     return mode not in (False, "auto", "graphs")
 
 
-# With "max", torch measures several kernels for each product and uses the fastest. It makes no CUDA
-# graphs, as a core is captured in one here.
+# With "max", torch measures several kernels for each product and uses the fastest. This mode of
+# torch makes no CUDA graphs, since this module captures each core itself.
 _MAX = "max-autotune-no-cudagraphs"
 
 
-# The error of a row of a core's result is a share of the row's norm. Compiled programs add in
-# another order, and merged kernels keep float32 where the eager pass rounds. The resulting error
-# depends on the checkpoint. It is therefore compared with the error of the eager core with smaller
-# batches and other roundings, which is measured. The errors of torch's programs were half of that.
-_ROUNDINGS = 2.0  # largest accepted error of a program, as a multiple of the measured one
-_LEAST = 1e-3  # the error that is always accepted
-# The largest error that is ever accepted, by the coarsest type in which a core computes. In
-# bfloat16, ten steps of a flow of 3.5 billion parameters differ by 0.067 from the same eager pass
+# The error of a row in a core's result is measured relative to the row's norm. Compiled programs
+# sum in another order, and merged kernels keep float32 values where the eager pass rounds. The
+# resulting error depends on the checkpoint. It is therefore compared with the measured error of the
+# eager core with smaller batches and other roundings. The errors of torch's programs were half as
+# large.
+# Largest accepted error of a program, as a multiple of the eager core's measured error.
+_ROUNDINGS = 2.0
+_LEAST = 1e-3  # error that is always accepted
+# The largest error that is ever accepted, for each coarsest type in which a core computes. In
+# bfloat16, ten steps of a flow with 3.5 billion parameters differ by 0.067 from the same eager pass
 # with fewer rows.
 TOLERANCE = {"float32": _LEAST, "float16": 1e-2, "bfloat16": 1e-1}
-_SHOWN = 300  # characters of a compiler's error in the log
+_SHOWN = 300  # number of characters of a compiler's error in the log
 # A compiled program replaces the graph of the eager core if its replay takes at most this share of
 # the time: a smaller gain may be noise, and only the graph computes as the eager pass does.
 _FASTER = 0.97
@@ -349,12 +366,14 @@ class Compilation:
                 resolved when the policy is loaded.
         """
         self.mode = mode
-        # While a core's program runs by regions: its number of rows.
+        # The number of rows of the core whose regions run their own compiled programs now,
+        # otherwise None.
         self.rows_of_regions: int | None = None
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
         self.scope: Scope = "all"  # the cores that are being made
-        # Batch sizes whose cores with parts are not made yet, from the largest to the smallest.
+        # Batch sizes for which the programs of cores with parts are not made yet, from the largest
+        # to the smallest.
         self.deferred: list[int] = []
         # The tier of the parts that a core calls; None outside of the context `parts`.
         self.tier_of_parts: str | None = None
@@ -377,15 +396,15 @@ class Compilation:
 
         Args:
             name: The core's name in messages.
-            function: The core. Its arguments are tensors on the model's device. Of all that may
-                change, it may read only the values of the model's weights.
-            rows: The largest number of rows of a call, if that does not follow from the batch size,
-                as for the candidates of a planner. The core then has one program, for that number
-                of rows. None makes a program for each batch size.
+            function: The core. Its arguments are tensors on the model's device. Apart from its
+                arguments, the only changing values that it may read are the model's weights.
+            rows: The largest number of rows of a call, if that number does not follow from the
+                batch size, as for the candidates of a planner. The core then has one program, for
+                that number of rows. None makes a program for each batch size.
             parts: The cores that the function calls. It becomes one CUDA graph with all of them. On
                 a CPU, only the parts are compiled.
-            by_regions: Whether `torch.compile` makes programs of the regions that the function
-                calls, see `region`, instead of one program of the whole function.
+            by_regions: Whether `torch.compile` makes a program of each region that the function
+                calls (see `region`), instead of one program of the whole function.
         """
         if not self.mode:
             return function
@@ -393,21 +412,23 @@ class Compilation:
         return self.cores[-1]
 
     def region(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that is compiled within programs of cores that are made by regions.
+        """Return a function that is compiled separately in cores with `by_regions`.
 
         A region is a part of a core that it calls many times with other weights, such as a layer of
-        a model. All calls with the same shapes share one program. It takes much less time to make
-        than a program of the whole core.
+        a model. All calls with the same shapes share one program. Compiling a region takes much
+        less time than compiling the whole core.
 
         Args:
-            function: The function, which has no other effects than its result. Its arguments are
-                tensors, None, and torch modules of the same structure.
+            function: The function, which has no side effects. Its arguments are tensors, None, and
+                torch modules of the same structure.
         """
         return Region(self, function) if self.mode else function
 
     @contextmanager
     def regions(self, rows: int) -> Iterator[None]:
-        """Let regions run their compiled programs in the context, for cores with this many rows."""
+        """Let regions run their compiled programs within the context, for cores with this many
+        rows.
+        """
         self.rows_of_regions = rows
         try:
             yield
@@ -415,11 +436,11 @@ class Compilation:
             self.rows_of_regions = None
 
     def compiled(self, name: str, function: Callable[..., Any], device: Any) -> Callable[..., Any]:
-        """Return torch's program for a function, which torch makes in the first call.
+        """Return the program of `torch.compile` for a function. Torch makes it in the first call.
 
         Args:
-            name: Identifies the function and its number of rows: torch limits the programs of a
-                code object to eight, and the name makes it another one.
+            name: Identifies the function and its number of rows. Torch makes at most eight programs
+                for a code object, so each name gets a separate code object.
             function: The function.
             device: The device of its arguments.
         """
@@ -432,7 +453,7 @@ class Compilation:
         options: dict[str, Any] = {}
         if self.mode == "max" and self.backend == "inductor":
             options |= torch._inductor.list_mode_options(_MAX)
-        # Before 2.8, torch cannot leave out guards. A CUDA graph of the program has none.
+        # Torch before 2.8 cannot omit guards. A CUDA graph of the program has no guards.
         has_filter = hasattr(torch.compiler, "skip_guard_on_globals_unsafe")
         if has_filter and device.type != "cuda":
             options["guard_filter_fn"] = _without_state_of_the_process
@@ -444,16 +465,17 @@ class Compilation:
     def add_size(self, size: int, forward: Callable[[], object], *, defers: bool = False) -> None:
         """Make the programs of all cores for a batch size.
 
-        Each program is compared twice with the eager pass. Sizes are added from the largest to the
-        smallest, so that the graphs of smaller sizes fit into the memory of larger ones. A core
-        whose programs all fail uses the program of the next larger size, or runs eagerly.
+        The results of each program are compared twice with the results of the eager pass. Sizes are
+        added from the largest to the smallest, so that the graphs of smaller sizes fit into the
+        memory of larger ones. A core whose programs all fail uses the program of the next larger
+        size, or runs eagerly.
 
         Args:
             size: The number of rows.
-            forward: Runs a forward pass with that many rows, and with other values each time.
-            defers: Whether graphs of cores with parts are left to `add_deferred`, since their
-                captures are long, and other policies wait for them. Until then, such a core calls
-                the programs of its parts.
+            forward: Runs a forward pass with that many rows, with different values in each call.
+            defers: Whether graphs of cores with parts are postponed until `add_deferred` is called,
+                since their captures are long, and other policies wait meanwhile. Until then, such a
+                core calls the programs of its parts.
 
         Raises:
             ConfigError: A program failed, and the mode is "require".
@@ -461,10 +483,10 @@ class Compilation:
         self._add(size, forward, "parts" if defers else "all")
 
     def add_deferred(self, forward: Callable[[int], object]) -> bool:
-        """Make the graphs that `add_size` has deferred, for one batch size.
+        """Make the graphs that `add_size` has deferred for one batch size.
 
         Args:
-            forward: Runs a forward pass with a number of rows, and with other values each time.
+            forward: Runs a forward pass with a number of rows, with different values in each call.
 
         Returns:
             Whether more sizes are left.
@@ -478,12 +500,12 @@ class Compilation:
         return bool(self.deferred)
 
     def _add(self, size: int, forward: Callable[[], object], scope: Scope) -> None:
-        """Make the programs of the cores of a scope for a batch size."""
+        """Make the programs for a batch size, for the cores in a scope."""
         began = time.monotonic()
         self.building, self.scope = size, scope
         try:
-            forward()  # This makes the programs.
-            forward()  # This compares them, after all of them were made.
+            forward()  # The first pass makes the programs.
+            forward()  # The second pass compares them after all of them were made.
         finally:
             self.building, self.scope = None, "all"
 
@@ -509,7 +531,7 @@ class Compilation:
 
     @contextmanager
     def parts(self, tier: str) -> Iterator[None]:
-        """Let cores call a tier of their parts in the context.
+        """Let cores call a tier of their parts within the context.
 
         Args:
             tier: `_GRAPH` for eager functions, or `_COMPILED` for torch's programs.
@@ -550,14 +572,14 @@ class Core:
     ) -> None:
         self.name, self._by_regions = name, by_regions
         self._owner, self._function, self._rows, self._parts = owner, function, rows, parts
-        # Number of rows -> tier -> program; after `settle` there is one tier.
+        # Number of rows -> tier -> program; only one tier remains after `settle`.
         self._programs: dict[int, dict[str, Any]] = {}
         # Number of rows -> shapes and types of the rows of each argument.
         self._kinds: dict[int, list[Any]] = {}
         self._compiled: dict[int, Callable[..., Any]] = {}  # number of rows -> torch's program
         # Inputs of the graph with the most rows; other graphs read their first rows.
         self._graph_inputs: list[Any] = []
-        # Failures at the batch size whose programs are being made.
+        # The failures at the batch size whose programs are being made.
         self._failures: list[str] = []
 
     def __call__(self, *tensors: Any) -> Any:
@@ -565,7 +587,7 @@ class Core:
         if not owner.mode or (self._parts and tensors[0].device.type != "cuda"):
             return self._function(*tensors)
 
-        # The program of another core, of which this core is a part, is being made.
+        # The program of another core, which calls this core as a part, is being made.
         if owner.tier_of_parts is not None:
             if owner.tier_of_parts == _COMPILED:
                 return self._compiled[rows](*map(_of_one_kind, tensors))
@@ -589,16 +611,18 @@ class Core:
         return results if isinstance(result, tuple) else results[0]
 
     def hold(self, number: int, tensor: Any) -> Any:
-        """Return a large argument of coming calls in memory from which their CUDA graph reads.
+        """Return a large argument of later calls as a tensor from which the CUDA graph reads
+        directly.
 
-        The caller may change it between these calls, which then do not copy it.
+        These calls do not copy the argument, and the caller may change its values between them.
 
         Args:
             number: The index of the argument.
             tensor: The argument.
 
         Returns:
-            A tensor with its values, to be passed in its place; without a graph, the tensor itself.
+            A tensor with the same values, which the caller passes instead of the argument; without
+            a graph, the argument itself.
         """
         size = self._size_for(len(tensor)) if self._owner.mode else None
         if size is None or self._owner.building is not None:
@@ -617,14 +641,16 @@ class Core:
         owner = self._owner
         sizes = owner.sizes if self._rows is None else [self._rows]
         if self._parts and owner.deferred:
-            # The graph of a larger size would take longer than the parts of this one.
+            # The graph of a larger size would take longer than the parts of this size.
             fitting_size = next((size for size in sizes if size >= rows), None)
             if fitting_size in owner.deferred:
                 return None
         return next((size for size in sizes if size >= rows and size in self._programs), None)
 
     def _is_made_now(self) -> bool:
-        """Return whether the core belongs to those that are being made, or note its deferral."""
+        """Return whether the core's program is made now; if it is deferred, record the batch
+        size.
+        """
         owner = self._owner
         if owner.scope == "parts" and self._parts:
             if owner.building is not None and owner.building not in owner.deferred:
@@ -633,7 +659,7 @@ class Core:
         return owner.scope != "wholes" or bool(self._parts)
 
     def tier(self, size: int) -> str | None:
-        """Return the tier of the program of a batch size; None if it has none."""
+        """Return the tier of the program for a batch size; None if there is no program."""
         return next(iter(self._programs.get(self._rows or size, ())), None)
 
     def drop_graphs(self) -> None:
@@ -646,12 +672,15 @@ class Core:
         self._graph_inputs.clear()
 
     def settle(self, size: int) -> list[str]:
-        """Keep the fastest program of a batch size; return the reasons for which others failed."""
+        """Keep the fastest program for a batch size, and return the reasons why other programs
+        failed.
+        """
         size = self._rows or size
         failures, self._failures = self._failures, []
         programs = self._programs.get(size, {})
         if len(programs) > 1:
-            # Both are graphs. They alternate, so that other work on the GPU slows both.
+            # Both programs are graphs. Their replays alternate, so that other work on the GPU slows
+            # both equally.
             graph, compiled = programs.values()
             graph_ms = compiled_ms = math.inf
             for _ in range(_REPLAYS):
@@ -670,7 +699,7 @@ class Core:
         return failures
 
     def _compared(self, tensors: Sequence[Any]) -> Any:
-        """Make the programs, keep those whose results are correct, and return the eager result."""
+        """Make the programs, keep the ones with correct results, and return the eager result."""
         eager_result, size = self._function(*tensors), len(tensors[0])
         is_first = size not in self._programs
         if is_first:
@@ -701,7 +730,7 @@ class Core:
         return eager_result
 
     def _tiers(self, size: int, device: Any) -> list[str]:
-        """Return the tiers of which programs are made for a batch size."""
+        """Return the tiers for which programs of a batch size are made."""
         tiers = [_GRAPH] if device.type == "cuda" else []
         are_parts_compiled = all(_COMPILED in core._programs.get(size, ()) for core in self._parts)
         if self._owner.mode != "graphs" and are_parts_compiled:
@@ -711,9 +740,9 @@ class Core:
     def _limit(self, tensors: Sequence[Any], eager_result: Any) -> float:
         """Return the largest error that a correct program may have on these inputs.
 
-        It is measured with the eager core, which runs with the first and the second half of the
-        batch and with other roundings. Smaller batches alone often change nothing, since the same
-        kernels compute each row in the same way.
+        It is measured with the eager core, which runs with each half of the batch and with other
+        roundings. Smaller batches alone often change nothing, since the same kernels compute each
+        row in the same way.
         """
         from vlagents_ray.policies.rounding import OtherRounding
 
@@ -732,8 +761,9 @@ class Core:
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
 
-        It is made with other values than those of the comparison. A CUDA graph that has missed some
-        of the core's work would otherwise return correct results there: those of its capture.
+        The program is made with values that differ from the values of the comparison. Otherwise, a
+        CUDA graph that missed some of the core's work would pass the comparison, since it would
+        return the results of its capture.
         """
         function, owner = self._function, self._owner
         size, device = len(tensors[0]), tensors[0].device
@@ -754,7 +784,8 @@ class Core:
     def _inputs(self, tensors: Sequence[Any]) -> list[Any]:
         """Return zeros of these shapes.
 
-        They use the memory of the inputs of larger graphs, if those have the same rows.
+        The zeros use the memory of the inputs of larger graphs, if the rows of these inputs have
+        the same shape and type.
         """
         size = len(tensors[0])
         fits = (
@@ -767,7 +798,7 @@ class Core:
         return [graph_input[:size].zero_() for graph_input in self._graph_inputs]
 
     def _program(self, tensors: Sequence[Any]) -> Callable[..., Any]:
-        """Return torch's program for tensors of these shapes."""
+        """Return the program of `torch.compile` for tensors of these shapes."""
         owner, size, device = self._owner, len(tensors[0]), tensors[0].device
         if self._by_regions:
 
@@ -786,7 +817,7 @@ class Region:
 
     def __init__(self, owner: Compilation, function: Callable[..., Any]) -> None:
         self._owner, self._function = owner, function
-        self._programs: dict[int, Callable[..., Any]] = {}  # number of the core's rows -> program
+        self._programs: dict[int, Callable[..., Any]] = {}  # number of rows of the core -> program
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         rows = self._owner.rows_of_regions
@@ -800,7 +831,7 @@ class Region:
 
 
 def held(core: Callable[..., Any], number: int, tensor: Any) -> Any:
-    """Return an argument of coming calls of a core, see `Core.hold`.
+    """Return an argument of later calls of a core, see `Core.hold`.
 
     Args:
         core: The result of `Compilation.core`.
@@ -811,11 +842,11 @@ def held(core: Callable[..., Any], number: int, tensor: Any) -> Any:
 
 
 def _without_state_of_the_process(guards: Sequence[Any]) -> list[bool]:
-    """Return which of a program's guards are kept: all except that of the process's state.
+    """Return which of a program's guards are kept: all except the guard of the process's state.
 
-    transformers sets torch's default dtype, for all threads, while it builds a model. Otherwise an
-    action meanwhile would make its program again, which takes seconds, and would fail if the dtype
-    changed back before the program was made.
+    While transformers builds a model, it sets torch's default dtype for all threads. With this
+    guard, an inference call at that time would compile its program again, which takes seconds, and
+    would fail if the dtype changed back before the end of the compilation.
     """
     return [guard.guard_type != "GLOBAL_STATE" for guard in guards]
 
@@ -823,8 +854,8 @@ def _without_state_of_the_process(guards: Sequence[Any]) -> list[bool]:
 def _of_one_kind(tensor: Any) -> Any:
     """Return a tensor of the kind for which programs are made.
 
-    It is contiguous, and it is an inference tensor only if the argument is one. `torch.compile`
-    makes another program for tensors of another kind.
+    It is contiguous, and it is an inference tensor only if the argument is one. For tensors of
+    another kind, `torch.compile` would make another program.
     """
     return tensor.contiguous() if tensor.is_inference() else tensor.clone().contiguous()
 
@@ -843,7 +874,7 @@ def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
 
 
 def _each(result: Any) -> Sequence[Any]:
-    """Return the tensors of a core's result, which is a tensor or a tuple of them."""
+    """Return the tensors of a core's result, which is a tensor or a tuple of tensors."""
     return result if isinstance(result, tuple) else (result,)
 
 

@@ -1,13 +1,14 @@
-"""Flow matching in random steps, so that an action chunk has a log-probability (Flow-SDE).
+"""Flow matching with random steps, which gives an action chunk a log-probability (Flow-SDE).
 
 The steps of a flow from noise to actions are deterministic, and the density of its actions is not
-known. A stochastic differential equation has the same marginal distributions at each time (Song et
-al. 2021, arXiv 2011.13456). With it, each step is a normal distribution, and the steps are a Markov
-chain whose log-probability is a sum. Learners that fine-tune flows use it: Flow-GRPO (arXiv
-2505.05470), from which the noise schedule is taken, and πRL (arXiv 2510.25889).
+known. A stochastic differential equation with the same marginal distributions at each time exists
+(Song et al. 2021, arXiv 2011.13456). With this equation, each step is drawn from a normal
+distribution, and the steps are a Markov chain whose log-probability is a sum. Learners that
+fine-tune flows use this chain: Flow-GRPO (arXiv 2505.05470), whose noise schedule is used here, and
+πRL (arXiv 2510.25889).
 
-Flow time is that of openpi: 1 is noise, 0 is the actions, and the velocity is noise minus actions.
-The functions accept arrays of any library, and are differentiable in it.
+Flow time follows openpi: 1 is noise, 0 is the actions, and the velocity is noise minus actions. The
+functions accept arrays of any library, which can differentiate them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
-OFFERED = ("logprob", "entropy", "replay")  # outputs of chunks from random steps
+OFFERED = ("logprob", "entropy", "replay")  # outputs of a chunk that was computed in random steps
 _LOG_2_PI = math.log(2 * math.pi)
 
 
@@ -44,7 +45,7 @@ def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *chang
             in (0, 1].
         noise: The actions at time 1.
         steps: The number of steps.
-        changes: Applied to the velocity of each step, one after another.
+        changes: Functions that are applied to the velocity of each step, in this order.
     """
     actions = noise
     for step in range(steps):
@@ -64,8 +65,8 @@ def normal_logprob(values: Any, mean: Any, std: float) -> Any:
 def step_std(step: int, steps: int, noise_level: float) -> float:
     """Return the standard deviation of each value after a step.
 
-    For the noise level a and the time t = 1 - step / steps, it is a * sqrt(t / (1 - t) / steps).
-    In the first step, 1 - t would be 0, and the value of the second step is used for it.
+    For the noise level a and the time t = 1 - step / steps, it is a * sqrt(t / (1 - t) / steps). In
+    the first step, 1 - t would be 0, so the value of 1 - t from the second step is used.
     """
     return noise_level * math.sqrt((steps - step) / max(step, 1) / steps)
 
@@ -84,7 +85,7 @@ def step_mean(actions: Any, velocity: Any, step: int, steps: int, noise_level: f
         The mean, (B, H, D).
     """
     time = 1.0 - step / steps
-    noise = actions + (1.0 - time) * velocity  # as the model estimates it
+    noise = actions + (1.0 - time) * velocity  # estimates of the model
     variance = step_std(step, steps, noise_level) ** 2
     return actions - velocity / steps - variance / (2.0 * time) * noise
 
@@ -96,7 +97,7 @@ def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_le
         velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time
             in (0, 1].
         chain: The noisy actions before and after each step, (B, K + 1, H, D), in the model's units:
-            `replay["chain"]` of B answers or samples.
+            the values of `replay["chain"]` of B answers or samples.
         noise_level: `replay["noise_level"]`.
 
     Returns:
@@ -127,7 +128,7 @@ class RandomSteps:
     """The random steps of the rows of a batch for which outputs are requested.
 
     The other rows keep their velocity. Each row draws from the generator of its session, so that
-    the other rows of a batch do not matter. Arrays are torch tensors.
+    the other rows of a batch have no influence. Arrays are torch tensors.
     """
 
     def __init__(
@@ -141,7 +142,8 @@ class RandomSteps:
 
         Args:
             rows: The rows of the batch.
-            shape: The number of steps, of rows of a chunk and of values of a row, (K, H, D).
+            shape: The number of steps, the number of rows of a chunk, and the number of values of a
+                row, (K, H, D).
             noise_level: As for `step_mean`.
             convert: Makes a tensor on the model's device from an array.
         """
@@ -153,7 +155,7 @@ class RandomSteps:
         self._index = convert(np.array(list(self._wants)))
         # Noisy actions (E, H, D) before the first step and after each step.
         self._chain: list[Any] = []
-        self._means: list[Any] = []  # means of the noisy actions after each step
+        self._means: list[Any] = []  # mean of the noisy actions after each step
 
     @classmethod
     def for_rows(
@@ -179,7 +181,7 @@ class RandomSteps:
         drawn = mean + step_std(step, self._steps, self._level) * self._draws[step]
         change = (before - drawn) * self._steps
         self._chain = self._chain or [before]
-        # Computed as `follow` computes the actions, so that the rounding is the same.
+        # This repeats the computation of `follow`, so that the rounding is the same.
         self._chain.append(before - change / self._steps)
         self._means.append(mean)
         return velocity.index_copy(0, self._index, change.to(velocity.dtype))
@@ -192,11 +194,11 @@ class RandomSteps:
             dim: The number of values of an action that are the robot's; None uses all.
 
         Returns:
-            Index of the row -> name of the output -> value.
+            The index of the row -> name of the output -> value.
         """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
-        # Make a single copy from the device, for which this thread waits.
+        # Copy all values from the device at once, since this thread waits for each copy.
         *chain, all_logprobs = fetch(require("torch").stack([*self._chain, total]))
         logprobs = all_logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprobs[0].size
@@ -217,13 +219,14 @@ class RandomSteps:
 class Guide:
     """The plan that each chunk of a batch follows, as arrays of the model's library."""
 
-    plan: Any  # (B, H, D) in the model's units, i.e. normalised; zeros where there is no plan
+    plan: Any  # (B, H, D) in the model's normalised units; zeros where there is no plan
     frozen: Any  # (B, H, 1), 1.0 for rows that will have been executed, otherwise 0.0
     weight: Any  # (B, H, 1) in [0, 1], how closely a later row follows the plan
 
     @classmethod
     def for_rows(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
-        """Return the guide from the rows' `delay` and `leftover`, in the model's units.
+        """Return the guide that follows from the `delay` and the `leftover` of rows in the model's
+        units.
 
         Returns:
             The guide; None if no row has a leftover plan.
@@ -254,11 +257,11 @@ class Guide:
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
     def insert_frozen(self, noise: Any) -> Any:
-        """Return noise (B, H, D) in which the frozen rows are those of the plan.
+        """Return noise (B, H, D) in which rows of the plan replace the frozen rows.
 
-        This is for policies that were trained with prefixes. They read these rows as actions, at
-        flow time 0 (`frozen` of `FlowPasses.sample`), and continue them without a correction
-        (training-time action conditioning, https://arxiv.org/abs/2512.05964).
+        This is for policies that were trained with prefixes. Such policies read these rows as
+        actions, at flow time 0 (`frozen` of `FlowPasses.sample`), and continue them without a
+        correction (training-time action conditioning, https://arxiv.org/abs/2512.05964).
         """
         return self.frozen * self.plan + (1.0 - self.frozen) * noise
 
@@ -284,8 +287,8 @@ class Guide:
             actions: The noisy actions, (B, H, D).
             time: The flow time.
             noise: The noise with which the flow began, (B, H, D).
-            steps: The number of steps. It limits the gain, since with that gain a single step
-                reaches the plan.
+            steps: The number of steps. The gain is limited to this number, since a single step with
+                that gain already reaches the plan.
             limit: The largest gain of the correction.
             lower: Returns the smaller of two numbers, for libraries whose `time` is not a plain
                 number.
@@ -297,9 +300,10 @@ class Guide:
 
 
 class FlowPasses(abc.ABC):
-    """The forward passes of a model: one over its inputs, and one for each step of the flow.
+    """The forward passes of a model: one pass over its inputs, and one pass for each step of the
+    flow.
 
-    The steps may also be compiled as one pass.
+    All steps may also be compiled as one pass.
     """
 
     # Whether each layer is compiled as a separate region, see `Compilation.region`.
@@ -308,14 +312,15 @@ class FlowPasses(abc.ABC):
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Create the forward passes of a model, compiled where possible."""
         self.model = model
-        self.adapters = LoraAdapters()  # adapters of the policy
-        # The module that defines the model, which has the functions of its authors' passes.
+        self.adapters = LoraAdapters()  # the adapters of the policy
+        # The module that defines the model, with the functions that its authors use in their
+        # forward passes.
         self.module = sys.modules[type(model).__module__]
         self._compilation = compilation
         regions = self.by_regions
         self._encode = compilation.core("encode", self.encode, by_regions=regions)
         self._velocity = compilation.core("velocity", self._step, by_regions=regions)
-        self._flows: dict[int, Callable[..., Any]] = {}  # number of steps -> whole flow
+        self._flows: dict[int, Callable[..., Any]] = {}  # number of steps -> core of the whole flow
         self.by_row = False  # whether `velocity` accepts a time for each row of a chunk, (B, H)
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
@@ -330,18 +335,18 @@ class FlowPasses(abc.ABC):
 
         Args:
             tokens: The tokens of the instruction, (P, T) int64.
-            mask: Whether each of these tokens is no padding, (P, T) bool.
+            mask: Whether each token is a token of the instruction, not padding, (P, T) bool.
             cameras: Whether each image is present, (P, N) bool.
             state: The state vector, (P, S).
             images: The results of `encode_images` for the N images.
 
         Returns:
-            The keys and values, or whatever else `velocity` reads of the inputs; and the mask of
-            the tokens that are present, (P, L).
+            The keys and values, or other features of the inputs that `velocity` reads; and the mask
+            of the tokens that are present, (P, L).
         """
 
     def constants(self, encoded: Any, present: Any, state: Any, horizon: int) -> tuple[Any, ...]:
-        """Compute, once for each flow, the inputs that are the same in all of its steps.
+        """Compute the inputs that are the same in all steps of a flow.
 
         Args:
             encoded: The first result of `encode`, for B rows.
@@ -350,21 +355,19 @@ class FlowPasses(abc.ABC):
             horizon: The number of rows of a chunk, H.
 
         Returns:
-            Tensors whose first dimension is B, for `velocity`. These are the arguments, unless the
-            model has others.
+            Tensors whose first dimension is B, for `velocity`. By default, these are the arguments.
         """
         return encoded, present, state
 
     def at_times(self, times: Any) -> Any:
-        """Compute, once for each flow, what its steps need of their flow times.
+        """Compute the features of the flow times of all steps of a flow.
 
         Args:
             times: The flow times of the K steps, (B, K); or (B, K, H) with `by_row`. Without
                 `by_row` they are the same for all rows.
 
         Returns:
-            A tensor (B, K, …), of which step k gets `[:, k]`. These are the times, unless the model
-            has something else.
+            A tensor (B, K, …). Step k receives `[:, k]`. By default, these are the times.
         """
         return times
 
@@ -375,12 +378,12 @@ class FlowPasses(abc.ABC):
         Args:
             constants: The result of `constants`.
             actions: The noisy actions, (B, H, D).
-            times: The result of `at_times` for this step: unless the model has something else, the
-                flow times (B,), or (B, H) with `by_row`.
+            times: The result of `at_times` for this step. By default, these are the flow times
+                (B,), or (B, H) with `by_row`.
         """
 
     def _step(self, *tensors: Any) -> Any:
-        """Return the velocity; this is the core of one step, whose arguments are tensors alone."""
+        """Return the velocity. This is the core of one step, with tensors as its only arguments."""
         *constants, actions, times = tensors
         return self.velocity(constants, actions, times)
 
@@ -403,9 +406,9 @@ class FlowPasses(abc.ABC):
             inputs: The first five arguments of `sample`.
             owners: The index of the observation of each row.
             noise: The noise of each row, (B, H, D). It is drawn before the noise of the steps,
-                which only some rows draw.
+                which is drawn for only some of the rows.
             steps: The number of steps.
-            config: Defines `noise_level`, `guidance` and `execute` of the policy.
+            config: The policy's settings, with `noise_level`, `guidance` and `execute`.
             dim: The number of values of an action that are the robot's; None uses all.
             convert: Makes a tensor on the model's device from an array.
 
@@ -469,10 +472,10 @@ class FlowPasses(abc.ABC):
             steps: The number of steps of the flow.
             changes: See `follow`.
             fingerprints: The adapter of each row, see `Row.adapter`; empty if no row has one.
-            frozen: With `by_row`, 1.0 for the rows of chunks that are already actions, at time 0,
-                otherwise 0.0, (B, H, 1).
-            states: The states of a memory, which LeRobot's π0.5 passes since 0.6.1. It is None,
-                since models with a memory are rejected.
+            frozen: With `by_row`, 1.0 for the rows of chunks that are already actions, at flow time
+                0, and 0.0 for other rows, (B, H, 1).
+            states: The states of a memory, an argument that LeRobot's π0.5 passes since 0.6.1. It
+                is None, since models with a memory are rejected.
             state_masks: As `states`.
         """
         torch = require("torch")
@@ -499,7 +502,7 @@ class FlowPasses(abc.ABC):
             return flow(encoded, present, state, noise)
 
     def _whole_flow(self, steps: int) -> Callable[..., Any]:
-        """Return the flow without changes, whose steps are one core."""
+        """Return the core of the whole flow, without changes of the velocity."""
         if steps not in self._flows:
             function = partial(self._flow, steps, (), None)
             self._flows[steps] = self._compilation.core("flow", function, parts=[self._velocity])
@@ -517,7 +520,7 @@ class FlowPasses(abc.ABC):
     ) -> Any:
         """Return actions (B, H, D).
 
-        Without changes, whose values differ for each batch, this function is a core.
+        Without changes, this function is a core. The values of changes differ for each batch.
         """
         torch = require("torch")
         constants = self.constants(encoded, present, state, noise.shape[1])
@@ -526,12 +529,12 @@ class FlowPasses(abc.ABC):
         times_of_steps = []
         for step in range(steps):
             times = noise.new_full(shape, 1.0 - step / steps, dtype=torch.float32)
-            # Frozen rows are actions already, at time 0.
+            # Frozen rows are already actions, at flow time 0.
             times_of_steps.append(times if frozen is None else times * (1.0 - frozen[..., 0]))
         at_times = self.at_times(torch.stack(times_of_steps, 1))
 
         def velocity(actions: Any, time: float) -> Any:
-            """Return the velocity at the time of a step."""
+            """Return the velocity at the flow time of a step."""
             step = round((1.0 - time) * steps)
             return self._velocity(*constants, actions, at_times[:, step])
 

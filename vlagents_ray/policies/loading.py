@@ -25,27 +25,28 @@ class LoadingReport:
 
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the batch sizes of the server, ascending
-    # Whether other policies of the process act meanwhile, see `DefersLoading`.
+    # Whether other policies of the process compute actions meanwhile, see `DefersLoading`.
     beside_acts: bool = False
     # Parts that run without compilation, although `compile` is set.
     uncompiled: list[str] = field(default_factory=list)
     # Descriptions of the models' devices, see `accelerator.torch_device`.
     devices: list[dict[str, Any]] = field(default_factory=list)
-    row_limit: RowLimit = field(default_factory=RowLimit)  # of a forward pass, by its memory
+    # Rows of a forward pass that fit into memory.
+    row_limit: RowLimit = field(default_factory=RowLimit)
     # Whether the policy pads batches to its sizes, so that the server does not pad them.
     pads: bool = False
-    # Number of rows of a forward pass -> its shortest duration so far, s.
+    # The number of rows of a forward pass -> the shortest duration so far, s.
     pass_s: dict[int, float] = field(default_factory=dict)
     # Called whenever a forward pass does not fit into memory, also after loading.
     on_out_of_memory: Callable[[], None] = lambda: None
     # Called with the time of each forward pass on a GPU.
     on_gpu_ms: Callable[[float], None] = lambda _: None
-    # Returns the context of a forward pass.
+    # A function that returns the context of a forward pass.
     timer: Callable[[], AbstractContextManager[None]] = nullcontext
 
     @property
     def accelerated(self) -> bool:
-        """Whether a model computes on another device than a CPU."""
+        """Whether a model runs on a device other than a CPU."""
         return any(device["kind"] != "cpu" for device in self.devices)
 
 

@@ -1,4 +1,4 @@
-"""A policy that does nothing, in an adjustable time, to measure everything around a policy."""
+"""A policy that returns zeros after an adjustable time, to measure the overhead around a policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 
 class NoopConfig(BaseModel, extra="forbid"):
-    """Size of the zero action, and latency of the simulated model."""
+    """The size of the zero action, and the latency of the simulated model."""
 
     action_dim: int = Field(default=7, ge=1, description="number of action values, D")
     delta: bool | None = Field(

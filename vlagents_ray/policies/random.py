@@ -1,4 +1,4 @@
-"""A policy of uniformly random actions, as a lower bound for the success of others."""
+"""A policy of uniformly random actions, as a lower bound for the success of other policies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act, Agent, Obs
 
 
 class RandomConfig(BaseModel, extra="forbid"):
-    """Bounds and size of the actions; `seed` is mixed with the seed of each episode."""
+    """The bounds and size of the actions. `seed` is mixed with the seed of each episode."""
 
     action_dim: int = Field(default=7, ge=1, description="number of action values, D")
     chunk: int = Field(
@@ -45,7 +45,7 @@ class Random(Agent):
     def __init__(self, config: RandomConfig | None = None) -> None:
         self.config = config or RandomConfig()
         self._rng: np.random.Generator | None = None
-        # The generator of samples, so that requesting them changes no action.
+        # The generator of samples, separate so that requesting samples changes no action.
         self._draws: np.random.Generator | None = None
 
     @property
@@ -58,8 +58,8 @@ class Random(Agent):
         )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""
-        # Numpy accepts no negative seed; each int64 has a distinct number modulo 2**64.
+        """Begin an episode with the seed `kwargs["seed"]` (an int, by default 0)."""
+        # Numpy accepts no negative seed. Modulo 2**64, distinct int64 values remain distinct.
         seeds = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
         self._rng = np.random.default_rng(seeds)
         self._draws = np.random.default_rng([*seeds, 1])

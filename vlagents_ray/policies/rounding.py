@@ -1,8 +1,9 @@
-"""The same computation with other rounding errors, to measure the numerical noise of a checkpoint.
+"""A repetition of a computation with other rounding errors, to measure the numerical noise of a
+checkpoint.
 
-This is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16
-bits is changed by a random fraction of its last digit. Another order of sums, or another kernel,
-changes it by a similar amount.
+This is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each 16-bit
+result is changed by a random fraction of its last digit. Another order of summation, or another
+kernel, changes a result by a similar amount.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ _ROUNDED = (torch.float16, torch.bfloat16)
 
 
 class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
-    """A context in which results of 16 bits are rounded differently.
+    """A context in which 16-bit results are rounded differently.
 
-    It has its own random generators, so that those of the process are not changed.
+    It has its own random generators, so that the process's generators are not changed.
     """
 
     def __init__(self) -> None:
@@ -30,7 +31,8 @@ class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
     def run(self, function: Callable[..., Any], *tensors: Any) -> Any:
         """Return the function's result.
 
-        Casts of weights by `autocast` are not cached, since they are also rounded differently.
+        The cache of `autocast` for casts of weights is disabled, since casts are also rounded
+        differently.
         """
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)
@@ -49,7 +51,7 @@ class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         if any(returned.alias_info is not None for returned in func._schema.returns):
-            return result  # a view, or an operation in place
+            return result  # The result is a view, or the operation changed a tensor in place.
         if isinstance(result, tuple | list):
             return type(result)(map(self._rounded, result))
         return self._rounded(result)
@@ -63,7 +65,7 @@ class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
         device = result.device
         if device not in self._generators:
             self._generators[device] = torch.Generator(device).manual_seed(0)
-        # In place, since a result may take a large part of the memory.
+        # The result is changed in place, since it may occupy a large part of the memory.
         factors = torch.rand(result.shape, generator=self._generators[device], device=device)
         factors.sub_(0.5).mul_(torch.finfo(result.dtype).eps).add_(1)
         return factors.mul_(result).to(result.dtype)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 # Time without an error after which more rows are tried, s. A shortage often ends within a minute,
-# as that while another checkpoint is loaded.
+# for example while another checkpoint is loaded.
 FIRST_WAIT_S = 60.0
 LONGEST_WAIT_S = 3600.0
 
@@ -16,8 +16,8 @@ LONGEST_WAIT_S = 3600.0
 class RowLimit:
     """A limit that falls when memory is exhausted, and rises again when some time has passed.
 
-    An attempt with more rows that fails delays one batch. So the wait doubles with each failure
-    that follows a rise.
+    A failed attempt with more rows delays one batch. The waiting time therefore doubles with each
+    failure that follows a rise.
     """
 
     rows: int | None = None  # None if memory has not been exhausted yet
@@ -27,7 +27,7 @@ class RowLimit:
     _has_risen: bool = False  # whether the last change was a rise
 
     def lower(self, rows: int) -> None:
-        """Set a smaller limit, since the memory was exhausted."""
+        """Set a smaller limit after memory was exhausted."""
         now = self.clock()
         if self._has_risen and now - self._changed_s < self._wait_s:
             self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
@@ -39,8 +39,8 @@ class RowLimit:
         """Double the limit if enough time has passed since it changed.
 
         Args:
-            most: The largest number of rows by the settings.
-            sizes: The only numbers of rows to use, ascending; empty if any may be used.
+            most: The largest number of rows that the settings permit.
+            sizes: The only permitted numbers of rows, ascending; empty if any number is permitted.
 
         Returns:
             Whether the limit has changed.

@@ -1,4 +1,4 @@
-"""A policy of scripted experts, which solve the simulators' tasks without learning."""
+"""A policy that uses scripted experts, which solve the simulators' tasks without learning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vlagents_ray.registry import named_class
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Settings of `Scripted`: the env if a client names none, and the user's expert."""
+    """Settings of `Scripted`: the env for clients that name no env, and the user's expert."""
 
     task: str | None = Field(
         default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'"
@@ -25,7 +25,9 @@ class ScriptedConfig(BaseModel, extra="forbid"):
 
 
 class Scripted(Agent):
-    """Chooses an expert for each session by the name of its env (see `policies.experts`)."""
+    """Chooses the expert of each session according to the session's env (see
+    `policies.experts`).
+    """
 
     Config: ClassVar[type] = ScriptedConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
@@ -41,7 +43,7 @@ class Scripted(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of the env `kwargs["env"]`, or of the config's `task`."""
-        self._expert = None  # the previous episode's expert must not act if this fails
+        self._expert = None  # if the reset fails, the previous episode's expert must not be used
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(

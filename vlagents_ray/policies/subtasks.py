@@ -1,4 +1,4 @@
-"""The wrapper with which a policy follows the subtasks of a planner, in place of the instruction of
+"""The wrapper that makes a policy follow the subtasks of a planner instead of the instruction of
 its episode.
 """
 
@@ -16,10 +16,10 @@ from vlagents_ray.policies.wrapper import Wrapper
 class Subtasks(Wrapper):
     """Resets a session of the policy whenever `subtask` in the info of its observations changes.
 
-    The new subtask is the instruction of that reset, whose options are those of the episode. So a
-    policy that reads an instruction only at its reset follows a planner
-    (`vlagents_ray.robot.planner`). It forgets the observations before, and observations without a
-    subtask change nothing.
+    The new subtask is the instruction of that reset, and the options of the reset are the options
+    of the episode. A policy that reads the instruction only at a reset can therefore follow a
+    planner (`vlagents_ray.robot.planner`). The reset deletes the policy's memory of earlier
+    observations. An observation without a subtask changes nothing.
 
     Args:
         agent: The policy.

@@ -36,9 +36,10 @@ class Wrapper(Agent):
     """
 
     repeatable: ClassVar[bool] = False
-    """Whether `change_batch` may change an observation twice, and on any thread: it reads nothing
-    that another observation sets, and takes little time. Then observations are prepared through
-    the wrapper (`vlagents_ray.abilities.Prepares`).
+    """Whether `change_batch` may be called twice with an observation, on any thread: its result
+    depends on no other observation, and the call takes little time.
+
+    If so, observations are prepared through the wrapper (`vlagents_ray.abilities.Prepares`).
     """
 
     def __init__(self, agent: Agent, config: Any = None) -> None:
@@ -64,7 +65,9 @@ class Wrapper(Agent):
             raise ConfigError(f"wrapper {cls.__name__}: {message}") from error
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Begin an episode with its first observation, and return that of the inner agent."""
+        """Begin an episode with its first observation, and return the first observation for the
+        inner agent.
+        """
         return obs
 
     def change_batch(
@@ -91,14 +94,15 @@ class Wrapper(Agent):
         return [*super().shared_objects(), *self.agent.shared_objects()]
 
     def forwarded(self, protocol: type[T]) -> T | None:
-        """Return an ability of the inner agent, whose observations the wrapper changes.
+        """Return an ability of the inner agent that receives the observations changed by the
+        wrapper.
 
         Args:
             protocol: The protocol of the ability.
 
         Returns:
-            The inner agent's ability; None if it has none, or if the wrapper would have to change
-            an observation twice for it, but is not `repeatable`.
+            The inner agent's ability; None if the inner agent does not have it, or if it requires
+            changing an observation twice and the wrapper is not `repeatable`.
         """
         inner = ability(self.agent, protocol)
         if inner is None or type(self).change_batch is Wrapper.change_batch:
@@ -119,7 +123,7 @@ class Wrapper(Agent):
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Change the observations, and compute the inner agent's actions.
 
-        Observations that could not be changed have an exception as their result.
+        The result for an observation that could not be changed is an exception.
         """
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         inner_sessions = []
@@ -138,8 +142,8 @@ class Wrapper(Agent):
 
 
 class _ChangesObservations:
-    """An ability of the inner agent of a wrapper, with the methods of its protocol, whose
-    observations the wrapper changes.
+    """An ability of a wrapper's inner agent, with the methods of its protocol, that receives
+    changed observations.
     """
 
     def __init__(self, wrapper: Wrapper, inner: Any, protocol: type) -> None:
@@ -163,17 +167,17 @@ class _ChangesObservations:
 
 
 def unwrapped(agent: Agent) -> Agent:
-    """Return the policy in all of its wrappers."""
+    """Return the policy inside all of its wrappers."""
     while isinstance(agent, Wrapper):
         agent = agent.agent
     return agent
 
 
 def require_trainable(agent: Agent) -> Trainable:
-    """Return an agent's ability to get new weights.
+    """Return an agent's ability to receive new weights.
 
     Raises:
-        NotTrainable: It has none.
+        NotTrainable: The agent does not have this ability.
     """
     trainable = ability(agent, Trainable)
     if trainable is None:
@@ -246,7 +250,7 @@ def _wrapped(agent: Agent, entry: str | Mapping[str, Mapping[str, Any]]) -> Wrap
 
 
 def _example_of(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> str:
-    """Return the end of an error message: where to find examples of missing settings.
+    """Return the end of an error message, which tells where to find examples of missing settings.
 
     Returns:
         A sentence that names a file and a page; empty if `config` lacks no setting.
@@ -268,7 +272,9 @@ def _example_of(policy: str, cls: type[Agent], config: Mapping[str, Any]) -> str
 
 
 def unloaded_contract(agent: Agent) -> Contract | None:
-    """Return the contract of a policy that is not loaded; None if it is known only later."""
+    """Return the contract of a policy before it is loaded; None if the contract is known only
+    after loading.
+    """
     try:
         return agent.contract
     except Exception:  # noqa: BLE001 - a policy may raise any error before `initialize`

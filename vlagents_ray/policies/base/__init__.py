@@ -1,4 +1,6 @@
-"""The common parts of model families: settings, checkpoints, sessions with chunked actions."""
+"""The common parts of the model families: settings, checkpoints, and sessions with action
+chunks.
+"""
 
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import Row, shared_frames

@@ -25,18 +25,19 @@ from vlagents_ray.policies.loading import LoadingReport, report_device
 from vlagents_ray.registry import require
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"  # set by Ray in a process that has GPUs
-# Variable with the share of its GPU's memory that a process may use; all of it if it is not set.
+# Environment variable with the share of the GPU's memory that a process may use. If it is not set,
+# the process may use all memory.
 GPU_SHARE = "VLAGENTS_RAY_GPU_SHARE"
 
-# The oldest driver for each major version of CUDA:
+# The oldest driver that supports each major version of CUDA:
 # https://docs.nvidia.com/deploy/cuda-compatibility/minor-version-compatibility.html
 OLDEST_DRIVERS = {12: 525, 13: 580}
 _DRIVER = Path("/proc/driver/nvidia/version")
-# Messages of errors of torch, JAX and ONNX Runtime. The classes of these errors differ between
+# Error messages of torch, JAX and ONNX Runtime. The classes of these errors differ between
 # versions.
 _EXHAUSTED = re.compile(
     r"out of memory|ALLOC_FAILED|ALLOCATION_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED"
-    # ONNX Runtime, without and with a limit of its memory
+    # The messages of ONNX Runtime without and with a memory limit
     r"|Failed to allocate memory|Available memory of \d+ is smaller than requested",
     re.IGNORECASE,
 )
@@ -48,14 +49,14 @@ _GPU_ERROR = re.compile(
 
 
 def torch_device(name: str = "auto") -> Any:
-    """Return the `torch.device` of a name.
+    """Return the `torch.device` with a name.
 
     Args:
-        name: A name of torch, or "auto". "auto" selects a GPU, or the CPU if this process was given
-            no GPU and torch finds none.
+        name: A device name of torch, or "auto". "auto" selects a GPU, or the CPU if Ray assigned no
+            GPU to this process and torch finds none.
 
     Raises:
-        ConfigError: There is no such device, or torch cannot use it.
+        ConfigError: The device does not exist, or torch cannot use it.
     """
     share = _limit_jax()
     torch = require("torch")
@@ -75,7 +76,8 @@ def torch_device(name: str = "auto") -> Any:
             "a GPU with resources: {num_gpus: 1}"
         ) from error
 
-    # `torch.__version__` is of a class of torch, which a process without torch cannot unpickle.
+    # `torch.__version__` is an instance of a class of torch, which a process without torch cannot
+    # unpickle.
     version = str(torch.__version__)
     described = {"kind": device.type, "device": str(device), "torch": version}
     if device.type == "cuda":
@@ -98,7 +100,7 @@ def _limit_jax() -> float:
     By default, JAX allocates three quarters of the memory at once, even if torch uses the same GPU.
 
     Returns:
-        This process's share of the memory; 0 if it has no limit.
+        The share of the memory that this process may use; 0 if it has no limit.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     share = os.environ.get(GPU_SHARE, "")
@@ -108,7 +110,7 @@ def _limit_jax() -> float:
 
 
 def _given_gpus() -> str:
-    """Return the GPUs that this process was given; empty if none was."""
+    """Return the GPUs that Ray assigned to this process; empty if there are none."""
     visible = os.environ.get(VISIBLE, "")
     return "" if visible in ("-1", "NoDevFiles") else visible
 
@@ -123,7 +125,9 @@ def _unusable(library: str, reason: str) -> ConfigError:
 
 
 def driver_version() -> str | None:
-    """Return the version of NVIDIA's driver, such as "580.65.06"; None if it is not known."""
+    """Return the version of NVIDIA's driver, such as "580.65.06"; None if the version is
+    unknown.
+    """
     with suppress(OSError):
         driver = re.search(r"Kernel Module\s+(?:for \S+\s+)?([\d.]+)", _DRIVER.read_text())
         return driver and driver[1]
@@ -137,9 +141,9 @@ def driver_version() -> str | None:
 
 
 def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
-    """Return the `torch.dtype` of a name.
+    """Return the `torch.dtype` with a name.
 
-    "auto" is `preferred` on an accelerator, and float32 on a CPU.
+    "auto" selects `preferred` on an accelerator, and float32 on a CPU.
     """
     torch = require("torch")
     usual = "float32" if device.type == "cpu" else preferred
@@ -147,16 +151,16 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
 
 
 def jax_device(name: str = "auto") -> Any:
-    """Return the JAX device of a name.
+    """Return the JAX device with a name.
 
     After this call, the programs that JAX compiles for an accelerator are kept for the next start.
 
     Args:
         name: A platform of JAX, such as "gpu" or "gpu:1", or "auto". "auto" selects the first
-            device, which is a CPU only if this process was given no GPU.
+            device, which may be a CPU only if Ray assigned no GPU to this process.
 
     Raises:
-        ConfigError: There is no such device, or JAX cannot use it.
+        ConfigError: The device does not exist, or JAX cannot use it.
     """
     _limit_jax()
     jax = require("jax")
@@ -225,12 +229,12 @@ def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
 
 
 def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
-    """Set the precision of float32 products and convolutions of this process.
+    """Set the precision of this process's float32 matrix products and convolutions.
 
     Args:
         precision: The precision.
-        device: The description of the device, to which the precision is added. Nothing is changed
-            for a CPU.
+        device: The description of the device, to which the precision is added. For a CPU, nothing
+            is changed.
     """
     if device["kind"] == "cpu" or "onnxruntime" in device:
         return
@@ -248,23 +252,23 @@ def fetch(tensor: Any) -> np.ndarray:
     """Wait until a tensor is computed, and return it as an array.
 
     Meanwhile, other threads can use the GPU to prepare the next batch or to load weights. The
-    method `Tensor.cpu` would copy to pageable memory, during which each of their CUDA calls waited
-    for all work on the GPU (torch 2.11, H200).
+    method `Tensor.cpu` would copy to pageable memory. During such a copy, each CUDA call of another
+    thread waited for all work on the GPU (torch 2.11, H200).
     """
     if tensor.device.type != "cuda":
         return np.asarray(tensor.cpu())
-    on_host = tensor.to("cpu", non_blocking=True)  # to pinned memory
+    on_host = tensor.to("cpu", non_blocking=True)  # copies to pinned memory
     require("torch").cuda.current_stream(tensor.device).synchronize()
     return np.asarray(on_host)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error reports that the memory of an accelerator is exhausted."""
+    """Return whether an error means that the memory of an accelerator is exhausted."""
     return _is_from_runtime(error) and bool(_EXHAUSTED.search(str(error)))
 
 
 def is_device_failure(error: BaseException) -> bool:
-    """Return whether an error reports a failure of an accelerator, other than exhausted memory.
+    """Return whether an error means a failure of an accelerator, other than exhausted memory.
 
     Such failures are permanent: after an illegal access, or the loss of the device, each further
     call in the process fails.
@@ -285,7 +289,7 @@ def _is_from_runtime(error: BaseException) -> bool:
 
 
 def free_memory() -> None:
-    """Free memory immediately.
+    """Free the memory of deleted objects immediately.
 
     Agents often contain reference cycles, and torch caches the GPU memory that it has allocated.
     """
@@ -294,9 +298,9 @@ def free_memory() -> None:
 
 
 def empty_cache() -> None:
-    """Return GPU memory that torch caches to the device, for other processes.
+    """Release the GPU memory that torch caches, so that other processes can use it.
 
-    JAX keeps its memory.
+    JAX never releases its memory.
     """
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
@@ -307,11 +311,12 @@ def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Return the memory of this process's GPUs.
 
     Args:
-        devices: Descriptions of devices, of which those of this process are used.
+        devices: Descriptions of devices. Devices of other processes are ignored.
 
     Returns:
-        Bytes that are "allocated" for values, "reserved" and "free". It is empty if this process
-        uses no GPU, for example if the policy runs in a child process, which reports its own.
+        The numbers of bytes that are "allocated" for values, "reserved" and "free". The result is
+        empty if this process uses no GPU, for example if the policy runs in a child process, which
+        reports its own memory.
     """
     memory: Counter[str] = Counter()
     torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
@@ -324,7 +329,7 @@ def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def _torch_memory(cuda: Any, device: str) -> dict[str, int]:
-    """Return the memory of a device of torch, of which this process may use a share."""
+    """Return the memory of a torch device, limited to the share that this process may use."""
     reserved = cuda.memory_reserved(device)
     free, total = cuda.mem_get_info(device)
     share = float(os.environ.get(GPU_SHARE) or 1)
@@ -337,7 +342,7 @@ def _torch_memory(cuda: Any, device: str) -> dict[str, int]:
 
 
 def _jax_memory(jax: Any, name: str) -> dict[str, int]:
-    """Return the memory of a device of JAX."""
+    """Return the memory of a JAX device."""
     device = next(device for device in jax.local_devices() if str(device) == name)
     stats = device.memory_stats() or {}
     used = stats.get("bytes_in_use", 0)
@@ -346,10 +351,10 @@ def _jax_memory(jax: Any, name: str) -> dict[str, int]:
 
 
 def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None]]:
-    """Return a context for each forward pass of a policy, which measures its time on a GPU.
+    """Return a context manager that measures the GPU time of each forward pass of a policy.
 
-    The time is reported when the next pass begins, so that nothing waits for the GPU. It spans from
-    the first operation to the last one, gaps included.
+    The time is reported when the next pass begins, so that no thread waits for the GPU. It extends
+    from the first operation to the last one and includes gaps between operations.
     """
     cuda = require("torch").cuda if "torch" in sys.modules else None
     gpus = [device for device in report.devices if device["kind"] == "cuda"]
@@ -362,7 +367,9 @@ def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None
 
     @contextmanager
     def timer() -> Iterator[None]:
-        """Record the begin and the end of a pass, after reporting the time of the previous one."""
+        """Report the time of the previous pass, then record the beginning and the end of this
+        one.
+        """
         nonlocal timed
         if timed and end.query():
             report.on_gpu_ms(begin.elapsed_time(end))
@@ -376,7 +383,9 @@ def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None
 
 
 def ensure_torchvision() -> None:
-    """Make torchvision importable with a CPU-only torch, for which PyPI has no build of it."""
+    """Make torchvision importable with a CPU-only torch, for which PyPI has no build of
+    torchvision.
+    """
     import_fixes.install()
     if importlib.util.find_spec("torchvision") is not None:
         importlib.import_module("torchvision")

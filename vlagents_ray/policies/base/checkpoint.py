@@ -24,7 +24,8 @@ log = logging.getLogger(__name__)
 STEP = "{step}"  # the placeholder in a checkpoint's name
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _INDEX = ".safetensors.index.json"
-# Compared elements of each tensor: enough to distinguish trained weights from random ones.
+# Number of compared elements of each tensor, enough to distinguish trained weights from random
+# ones.
 _COMPARED = 64
 _LISTED = 8
 
@@ -41,7 +42,7 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 def used_checkpoints() -> Iterator[list[Path]]:
     """Yield a list of the paths that `find_checkpoint` finds in this context.
 
-    If a path is inside of an earlier one, it replaces that one.
+    A path inside of an earlier path replaces the earlier path.
     """
     paths: list[Path] = []
     token = _used.set(paths)
@@ -95,11 +96,11 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 def _holds(folder: Path, path: Path) -> bool:
     """Return whether a path is in a folder, or is the folder itself.
 
-    Links are followed, such as a link `last` to a step.
+    Links are followed, such as a link `last` to the folder of a training step.
     """
     if not folder.is_dir():
         return False
-    # A file in the hub's cache is a link to a file outside of its folder.
+    # A file in the hub's cache is a link to a file outside of the link's folder.
     resolved = (path.resolve(), path.parent.resolve() / path.name)
     return any(folder.resolve() in (target, *target.parents) for target in resolved)
 
@@ -111,7 +112,7 @@ def find_adapter(
 
     Args:
         source: The adapter's path or hub id.
-        checkpoint: The name of the policy's checkpoint, the base.
+        checkpoint: The name of the policy's checkpoint, which is the base of the adapter.
         base: The files and folders of the base.
         digest_of_base: Their digest.
 
@@ -156,8 +157,8 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
         base: The files and folders of that checkpoint.
         digest_of_base: Their digest.
     """
-    # Unlike the methods of Path, os.path raises neither for unknown users nor for folders that
-    # are not visible here.
+    # Unlike the methods of Path, functions of os.path raise no error for unknown users or for
+    # unreadable folders.
     path = Path(os.path.expanduser(trained_on))
     if os.path.exists(path):
         folders_of_base: set[Path] = set()
@@ -173,7 +174,7 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
 
 
 def _beside(path: Path) -> str:
-    """Return what the nearest existing folder above a missing path contains, for a message."""
+    """Return a text that lists the contents of the nearest existing folder above a missing path."""
     parent = next((folder for folder in path.parents if folder.is_dir()), Path("/"))
     names = sorted(entry.name for entry in parent.iterdir())
     shown = ", ".join(names[:_LISTED]) + (" …" if len(names) > _LISTED else "")
@@ -191,7 +192,8 @@ def _from_hub(name: str) -> Path:
 
     try:
         path = Path(hub.snapshot_download(repository, revision=commit or None))
-    except Exception as error:  # of many classes: no such id, no access, no network, offline mode
+    # The error may be of many classes: unknown id, no access, no network, offline mode.
+    except Exception as error:
         if type(error).__name__ == "RevisionNotFoundError":
             raise ConfigError(
                 f"checkpoint {name!r}: expected a commit, a branch or a tag of {repository}, got "
@@ -216,14 +218,16 @@ def _revisions(hub: Any, repository: str) -> str:
 
 
 class SavedTensors:
-    """The tensors of a checkpoint on disk by name; a tensor is read when it is accessed."""
+    """The tensors of a checkpoint on disk by name. Each tensor is read when it is accessed."""
 
     def __init__(self, readers: Mapping[str, Callable[[], Any]]) -> None:
         self._readers = readers
 
     @classmethod
     def open(cls, path: Path) -> SavedTensors:
-        """Open a .safetensors file, or a folder with one, or with several and their index."""
+        """Open a .safetensors file, or a folder with one such file, or with several files and
+        their index.
+        """
         files = [path] if path.is_file() else _safetensors(path)
         readers: dict[str, Callable[[], Any]] = {}
         for file in files:
@@ -261,11 +265,11 @@ def _safetensors(folder: Path) -> list[Path]:
 def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
     """Check that a model has the values of its checkpoint.
 
-    Some libraries continue with random weights if they cannot load those of the checkpoint. The
-    result looks like a bad policy, and is hard to diagnose.
+    Some libraries continue with random weights if they cannot load the weights of the checkpoint.
+    The result looks like a bad policy, and is hard to diagnose.
 
-    The names and shapes of all parameters and saved buffers are compared, and 64 elements of each
-    tensor, in the model's dtype. A parameter that is tied to another one may be missing.
+    The check compares the names and shapes of all parameters and saved buffers, and 64 elements of
+    each tensor in the model's dtype. A parameter that is tied to another parameter may be missing.
     """
     torch = require("torch")
     saved_names = set(saved)
@@ -298,8 +302,9 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
 def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
     """Load a model with transformers, `cls.from_pretrained(path, **options)`.
 
-    Since version 5, transformers renames parameters when it reads them. `require_loaded` compares
-    names, and cannot check such models. Instead, transformers reports parameters without values.
+    Since version 5, transformers renames parameters when it reads them. `require_loaded`, which
+    compares names, cannot check such models. The check uses the parameters without values that
+    transformers reports.
     """
     try:
         model, loading_info = cls.from_pretrained(path, output_loading_info=True, **options)
@@ -324,7 +329,7 @@ def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
 def require_filled(params: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Check that nested parameters have exactly the expected names and shapes.
 
-    This check is for JAX, whose loaders return only values from the checkpoint.
+    This check is for JAX models, whose loaders return only values from the checkpoint.
     """
     have, want = dict(_leaves(params)), dict(_leaves(expected))
     absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))
@@ -350,7 +355,7 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _same(torch: Any, have: Any, want: Any) -> bool:
-    """Return whether two tensors have the same shape and equal elements, in a sample of them."""
+    """Return whether two tensors have the same shape, and equal elements in a sample."""
     if have.shape != want.shape:
         return False
 

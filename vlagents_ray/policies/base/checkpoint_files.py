@@ -21,7 +21,8 @@ from typing import Any, BinaryIO
 from vlagents_ray.abilities import HasWeightsId, ability
 from vlagents_ray.interface import Agent
 
-# Names that trainers give to unfinished files: orbax' folders, and the usual suffixes.
+# Names that training programs use for unfinished files: the folders of orbax, and the usual
+# suffixes.
 TEMPORARY = (
     "*.orbax-checkpoint-tmp*",
     "*.tmp",
@@ -33,25 +34,25 @@ TEMPORARY = (
     ".tmp*",
 )
 
-# Suffixes of files without weights, which are often written before the weights.
+# Suffixes of files that contain no weights. Such files are often written before the weights.
 _TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")
 
 METHOD = "sampled-sha256"
 _WHOLE = 2**20  # bytes; a file up to this size is read in full
-_BLOCK, _BLOCKS = 4096, 256  # bytes of a block, and the number of blocks
-_LONGEST_HEADER = 10**8  # bytes; the limit of safetensors
+_BLOCK, _BLOCKS = 4096, 256  # bytes of a sampled block, and the number of blocks
+_LONGEST_HEADER = 10**8  # largest header that safetensors permits, bytes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-# Files about a checkpoint, which do not affect its behaviour.
+# Documentation files of a checkpoint, which do not affect its behaviour.
 _BESIDE = (".md", ".gitattributes", ".log")
 
 
 def unfinished(path: Path) -> str | None:
     """Return why a checkpoint is incomplete.
 
-    A .safetensors file must have the length in its header. An index may name only existing files.
-    JSON must be valid. A zip file, as written by torch.save, must end with its directory. A folder
-    must contain weights. Other kinds of files are not checked: the caller must also check that they
-    no longer grow.
+    A .safetensors file must have the length that its header specifies. All files that an index
+    names must exist. JSON must be valid. A zip file, as written by torch.save, must end with its
+    directory. A folder must contain weights. Other kinds of files are not checked: the caller must
+    also check that they no longer grow.
 
     Args:
         path: A file or a folder.
@@ -80,7 +81,9 @@ def unfinished(path: Path) -> str | None:
 
 
 def _trouble(file: Path) -> str | None:
-    """Return why a file is incomplete, by the check for its suffix; None if it passes."""
+    """Return why a file is incomplete, according to the check for its suffix; None if the file
+    passes.
+    """
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
@@ -90,7 +93,9 @@ def _trouble(file: Path) -> str | None:
 
 
 def _safetensors(file: Path) -> str | None:
-    """Return why a .safetensors file is incomplete; None if it has the length in its header."""
+    """Return why a .safetensors file is incomplete; None if it has the length that its header
+    specifies.
+    """
     size = file.stat().st_size
     with file.open("rb") as opened:
         length = int.from_bytes(opened.read(8), "little")
@@ -102,9 +107,10 @@ def _safetensors(file: Path) -> str | None:
 
 
 def _data_offsets(header: bytes) -> list[tuple[int, int]]:
-    """Return start and end of each tensor's bytes after the header (JSON) of a .safetensors file.
+    """Return the start and the end of each tensor's bytes in a .safetensors file, relative to the
+    end of the JSON header.
 
-    The file begins with 8 bytes, the length of the header.
+    The first 8 bytes of the file are the length of the header.
     """
     entries = json.loads(header)
     entries.pop("__metadata__", None)
@@ -112,20 +118,20 @@ def _data_offsets(header: bytes) -> list[tuple[int, int]]:
 
 
 def _index(file: Path) -> str | None:
-    """Return which files an index names that do not exist; None if there are none."""
+    """Return which files of an index do not exist, as a message; None if all exist."""
     names = set(json.loads(file.read_text(encoding="utf-8"))["weight_map"].values())
     absent = sorted(name for name in names if not (file.parent / name).is_file())
     return f"names {absent}, which are missing" if absent else None
 
 
 def _json(file: Path) -> str | None:
-    """Return None; raises `ValueError` if the file is not JSON."""
+    """Return None if the file is valid JSON; otherwise raise `ValueError`."""
     json.loads(file.read_text(encoding="utf-8"))
     return None
 
 
 def _zip(file: Path) -> str | None:
-    """Return why a file of torch.save is incomplete; None if nothing shows that."""
+    """Return why a file of torch.save is incomplete; None if nothing shows that it is."""
     with file.open("rb") as opened:
         first_bytes = opened.read(4)
     if not first_bytes:
@@ -151,10 +157,11 @@ def identify_weights(agent: Agent, paths: Sequence[Path]) -> dict[str, Any] | No
 
     Args:
         agent: The policy, after `initialize`.
-        paths: The files and folders that it has found meanwhile.
+        paths: The files and folders that the policy found while it was initialized.
 
     Returns:
-        The policy's own `HasWeightsId.weights_id`, or that of the files; None if there is neither.
+        The `HasWeightsId.weights_id` of the policy if it has one, otherwise the identity of the
+        files; None if there are no files.
     """
     has_id = ability(agent, HasWeightsId)
     return (has_id.weights_id if has_id is not None else None) or weights_of(paths)
@@ -163,8 +170,8 @@ def identify_weights(agent: Agent, paths: Sequence[Path]) -> dict[str, Any] | No
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
     """Return the identity of a policy's files, as `HasWeightsId` describes it.
 
-    The digest covers all files. The revision is that of the first path, since the others, such as
-    that of an encoder, may come from another repository.
+    The digest covers all files. The revision is the commit of the first path, since other paths,
+    such as the path of an encoder, may come from another repository.
 
     Args:
         paths: Files and folders; the first one is the policy's checkpoint.
@@ -184,10 +191,10 @@ def digest(paths: Iterable[Path]) -> str:
     file, and some of its content. The files of a folder are sorted by name.
 
     - A file of at most 1 MiB is read in full.
-    - Of a larger .safetensors file, the header and 4 KiB in the middle of each tensor are read.
-    - Of a zip file, as written by torch.save, the directory is read, which has the CRC-32 of each
-      entry.
-    - Of any other file, 256 blocks of 4 KiB at equal distances are read.
+    - From a larger .safetensors file, the header and 4 KiB in the middle of each tensor are read.
+    - From a zip file, as written by torch.save, the directory is read, which contains the CRC-32 of
+      each entry.
+    - From any other file, 256 blocks of 4 KiB at equal distances are read.
 
     Therefore, different weights, statistics or settings have different digests, but a deliberate
     change of a few bytes may not be noticed. Hidden files and READMEs are not covered.
@@ -196,7 +203,7 @@ def digest(paths: Iterable[Path]) -> str:
     for path in paths:
         for file in files_in(path):
             name = file.name if file == path else file.relative_to(path).as_posix()
-            # A file that cannot be read, or is gone, was not loaded.
+            # A file that cannot be read or no longer exists was not loaded.
             with contextlib.suppress(OSError):
                 size = file.stat().st_size
                 sha256.update(json.dumps([name, size]).encode())
@@ -228,10 +235,10 @@ def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
 
     Args:
         folder: The folder.
-        above: The real paths of its parents, which are not entered again.
+        above: The real paths of the folder's parents, which are not entered again.
     """
     within = above | {os.path.realpath(folder)}
-    with contextlib.suppress(OSError):  # The folder cannot be read, or is gone.
+    with contextlib.suppress(OSError):  # The folder cannot be read or no longer exists.
         for entry in list(folder.iterdir()):
             if entry.name.startswith((".", "__pycache__")):
                 continue

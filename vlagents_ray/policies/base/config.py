@@ -1,4 +1,7 @@
-"""The settings of all model families; each family adds its own and narrows these."""
+"""The settings that all model families share.
+
+Each family adds settings and restricts the values of these.
+"""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
 """Fixes for torchvision and LeRobot if their wheels do not fit this machine, applied when they are
 imported.
 
-PyPI's torchvision for Linux is compiled against CUDA. Its operators do not load beside a CPU-only
-torch, and `import torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an
+PyPI's torchvision for Linux is compiled against CUDA. Its operators do not load with a CPU-only
+torch, so `import torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an
 installed FFmpeg, or with torchvision's `VideoReader`, which newer versions lack. If the wheels fit,
 nothing is changed.
 
-`vlagents-ray venv create` copies this file, which imports nothing of this package, into the
-environments that it makes, with a `.pth` file that calls `install`, so that LeRobot's own commands
+This file imports nothing of this package. `vlagents-ray venv create` copies it into each
+environment that it makes, with a `.pth` file that calls `install`, so that LeRobot's own commands
 also work there.
 """
 
@@ -27,12 +27,12 @@ from typing import Any
 Execute = Callable[[ModuleType], None]
 
 log = logging.getLogger(__name__)
-_operators: list[Any] = []  # operators live as long as the object that defined them
+_operators: list[Any] = []  # operators exist as long as the object that defined them
 
 
 def install() -> None:
     """Fix later imports of torchvision and of LeRobot's `video_utils`; imports nothing itself."""
-    # By name, since an environment also has a copy of this file.
+    # The class is compared by name, since an environment also has a copy of this file.
     names = {type(finder).__name__ for finder in sys.meta_path}
     if _Finder.__name__ not in names:
         sys.meta_path.insert(0, _Finder())
@@ -44,9 +44,8 @@ class _Finder:
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return the spec of a module of `_FIXES`, whose loader applies the fix.
-
-        It is None for any other module.
+        """Return the spec of a module of `_FIXES`, with a loader that applies the fix; None for any
+        other module.
         """
         fix = _FIXES.get(name)
         if fix is None:
@@ -62,7 +61,7 @@ class _Finder:
 def _torchvision(execute: Execute, module: ModuleType) -> None:
     """Declare the missing operators that the import looks up.
 
-    Calls of them still raise an error.
+    Calling such an operator still raises an error.
     """
     torch = importlib.import_module("torch")
     try:
@@ -73,7 +72,7 @@ def _torchvision(execute: Execute, module: ModuleType) -> None:
     else:
         return
 
-    # Remove what the failed import left behind.
+    # Remove the partly imported modules of the failed import.
     submodules = [name for name in sys.modules if name.startswith("torchvision.")]
     for name in submodules:
         del sys.modules[name]
@@ -122,7 +121,7 @@ def decode_frames(
     *_: object,
     **__: object,
 ) -> Any:
-    """Return the frames that are nearest to some timestamps, s.
+    """Return the frames that are nearest to the given timestamps, s.
 
     This replaces LeRobot's `decode_video_frames_torchvision`.
 
@@ -130,7 +129,8 @@ def decode_frames(
         (N, 3, H, W) float32 in [0, 1].
 
     Raises:
-        ValueError: LeRobot's `FrameTimestampError`: a frame is `tolerance_s` or more away.
+        ValueError: LeRobot's `FrameTimestampError`: a timestamp is `tolerance_s` or more from its
+            nearest frame.
     """
     av, np, torch = (importlib.import_module(name) for name in ("av", "numpy", "torch"))
 
@@ -138,7 +138,7 @@ def decode_frames(
     with av.open(str(video_path)) as container:
         stream = container.streams.video[0]
         first = max(0.0, min(timestamps) - tolerance_s)
-        # Decoding begins at the key frame at or before that time.
+        # Decoding begins at the last key frame that is not after that time.
         container.seek(int(first / stream.time_base), stream=stream)
         for frame in container.decode(stream):
             frames.append(frame)

@@ -23,31 +23,33 @@ T = TypeVar("T")
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part of the state that is 1 - `Obs.gripper`
-KEPT = 256  # number of cached instructions with their tokens, which is more than a server needs
-# Longest cached instruction, characters. Clients choose them; the cache needs about 10 MB at most.
+KEPT = 256  # number of instructions whose tokens are cached, more than a server needs
+# Longest instruction that is cached, characters. Since clients choose the instructions, this limits
+# the cache to about 10 MB.
 KEPT_CHARACTERS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One chunk to compute: the answer to a session, or a sample of its distribution."""
+    """One chunk to compute: the answer to a session, or a sample of the answer's distribution."""
 
     # The results of `ModelPolicy.perceive` for the last observations, oldest first.
     frames: tuple[Any, ...]
     instruction: str
-    rng: np.random.Generator  # the session's, so that other rows have no influence
-    # (H', D) float32, real-time chunking: see LEFTOVER in the interface.
+    rng: np.random.Generator  # generator of the session, so that other rows have no influence
+    # The leftover plan of real-time chunking, (H', D) float32: see LEFTOVER in the interface.
     leftover: np.ndarray | None = None
-    # The number of the chunk's first rows that are those of the leftover: see DELAY.
+    # The number of rows at the beginning of the chunk that are equal to the leftover: see DELAY.
     delay: int = 0
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # The session's memory, for families that store more than frames.
     memory: dict[str, Any] = field(default_factory=dict)
     want: tuple[str, ...] = ()  # requested outputs of the chunk, from the contract's `behaviour`
-    # Whether the chunk is drawn from the distribution, as samples and requested outputs need it;
-    # otherwise it is the likeliest one.
+    # Whether the chunk is drawn from the distribution, which samples and requested outputs require.
+    # Otherwise, the most likely chunk is computed.
     sample: bool = False
-    # Fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty without an adapter.
+    # The fingerprint of the session's adapter, empty without an adapter: see
+    # `ModelPolicy.adapters`.
     adapter: str = ""
 
     def noise(self, *shape: int) -> np.ndarray:
@@ -65,7 +67,9 @@ def drawn(row: Row, draws: np.random.Generator) -> Row:
 
 
 def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-    """Return which rows to encode: the samples of a session share the observations of its row.
+    """Return which rows to encode.
+
+    The samples of a session share the observations of the session's row.
 
     Returns:
         The indices of rows with distinct observations, and for each row the index of its
@@ -86,12 +90,12 @@ def choose_cameras(
     """Map the model's name of each camera to the name in observations.
 
     Args:
-        chosen: The mapping in the policy's settings; None selects `usual`.
+        chosen: The mapping in the policy's settings; with None, `usual` applies.
         usual: The usual mapping of the model's family.
         known: The model's cameras, in the order of the result.
 
     Raises:
-        ConfigError: A camera is unknown or missing. It is never replaced by zeros.
+        ConfigError: A camera is unknown or missing. A missing camera is never replaced with zeros.
     """
     mapping = usual if chosen is None else chosen
     if set(mapping) != set(known):
@@ -104,7 +108,7 @@ def choose_cameras(
 
 
 def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Return the images by the model's names, (H, W, 3) uint8 RGB, not copied."""
+    """Return the images by the model's camera names, (H, W, 3) uint8 RGB, without copying them."""
     for ours in cameras.values():
         if ours not in obs.cameras:
             raise MissingCamera(ours, have=obs.cameras)
@@ -152,7 +156,7 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
 
 
 def needs_gripper(parts: Sequence[str]) -> bool:
-    """Return whether `Obs.gripper` is among the parts, for a contract."""
+    """Return whether the parts include `Obs.gripper`, for a contract."""
     return GRIPPER in parts or CLOSED in parts
 
 
@@ -161,7 +165,8 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
 
     Args:
         parts: The parts of a state vector, as for `state_vector`.
-        dim: The length of the vector, which is that of its part if there is only one.
+        dim: The length of the vector. If there is only one part, this is also the length of that
+            part.
     """
     names = [name for name in parts if name not in (GRIPPER, CLOSED)]
     is_whole_vector = list(parts) == names and len(names) == 1
@@ -201,13 +206,13 @@ def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
 
 
 def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
-    """Return a copy of the plan to continue, (H, D) float32, from an observation with a plan."""
+    """Return a copy of the leftover plan in an observation, (H, D) float32."""
     leftover = obs.info[LEFTOVER]
     dim = None if contract is None else contract.action.dim
     try:
         plan = np.array(leftover, np.float32)
     except (TypeError, ValueError):
-        plan = np.zeros(0, np.float32)  # values that are not numbers are rejected below
+        plan = np.zeros(0, np.float32)  # Values that are not numbers are rejected below.
     if plan.ndim != 2 or dim not in (None, plan.shape[1]) or not np.isfinite(plan).all():
         content = leftover.shape if isinstance(leftover, np.ndarray) else type(leftover).__name__
         raise InvalidObservation(

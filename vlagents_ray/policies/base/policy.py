@@ -1,6 +1,6 @@
 """The base class of policies that are models.
 
-It has the sessions, histories, chunks and samples; a model family adds the forward pass.
+It handles sessions, histories, chunks and samples; a model family adds the forward pass.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ from vlagents_ray.weights.trainable import from_host, named_values, to_host
 
 logger = logging.getLogger(__name__)
 
-# A batch is divided into several passes if these take less than this share of the time of one pass:
-# a smaller saving is within the spread of the measurements.
+# A batch is divided into several passes if together they take less than this share of the time of
+# one pass. A smaller saving is within the spread of the measurements.
 _FASTER = 0.9
 
 T = TypeVar("T")
@@ -84,11 +84,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A chunk, with the model's uncertainty where the model states one."""
+    """A chunk, with the model's uncertainty if the model computes it."""
 
     actions: np.ndarray  # (H, D) float32, in the units of the contract's action
-    mean: np.ndarray | None = None  # (H, D), of the model's distribution
-    std: np.ndarray | None = None  # (H, D)
+    mean: np.ndarray | None = None  # mean of the model's distribution, (H, D)
+    std: np.ndarray | None = None  # standard deviation, (H, D)
     behaviour: dict[str, Any] = field(default_factory=dict)  # a value for each name of `Row.want`
     info: dict[str, Any] = field(default_factory=dict)  # for `Act.info`
 
@@ -101,10 +101,10 @@ class PolicyEpisode:
     frames: deque[Any]  # results of `perceive`, oldest first
     rng: np.random.Generator
     draws: np.random.Generator  # generator of samples, so that requesting them changes no action
-    plan: ChunkBuffer  # the actions that are still to be returned, if they are returned singly
+    plan: ChunkBuffer  # remaining actions, if they are returned one at a time
     memory: dict[str, Any] = field(default_factory=dict)
     adapter: str = ""  # fingerprint of the adapter; empty without an adapter
-    # The tokens of the instruction, if a family computes them when the episode begins.
+    # The tokens of the instruction, for families that compute them when the episode begins.
     prompt: Any = None
 
 
@@ -118,7 +118,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
-    # The attribute whose linear layers `quantization` may keep in 8 bits.
+    # The name of the attribute with the network whose linear layers `quantization` may keep in 8
+    # bits.
     network: ClassVar[str | None] = None
     # Whether `predict` runs `network` within `self.adapters.rows`.
     adaptable: ClassVar[bool] = False
@@ -126,10 +127,11 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
-        # `load` marks the model's cores with it.
+        # `load` passes the model's cores to it.
         self.compilation = Compilation(self.config.compile)
         self.adapters = LoraAdapters()
-        self.report = LoadingReport(lambda _: None, COMPILED_SIZES)  # the server's, once loaded
+        # Replaced with the server's report when the model is loaded.
+        self.report = LoadingReport(lambda _: None, COMPILED_SIZES)
         self.episode: PolicyEpisode | None = None
         if self.config.adapters and not self.adaptable:
             raise ConfigError(
@@ -154,7 +156,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def most_rows(self) -> int:
         """The largest number of rows of a forward pass.
 
-        It is that of the config, or a smaller one for some time after that did not fit into memory.
+        This is the limit of the config, or a smaller one for some time after a pass did not fit
+        into memory.
         """
         return min(self.config.rows, self.report.row_limit.rows or self.config.rows)
 
@@ -170,12 +173,14 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return the names for the contract's `behaviour`.
 
         Returns:
-            The names; None if there are none, or if an answer is not a whole chunk.
+            The names; None if the model offers none, or if an answer is not a whole chunk.
         """
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
-        """Return, for the contract, the number of the model's `horizon` rows in an answer."""
+        """Return the number of rows in an answer, for the contract, from the number of rows of
+        the model's chunk.
+        """
         if self.config.actions != "chunk":
             return 1
         return min(self.config.execute or horizon, horizon)
@@ -189,10 +194,10 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             cameras: The model's name of each camera -> the name in observations.
             parts: The parts of the state vector, in order.
             horizon: The number of rows of a chunk; None if it is not yet known.
-            facts: Further fields of the contract, which replace the usual ones.
+            facts: Further fields of the contract, which replace the default values.
         """
         usual: dict[str, Any] = {
-            # Images may have any size: families resize them.
+            # Images may have any size, since the families resize them.
             "cameras": {ours: CameraSpec() for ours in cameras.values()},
             "state": state_specs(parts, self.state_dim),
             "gripper": needs_gripper(parts),
@@ -224,17 +229,17 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def merge_products(self) -> None:
         """Merge products of the loaded network that have the same input; the default merges none.
 
-        Their weights become views of one tensor. It is called for a network on an accelerator,
-        where pushed weights are copied into the memory of the old ones, unless it is quantized or
-        has adapters, which change single layers.
+        Their weights become views of one tensor. The method is called for a network on an
+        accelerator, where pushed weights are copied into the memory of the old weights. It is not
+        called if the network is quantized or has adapters, which change single layers.
         """
 
     def initialize(self) -> None:
         """Load the checkpoint, and warm up.
 
         With `batch_sizes`, each size runs once, or the model's cores are compiled for it. Without
-        them, one row and a full batch run on an accelerator, so that a missing kernel or too little
-        memory is an error before a robot acts.
+        `batch_sizes`, one row and a full batch run on an accelerator, so that a missing kernel or a
+        lack of memory is an error before a robot moves.
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
@@ -258,7 +263,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Run or compile each batch size.
 
         Args:
-            defers: Whether long captures of CUDA graphs are left to `load_deferred`.
+            defers: Whether long captures of CUDA graphs are postponed until `load_deferred` is
+                called.
         """
         sizes = self.config.batch_sizes or []
         self.report.pads = bool(sizes)
@@ -278,7 +284,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             self._run_examples(size, seeds)
 
         if sizes:
-            free_memory()  # memory of the full batch, which usual batches do not need
+            free_memory()  # frees the memory of the full batch, which smaller batches do not need
         for device in self.report.devices:
             if device["kind"] == "cuda" and cores:
                 device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
@@ -315,7 +321,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode.
 
-        The options are `seed`, an int, by default 0, and `adapter`, the name of an adapter.
+        The options are `seed`, an int (default 0), and `adapter`, the name of an adapter.
         """
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
@@ -385,7 +391,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             self._warm_up()
 
     def close(self) -> None:
-        """Drop the model, its adapters and its compiled programs, which frees their memory."""
+        """Drop the model, its adapters and its compiled programs, so that their memory is freed."""
         self.model = None
         self.adapters = LoraAdapters()
         self.compilation = Compilation(self.config.compile)
@@ -400,7 +406,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Check the other files in an adapter's folder, and keep the statistics of its rows.
+        """Check the other files in an adapter's folder, and store the normalization statistics for
+        the adapter's rows.
 
         Args:
             adapter: The adapter's fingerprint, as in `Row.adapter`.
@@ -428,7 +435,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         """Begin an episode in this session."""
-        # Numpy accepts no negative seed. Modulo 2**64, each int64 has a distinct number.
+        # Numpy accepts no negative seed. Modulo 2**64, distinct int64 values remain distinct.
         seeds = [self.config.seed, seed % 2**64]
         self.episode = PolicyEpisode(
             instruction,
@@ -452,7 +459,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return the rows to compute for a session.
 
         Returns:
-            The row of the chunk, and then those of the samples; empty while actions are left.
+            The row of the chunk, followed by the rows of the samples; empty while actions of an
+            earlier chunk are left.
         """
         episode = session._current_episode()
         samples = wanted_samples(obs, self.config)
@@ -484,7 +492,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         if not samples:
             return [chunk_row]
 
-        # Each sample has a seed, since they may be computed in several passes.
+        # Each sample has its own seed, since the samples may be computed in several passes.
         seeds = episode.draws.integers(2**63, size=samples)
         return [chunk_row, *(drawn(chunk_row, np.random.default_rng(seed)) for seed in seeds)]
 
@@ -495,8 +503,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
 
         Args:
             session: The session.
-            predictions: Those of the chunk and of its samples. Without them, the answer is the next
-                action of the session's plan.
+            predictions: The predictions of the chunk and of its samples. If empty, the answer is
+                the next action of the session's plan.
         """
         episode = session._current_episode()
         info = self.adapters.weights_info(episode.adapter)
@@ -519,7 +527,7 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         if self.config.actions == "chunk":
             return Act(chunk, info=info)
 
-        # Check the chunk before it is kept for later ticks.
+        # Check the chunk before it is stored for later ticks.
         try:
             check_action(chunk, self.contract)
         except InvalidAction as error:
@@ -532,7 +540,9 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
     def _distribution(self, prediction: Prediction, samples: list[Prediction]) -> dict[str, Any]:
-        """Return the samples, and the mean and deviation of the model or of the samples."""
+        """Return the samples, and the mean and the standard deviation of the model or of the
+        samples.
+        """
         chunks = np.stack([self._executed_rows(sample.actions) for sample in samples])
         mean = chunks.mean(0) if prediction.mean is None else self._executed_rows(prediction.mean)
         std = chunks.std(0) if prediction.std is None else self._executed_rows(prediction.std)
@@ -546,8 +556,8 @@ class ModelPolicy(TrainableAgent, abc.ABC):
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
         """Compute all rows.
 
-        If the memory of an accelerator is exhausted, this and later batches use smaller forward
-        passes, which grow again after some time.
+        If the memory of an accelerator is exhausted, this batch and later ones use smaller forward
+        passes, whose size increases again after some time.
         """
         if self.report.row_limit.recover(self.config.rows, self.config.batch_sizes or ()):
             logger.info("forward passes of up to %d rows are tried again", self.most_rows)
@@ -559,14 +569,15 @@ class ModelPolicy(TrainableAgent, abc.ABC):
                 if not is_out_of_memory(error) or not self._lower_rows(len(rows), error):
                     raise
 
-            # Not in the handler, where the traceback still refers to the tensors of the pass.
+            # Free memory after the handler, in which the traceback still refers to the tensors of
+            # the pass.
             free_memory()
-            # The next try draws the same noise.
+            # Restore the generators, so that the next attempt draws the same noise.
             for row, state in zip(rows, states_before, strict=True):
                 row.rng.bit_generator.state = state
 
     def _lower_rows(self, rows: int, error: Exception) -> bool:
-        """Halve the size of the largest forward pass after one has not fit into memory.
+        """Halve the largest size of a forward pass after a pass did not fit into memory.
 
         Args:
             rows: The number of rows of the batch.
@@ -595,19 +606,20 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         return bool(smaller_sizes)
 
     def _size(self, rows: int) -> int:
-        """Return the number of rows to which a pass of `rows` rows is padded."""
+        """Return the number of rows after padding of a pass with `rows` rows."""
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
     def padded(self, items: list[T]) -> list[T]:
-        """Return the items of a batch, whose last one is repeated up to the next batch size."""
+        """Return the items of a batch, with the last item repeated up to the next batch size."""
         return items + items[-1:] * (self._size(len(items)) - len(items))
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """Compute all rows, in as many forward passes as `_split` returns."""
+        """Compute all rows, in the forward passes that `_split` returns."""
         predictions: list[Prediction | Exception] = []
         for size in self._split(len(rows)):
             pass_rows = rows[len(predictions) : len(predictions) + size]
-            # The rows that fill the pass are copies, so that they draw no noise of the session.
+            # The rows that pad the pass are copies, so that they draw no noise from the session's
+            # generator.
             fillers = self.padded(pass_rows)[len(pass_rows) :]
             copies = [copy.deepcopy(row, {id(row.frames): row.frames}) for row in fillers]
             padded_rows = [*pass_rows, *copies]
@@ -631,8 +643,9 @@ class ModelPolicy(TrainableAgent, abc.ABC):
         """Return the number of rows of each forward pass for a batch.
 
         There are several passes if the batch is too large for one, or if several are faster. With
-        `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On a
-        CPU, the time of a pass depends on other processes, so that the fewest passes are used.
+        `batch_sizes`, 9 rows may take longer in a pass of 16 than in a pass of 8 and a pass of 1.
+        On a CPU, where the time of a pass depends on other processes, the smallest number of passes
+        is used.
         """
         full_passes, remaining = divmod(rows, self.most_rows)
         split = [self.most_rows] * full_passes
@@ -652,23 +665,24 @@ class ModelPolicy(TrainableAgent, abc.ABC):
             if isinstance(prediction, Exception):
                 raise prediction
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
-            # JAX compiles for each pair of a number of rows and a smaller number of observations.
+            # JAX compiles a separate program for each number of rows and each smaller number of
+            # observations.
             for observations in self.config.batch_sizes or ():
                 if observations >= size:
                     continue
                 samples = [drawn(rows[0], row.rng) for row in rows[observations:]]
-                # Not through `_forward`, which would record the durations of these passes.
+                # `_forward` is not called, since it would record the durations of these passes.
                 self.predict([*rows[:observations], *samples])
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         """Return which rows to encode.
 
         If each row has its own observations, the results are 0, 1, …, so that the encoded
-        observations need not be gathered.
+        observations need no gather operation.
 
         Returns:
             The indices of the rows to encode, padded to one of `batch_sizes`; and for each row the
-            index of its observations among these.
+            position of its observations in this list.
         """
         firsts, owners = shared_frames(rows)
         firsts = self.padded(firsts)
@@ -724,10 +738,10 @@ def fastest_split(rows: int, pass_s: tuple[tuple[int, float], ...]) -> list[int]
 
     Args:
         rows: The total number of rows, at most the largest size.
-        pass_s: The sizes of passes, ascending, and the duration of each, s. Smaller passes are
-            padded to the next size.
+        pass_s: The sizes of passes, in ascending order, and the duration of each pass, s. Smaller
+            passes are padded to the next size.
     """
-    # The shortest time for 0, 1, … rows, and the passes that take it.
+    # The shortest time for 0, 1, … rows, and the passes with that total time.
     best: list[tuple[float, list[int]]] = [(0.0, [])]
     for count in range(1, rows + 1):
         splits = []

@@ -26,9 +26,10 @@ _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in _LIBRARY
 _SITES = {"site-packages", "dist-packages"}
 # A folder with at most this many files has a digest for each of them; a larger one has one digest.
 _LISTED = 32
-_LONGEST = 4096  # characters of the longest path
+_LONGEST = 4096  # length of the longest path, characters
 
-Program = dict[str, str]  # name -> digest, or the version of an installed package
+# Name of a file or a package -> digest, or the version of an installed package.
+Program = dict[str, str]
 
 
 def code_of_class(target: str) -> Program:
@@ -83,7 +84,7 @@ _distributions = functools.cache(packages_distributions)
 
 
 loaded_code = functools.cache(code_of_class)
-"""`code_of_class` with the result of the first call in this process.
+"""The result of the first call of `code_of_class` in this process.
 
 Later edits of the files do not change the code that is running.
 """
@@ -123,7 +124,7 @@ def digest_of(files: Program) -> str:
 
 
 def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings, and the defaults of the class's `Config` and constructor for the others."""
+    """Return settings, completed with the defaults of the class's `Config` and constructor."""
     fields = getattr(getattr(cls, "Config", None), "model_fields", {})
     defaults = {name: field.default for name, field in fields.items()}
     parameters = inspect.signature(cls.__init__).parameters.values()
@@ -157,8 +158,8 @@ def _spec(name: str) -> ModuleSpec | None:
     parent, _, _ = name.rpartition(".")
     if not parent:
         try:
-            return find_spec(name)  # imports nothing, since the name has no parent
-        except (ImportError, ValueError):  # the module has no spec
+            return find_spec(name)  # This call imports nothing, since the name has no parent.
+        except (ImportError, ValueError):  # The module has no spec.
             return None
 
     package = _spec(parent)
@@ -190,7 +191,7 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
     """
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError):  # importing it raises the same error
+    except (SyntaxError, ValueError):  # Importing the module raises the same error.
         return
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -1,8 +1,8 @@
 """The transfer of rows' inputs to the policy's device, where they are stacked into a batch.
 
 On a GPU, the threads that prepare observations copy each row as soon as it is prepared. The copies
-are made from pinned memory and on a separate stream. Therefore, the rows of the next batch are
-copied while a batch is computed, and the policy's thread does not wait for them.
+are made from pinned memory and on a separate stream. The rows of the next batch are therefore
+copied while the current batch is computed, and the policy's thread does not wait for them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 from vlagents_ray.policies.base.accelerator import is_out_of_memory
 from vlagents_ray.registry import require
 
-# bytes: tensors of all types begin at a multiple, and a GPU copies in words of this size.
+# Alignment of tensors in a block, bytes. It suits all types, and a GPU copies in words of this
+# size.
 _ALIGNED = 16
 
 
@@ -35,7 +36,7 @@ class StagedRow(dict[str, np.ndarray]):
 
     @property
     def layout(self) -> list[tuple[str, tuple[int, ...], np.dtype[Any]]]:
-        """Name, shape and type of each array, in the order of the block."""
+        """The name, shape and type of each array, in the order of the block."""
         return [(name, array.shape, array.dtype) for name, array in self.items()]
 
 
@@ -70,7 +71,8 @@ class Staging:
         try:
             self._copy(row)
         except RuntimeError as error:
-            # If memory is exhausted, `stack` copies the row: its caller can free memory.
+            # If memory is exhausted, `stack` copies the row, since the caller of `stack` can free
+            # memory.
             if not is_out_of_memory(error):
                 raise
         return row
@@ -80,8 +82,9 @@ class Staging:
 
         Args:
             rows: The rows of the batch, B.
-            keep: Whether later batches also contain the rows, as those of a history. Otherwise
-                their copies are freed, so that a GPU has only copies for waiting requests.
+            keep: Whether later batches also contain the rows, such as the rows of a history.
+                Otherwise, their copies are freed, so that a GPU contains only copies for waiting
+                requests.
 
         Returns:
             Tensors (B, …) on the device by name. On a CPU, they are valid until the next call.
@@ -95,7 +98,8 @@ class Staging:
                 raise ValueError(
                     f"stack: expected the same arrays in each row, got {layout} and {row.layout}"
                 )
-            # Its copy was freed after an earlier batch, or another replica has prepared it.
+            # The row's copy was freed after an earlier batch, or the row was prepared in another
+            # replica.
             if row.block is None:
                 self._copy(row)
 
@@ -103,7 +107,8 @@ class Staging:
             current = torch.cuda.current_stream(self.device)
             for row in rows:
                 current.wait_event(row.copied)
-                row.block.record_stream(current)  # its memory was allocated on the other stream
+                # The memory of the copy was allocated on the other stream.
+                row.block.record_stream(current)
         blocks = [row.block for row in rows]
         batch = torch.stack(blocks, out=self._memory(len(blocks), len(blocks[0])))
 
@@ -119,7 +124,8 @@ class Staging:
         return tensors
 
     def _memory(self, rows: int, size: int) -> Any:
-        """Return the memory of a batch on a CPU, where new memory would cost more than the copies.
+        """Return reusable memory for a batch on a CPU, where an allocation would take longer than
+        the copies.
 
         Args:
             rows: The number of rows.

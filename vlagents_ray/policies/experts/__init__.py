@@ -1,6 +1,6 @@
 """Scripted experts: small classes that solve simulated tasks without learning.
 
-`EXPERTS` maps the full name of an env, or of a suite, to "module:Class"; the full name has
+`EXPERTS` maps the full name of an env, or the name of a suite, to "module:Class"; the full name has
 priority. A module is imported when the first of its experts is used. `examples/experts/README.md`
 lists experts for more simulators.
 """
@@ -23,7 +23,7 @@ EXPERTS: dict[str, str] = {
 
 
 class Expert(Protocol):
-    """The expert of a session, created for each episode."""
+    """The expert of a session. A new one is created for each episode."""
 
     def __init__(self, env_name: str) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Experts for ManiSkill's PushCube and PickCube, from the simulator's state."""
+"""Experts for ManiSkill's PushCube and PickCube, which use the simulator's state."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import sim_vector
 
-_UNIT_M = 0.1  # motion commanded by an action of 1.0
+_UNIT_M = 0.1  # motion that an action of 1.0 commands
 _OPEN, _CLOSED = 1.0, -1.0
 _CURE = "this expert needs the env's default robot, in the control mode pd_ee_delta_pose"
 
@@ -33,9 +33,9 @@ class PushCube(_CubeExpert):
 
     _SIZE = 35
     _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
-    _OVER_M = 0.15  # height of the tool before that, above the cube
+    _OVER_M = 0.15  # height of the tool above the cube before it moves down
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
-    _FAR_M = 0.28  # distance of the target from the centre of the table, along x
+    _FAR_M = 0.28  # distance of the target centre from the table's centre along x
     _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
 
     def act(self, obs: Obs) -> Act:
@@ -71,8 +71,9 @@ class PickCube(_CubeExpert):
 
     _SIZE = 42
     _OVER_M = 0.08  # height of the tool over the cube before it descends
-    _GRASP_STEPS = 3  # steps until the fingers hold the cube
-    _GIVE_UP_STEPS = 8  # steps without contact on both fingers, after which it tries again
+    _GRASP_STEPS = 3  # number of steps until the fingers hold the cube
+    # Number of steps without contact on both fingers after which the expert tries again.
+    _GIVE_UP_STEPS = 8
 
     def act(self, obs: Obs) -> Act:
         """Return the next action of the pick, (7,)."""
@@ -103,7 +104,9 @@ class PickCube(_CubeExpert):
 
 
 class _Hand:
-    """Converts remaining distances to actions, with shorter steps while the arm does not follow."""
+    """Converts remaining distances to actions, with shorter steps while the arm does not follow
+    its commands.
+    """
 
     _STUCK_M = 0.001  # largest motion of an arm that counts as stuck after a longer command
 

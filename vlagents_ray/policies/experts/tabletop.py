@@ -16,22 +16,22 @@ import numpy as np
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState, NotReset
 from vlagents_ray.interface import Act, Obs
 
-_VIEW = 0.66  # m, along the image's shorter side
-# Factors that project lengths along y and along z onto the image's vertical axis.
+_VIEW = 0.66  # length that the image's shorter side shows, m
+# Factors that project lengths along y and z onto the image's vertical axis.
 _Y_FACTOR, _Z_FACTOR = math.sin(math.radians(70)), math.cos(math.radians(70))
 _METRES_PER_UNIT = 0.03
 
 _HUES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}  # degrees
 _HUE_TOLERANCE = 20.0  # degrees
-_PASTEL, _FULL = (0.15, 0.5), (0.55, 1.0)  # saturation of pads and of pucks
+_PASTEL, _FULL = (0.15, 0.5), (0.55, 1.0)  # ranges of saturation of pads and of pucks
 _PUCK_HEIGHT = 0.03  # m
-# m, largest distance of a puck's or a pad's pixels from its centre.
+# Largest distance of the pixels of a puck or a pad from its centre, m.
 _PUCK_REACH, _PAD_REACH = 0.034, 0.06
 
-_TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
-_AWAY = (0.0, 0.20, 0.16)  # m, a position in which the gripper occludes no objects
-_ARRIVED = 0.003  # m, tolerance of reached positions
-_HOLDING = 0.4  # closed fingers with a larger opening hold a puck
+_TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # heights of the fingertips, m
+_AWAY = (0.0, 0.20, 0.16)  # position in which the gripper occludes no objects, m
+_ARRIVED = 0.003  # tolerance of reached positions, m
+_HOLDING = 0.4  # opening of closed fingers above which they hold a puck
 _OPEN, _CLOSED = 1.0, -1.0
 
 _INSTRUCTIONS = {
@@ -44,7 +44,7 @@ _INSTRUCTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A position of the fingertips, and what to do there."""
+    """A position of the fingertips, and the action at that position."""
 
     xyz: tuple[float, float, float]  # m
     grip: float  # command of the gripper
@@ -93,7 +93,7 @@ class TabletopExpert:
             self._waited += 1
 
         offset = (np.array(self._plan[0].xyz) - position) / _METRES_PER_UNIT
-        # All axes are scaled by the same factor, to stay on the straight line.
+        # All axes are scaled by the same factor, so that the motion stays on the straight line.
         offset /= max(1.0, float(np.abs(offset).max()))
         return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
 
@@ -180,7 +180,8 @@ class _ColouredObjects:
         brightest = np.maximum(np.maximum(red, green), blue)
         chroma = brightest - np.minimum(np.minimum(red, green), blue)
         rows, columns = np.nonzero((brightest > 50) & (chroma > _PASTEL[0] * brightest))
-        self._columns, self._rows = columns + 0.5, rows + 0.5  # centres of the pixels, px
+        # Coordinates of the pixels' centres, px.
+        self._columns, self._rows = columns + 0.5, rows + 0.5
 
         red, green, blue = red[rows, columns], green[rows, columns], blue[rows, columns]
         brightest, chroma = brightest[rows, columns], chroma[rows, columns]
@@ -207,7 +208,7 @@ class _ColouredObjects:
         """Return the position of an object, (x, y) m, by its colour.
 
         Args:
-            colour: One of `_HUES`.
+            colour: A key of `_HUES`.
             noun: "puck" or "pad", for errors.
             saturation: The bounds of its pixels' saturation.
             reach: The largest distance of its pixels from its centre, m.

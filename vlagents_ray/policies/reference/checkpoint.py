@@ -16,28 +16,28 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 
 CAMERAS = ("scene", "wrist")  # the model's cameras, in the order of its image encoders
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-# Smallest standard deviation of a value of the state. A value that never changed in training then
-# stays near zero.
+# Smallest standard deviation of a value of the state. With this limit, a value that never changed
+# in training stays near zero.
 _LEAST_STD = 1e-2
 
 
 class NetworkSizes(BaseModel, extra="forbid", frozen=True):
     """The sizes of a network; by default 3.9 million parameters."""
 
-    words: int  # words of the vocabulary
-    longest: int = 16  # words of the longest instruction
+    words: int  # number of words in the vocabulary
+    longest: int = 16  # number of words of the longest instruction
     side: int = 64  # px, side of an image
     patch: int = 12  # px, side of the patch of an image token
     stride: int = 8  # px, distance between two patches
-    state: int = 8  # values of the state; a robot with fewer values has zeros after them
-    horizon: int = 8  # actions of a chunk
-    action: int = 4  # values of an action
+    state: int = 8  # number of values of the state; shorter states are padded with zeros
+    horizon: int = 8  # number of actions in a chunk
+    action: int = 4  # number of values of an action
     token_width: int = 96  # width of an image token
     queries: int = 16  # number of queries
     width: int = 128  # width of a query
     looks: int = 2  # number of times that the queries attend to the images
     head: int = 256  # width of the flow's network
-    blocks: int = 3  # blocks of the flow's network
+    blocks: int = 3  # number of blocks of the flow's network
 
 
 class Embodiment(BaseModel, extra="forbid", frozen=True):
@@ -66,7 +66,8 @@ class Checkpoint(BaseModel, extra="forbid", frozen=True):
         """Return the tokens of an instruction, (longest,) int64, 0 after its last word.
 
         Raises:
-            InvalidObservation: It has a word that is not in the vocabulary, or too many words.
+            InvalidObservation: The instruction has a word that is not in the vocabulary, or too
+                many words.
         """
         words = words_of(instruction)
         unknown = [word for word in words if word not in self.words]

@@ -1,8 +1,8 @@
 """The network of the reference policy."""
 
 # mypy: disable-error-code="misc"
-# mypy does not read torch's types (pyproject.toml). It therefore takes torch's classes for `Any`,
-# and its check of subclasses of `Any` is disabled here.
+# mypy does not read torch's types (pyproject.toml). It therefore treats torch's classes as `Any`,
+# and its check for subclasses of `Any` is disabled here.
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from vlagents_ray.policies.reference.checkpoint import CAMERAS, WEIGHTS, Network
 from vlagents_ray.weights.safetensors import read_values
 
 _TIMES = 32  # frequencies of the flow's time, from 1 to 1000 rad
-_CONTRAST = 1e-2  # added to a patch's variance, so that noise in an empty patch is not amplified
-# Attention score of a token of an image whose key equals the query.
+# Added to the variance of a patch, so that noise in an empty patch is not amplified.
+_CONTRAST = 1e-2
+# Attention score of an image token whose key equals the query.
 _SHARPNESS = 12.0
 
 
@@ -35,7 +36,8 @@ def _inverse_norms(vectors: Tensor) -> Tensor:
 
 
 class _Eye(nn.Module):
-    """Encodes a camera's images as tokens, and the tokens as the keys and values of each `_Look`.
+    """Encodes a camera's images as tokens, and computes from the tokens the keys and values for
+    each `_Look`.
 
     Patches are normalised before and after their projection (arXiv 2302.01327), since they differ
     in few pixels.
@@ -58,8 +60,8 @@ class _Eye(nn.Module):
         """Encode images, (P, 3, S, S).
 
         Returns:
-            The keys and then the values of the first look, then those of the next one, and so on,
-            each (P, tokens, width).
+            The keys of the first look, the values of the first look, the keys of the second look,
+            and so on, each (P, tokens, width).
         """
         tokens = self.patches(self.cut(images).transpose(1, 2)) + self.places
         tokens = tokens + self.mix(tokens)
@@ -102,7 +104,7 @@ class _Look(nn.Module):
 
 
 class _Block(nn.Module):
-    """A layer of the flow's network, scaled and shifted by its condition."""
+    """A layer of the flow's network. Its condition scales and shifts the values."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -118,10 +120,10 @@ class _Block(nn.Module):
 class ReferenceNetwork(nn.Module):
     """The network of the reference policy, which computes the velocity of a flow.
 
-    Queries attend to the words of the instruction, so that each of them represents an object or an
-    action that is named. They then attend to the images twice. The attention of a query to a
-    camera's tokens yields the content and the position of what it represents. All queries and the
-    robot's state are the context, from which a small network computes the velocity (arXiv
+    Queries attend to the words of the instruction, so that each query represents an object or an
+    action in the instruction. The queries then attend to the images twice. The attention of a query
+    to a camera's tokens yields the content and the position of the represented object. All queries
+    and the robot's state form the context, from which a small network computes the velocity (arXiv
     2210.02747).
     """
 
@@ -151,7 +153,7 @@ class ReferenceNetwork(nn.Module):
         """Return the context, (P, 2 * head).
 
         Args:
-            tokens: The words of the instructions, (P, L) int64; 0 is no word.
+            tokens: The words of the instructions, (P, L) int64; 0 is padding.
             state: (P, S).
             images: The images of each camera, (P, 3, S, S) in [-1, 1].
         """
@@ -176,8 +178,8 @@ class ReferenceNetwork(nn.Module):
             actions: The noisy actions, (B, H, D).
             times: The flow times, (B,); 1 is noise.
         """
-        # The rates are not a buffer: a network of bfloat16 would round the largest one by several
-        # rad.
+        # The rates are not a buffer, since a bfloat16 network would round the largest rate by
+        # several rad.
         angles = times[:, None].float() * torch.logspace(0, 3, _TIMES, device=times.device)
         when = torch.cat([angles.sin(), angles.cos()], -1).to(context.dtype)
         condition = silu(self.why(context) + self.when(when))
@@ -190,7 +192,9 @@ class ReferenceNetwork(nn.Module):
 def flow_velocity(
     network: ReferenceNetwork, inputs: Mapping[str, Tensor]
 ) -> Callable[[Tensor, float], Tensor]:
-    """Return the velocity of a flow, for a learner; the inputs are encoded once.
+    """Return the function that computes the velocity of a flow, for a learner.
+
+    The inputs are encoded once.
 
     Args:
         network: The network.
@@ -200,7 +204,7 @@ def flow_velocity(
     context = network.encode(inputs["tokens"], inputs["state"], *inputs["images"].unbind(1))
 
     def velocity(actions: Tensor, time: float) -> Tensor:
-        """Return the velocity at noisy actions, (B, H, D), and one time."""
+        """Return the velocity at noisy actions, (B, H, D), and a flow time."""
         return network.velocity(context, actions, actions.new_full((len(actions),), time))
 
     return velocity
@@ -210,7 +214,7 @@ def read_network(sizes: NetworkSizes, folder: Path) -> ReferenceNetwork:
     """Return a network with the weights of a checkpoint.
 
     Raises:
-        ConfigError: They are damaged, or those of another network.
+        ConfigError: The weights are damaged, or belong to another network.
     """
     network = ReferenceNetwork(sizes)
     try:

@@ -1,4 +1,4 @@
-"""The reference policy around its network."""
+"""The reference policy, which uses the network of this package."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from vlagents_ray.registry import require
 
 
 class ReferencePasses(FlowPasses):
-    """The passes of a `ReferenceNetwork`; actions stay in float32 between the steps."""
+    """The forward passes of a `ReferenceNetwork`. Actions stay in float32 between the steps."""
 
     def encode(
         self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any
@@ -65,12 +65,12 @@ class ReferenceConfig(ModelConfig):
 
 @dataclass(frozen=True)
 class LoadedReference:
-    """The network, and the facts of its checkpoint."""
+    """The network, and the metadata of its checkpoint."""
 
     network: Any
     checkpoint: Checkpoint
     robot: Embodiment
-    cameras: dict[str, str]  # name in CAMERAS, in their order -> the robot's name
+    cameras: dict[str, str]  # name in CAMERAS, in the same order -> name of the robot's camera
     dtype: Any
     passes: ReferencePasses
     staging: Staging
@@ -113,7 +113,7 @@ class Reference(ModelPolicy):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk continues the executed plan, as it does with `actions: chunk`."""
+        """Whether a chunk continues the executed plan, which requires `actions: chunk`."""
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedReference:
@@ -170,7 +170,10 @@ class Reference(ModelPolicy):
         return staged
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute one chunk for each row; samples of a session share its encoded observation."""
+        """Compute one chunk for each row.
+
+        The samples of a session share the session's encoded observation.
+        """
         model, torch = self.loaded(), require("torch")
         firsts, owners = shared_frames(rows)
         sizes = model.checkpoint.sizes
@@ -192,7 +195,7 @@ class Reference(ModelPolicy):
         return [Prediction(flow, behaviour=outputs.get(i, {})) for i, flow in enumerate(flows)]
 
     def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Stack the last frames of rows, in the type of the network."""
+        """Stack the last frames of rows, converted to the dtype of the network."""
         model = self.loaded()
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images, state = pixels(inputs["images"]).to(model.dtype), inputs["state"].to(model.dtype)
