@@ -1,4 +1,4 @@
-"""Fixtures of tests of evaluations, for conftest.py of this package and of plug-ins."""
+"""Fixtures for tests of evaluations, which conftest.py of this package and of plug-ins imports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ WORKER_PATH = {"env_vars": {"PYTHONPATH": PYTHONPATH}}
 
 @pytest.fixture
 def config(tmp_path: Path) -> Callable[..., EvalConfig]:
-    """Settings of a small evaluation of `Line` in a folder of this test's own."""
+    """Return the settings of a small evaluation of `Line`, with results in the test's own
+    folder.
+    """
 
     def make(**changes: Any) -> EvalConfig:
         settings = {
@@ -36,8 +38,8 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
 
 @pytest.fixture(scope="module", autouse=True)
 def commits_reach_the_disk() -> Iterator[None]:
-    """They do not, which takes 5 to 25 ms each; a module that is about it overrides this
-    fixture.
+    """Replace the sync of each commit to the disk, which takes 5 to 25 ms, by nothing. A module
+    that tests the sync overrides this fixture.
     """
     opened = Store._open
 

@@ -1,4 +1,4 @@
-"""Results with all kinds of episodes that an export has a row for."""
+"""Results with all kinds of episodes that become a row of an export."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ SETTINGS = {
 
 
 def with_a_lost_episode(settings: EvalConfig) -> Results:
-    """Play two episodes in each of two envs by `SETTINGS`, and record one that infrastructure
-    failed.
+    """Run two episodes in each of two environments with `SETTINGS`, and record one episode that
+    failed for an infrastructure error.
     """
     play(settings, left_out=[2])
     with Store(resolve(settings.model_copy(update={"resume": True}))) as store:

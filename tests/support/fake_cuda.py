@@ -1,17 +1,19 @@
-"""A CUDA of two devices on a CPU: streams, graphs and errors as torch has them, for tests without a
-GPU.
+"""A simulation of CUDA with two devices on a CPU, with torch's streams, graphs and errors, for
+tests without a GPU.
 
-A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is
-captured, the operations of its stream are recorded, and their results are then overwritten, as a
-capture computes nothing; a replay computes them again from the same tensors. The rules are CUDA's,
-or stricter:
+A tensor of `FakeCuda.tensor` computes on the CPU but reports a GPU as its device. While a graph is
+captured, the operations of its stream are recorded, and their results are then overwritten, since a
+capture computes nothing; a replay computes them again from the same tensors. The rules are those of
+CUDA, or stricter:
 
 - A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
 - An operation on another stream or device than the captured one runs at once and is not recorded.
-- `torch.cuda.graph` has one stream for all captures of a process, on the device of the first.
+- `torch.cuda.graph` uses one stream for all captures of a process, on the device of the first
+  capture.
 - With `install_copies`, a copy from pinned memory on a stream other than the default one is made
-  only when a stream waits for an event after it; until then its destination has garbage.
-- The graphs of a memory pool share memory: a replay overwrites the results of all others.
+  only when a stream waits for an event after it; until then its destination contains garbage.
+- The graphs of a memory pool share memory: a replay overwrites the results of all other graphs in
+  the pool.
 - A GPU's time is the number of replayed operations, in milliseconds.
 - After `fail`, every call fails. A tensor of more than `most_rows` rows does not fit into memory.
 """
@@ -37,22 +39,22 @@ _EMPTY = (
     "The CUDA Graph is empty. This usually means that the graph was attempted to be captured "
     "on wrong device or stream."
 )
-_GARBAGE = 55  # in memory that a capture has not written
+_GARBAGE = 55  # value of memory that a capture has not written
 
 
 class FakeCuda:
-    """The GPUs of the process; `install` puts it in the place of torch's own."""
+    """The GPUs of the process. `install` replaces torch's own functions."""
 
     def __init__(self) -> None:
-        self.capture: Capture | None = None  # the open one
+        self.capture: Capture | None = None  # the capture in progress
         self.failure = ""
         self.most_rows = sys.maxsize
         self.emptied = 0  # calls of `empty_cache`
         self.pinned: list[torch.Tensor] = []
-        self.clock_ms = 0.0  # clock of all GPUs
-        self.captures: list[Capture] = []  # all that were begun
+        self.clock_ms = 0.0  # common clock of all GPUs
+        self.captures: list[Capture] = []  # all captures since the start
         self.replays: list[Capture] = []  # the graph of each replay
-        self.reserved = [0, 0]  # bytes of the graphs on each device
+        self.reserved = [0, 0]  # bytes reserved for graphs on each device
         self.memory = Memory()
         # Streams and bytes of copies between GPU and host.
         self.transfers: list[tuple[Stream, int]] = []
@@ -61,7 +63,7 @@ class FakeCuda:
         self._capture_stream: Stream | None = None
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
-        """Replace what policies use of `torch.cuda`, and compile nothing."""
+        """Replace the parts of `torch.cuda` that policies use, and disable compilation."""
         for name, value in {
             "is_available": lambda: True,
             "is_initialized": lambda: True,
@@ -92,15 +94,15 @@ class FakeCuda:
         patch.setattr(torch.Tensor, "pin_memory", lambda self: self)
 
     def install_copies(self, patch: pytest.MonkeyPatch) -> None:
-        """Replace pinned memory and the copies from it; one that would wait for its stream is an
-        error.
+        """Replace pinned memory and the copies from it; a copy that would wait for its stream
+        raises an error.
         """
         empty, pin, to, pinned = torch.empty, torch.Tensor.clone, torch.Tensor.to, set[int]()
 
         def hold(tensor: torch.Tensor, held: bool = True) -> torch.Tensor:
             if held:
                 pinned.add(tensor.data_ptr())
-                # Its memory stays in use, so that the address means it alone.
+                # The memory stays in use, so that no other tensor gets the same address.
                 self.pinned.append(tensor)
             return tensor
 
@@ -134,11 +136,11 @@ class FakeCuda:
         patch.setattr(torch.Tensor, "to", copy)
 
     def tensor(self, values: torch.Tensor, index: int = 0) -> GpuTensor:
-        """Return a tensor of these values on a GPU."""
+        """Return a tensor of these values on a simulated GPU."""
         return GpuTensor(values, self, index)
 
     def fail(self, said: str = "CUDA error: device-side assert triggered") -> None:
-        """Let all further calls fail."""
+        """Let all further calls fail with the message `said`."""
         self.failure = said
 
     def current_stream(self, device: Any = None) -> Stream:
@@ -156,7 +158,7 @@ class FakeCuda:
         capture = self.capture
         if capture is None or capture.thread != threading.get_ident():
             self._require(index)
-        # An operation begins after the copies that were queued on its stream before.
+        # An operation begins after the copies that were queued on its stream before it.
         self.current_stream(index).run_pending()
         result = call()
         if any(
@@ -239,12 +241,14 @@ class FakeCuda:
 
 
 class Memory:
-    """The bytes of the tensors on all GPUs, each memory once, and their peak."""
+    """The number of bytes of the tensors on all GPUs, each memory counted once, and the peak of
+    this number.
+    """
 
     def __init__(self) -> None:
         self.allocated = self.peak = 0
         self.total = 80 * 10**9
-        self._tensors: Counter[int] = Counter()  # by the address of their memory
+        self._tensors: Counter[int] = Counter()  # number of tensors by the address of their memory
 
     def add(self, tensor: GpuTensor) -> None:
         """Count a tensor until it is deleted."""
@@ -264,8 +268,8 @@ class Memory:
 
 @dataclass(eq=False)
 class Stream:
-    """A stream of one GPU, on which operations other than the copies of `install_copies` run at
-    once.
+    """A stream of one GPU. Only the copies of `install_copies` are delayed; all other operations
+    run at once.
     """
 
     cuda: FakeCuda
@@ -273,7 +277,7 @@ class Stream:
     priority: int = 0
     # Copies that no stream has waited for.
     pending: list[Callable[[], object]] = field(default_factory=list)
-    synchronized: int = 0  # calls of `synchronize`
+    synchronized: int = 0  # number of calls of `synchronize`
     waited_for: list[Stream] = field(default_factory=list)  # arguments of `wait_stream`
 
     def record_event(self) -> Event:
@@ -283,17 +287,17 @@ class Stream:
         return event
 
     def wait_event(self, event: Event) -> None:
-        """Make the copies before the event."""
+        """Make the copies that were queued before the event."""
         if event.stream is not None:
             event.stream.run_pending()
 
     def run_pending(self) -> None:
-        """Make all copies."""
+        """Make all queued copies."""
         while self.pending:
             self.pending.pop(0)()
 
     def wait_stream(self, other: Stream) -> None:
-        """Make the copies of another stream, and note it."""
+        """Make the queued copies of another stream, and record that stream."""
         self.waited_for.append(other)
         other.run_pending()
 
@@ -308,15 +312,15 @@ class Stream:
 
 @dataclass(eq=False)
 class Event:
-    """A `torch.cuda.Event`, which is over at once."""
+    """A `torch.cuda.Event`, which is always completed."""
 
     cuda: FakeCuda
     ms: float | None = None
-    stream: Stream | None = None  # the first one
+    stream: Stream | None = None  # the first stream on which the event was recorded
 
     def record(self, stream: Stream | None = None) -> None:
-        """Note the time, and the stream, always of the same GPU, on which nothing but copies is
-        ever outstanding.
+        """Record the time and the stream. The stream must be on the same GPU as before, and may
+        have only copies outstanding.
         """
         stream = stream or self.cuda.current_stream()
         stream.synchronize()
@@ -326,11 +330,11 @@ class Event:
         self.ms, self.stream = self.cuda.clock_ms, stream
 
     def query(self) -> bool:
-        """Return that the event is over."""
+        """Return True, since the event is completed."""
         return True
 
     def synchronize(self) -> None:
-        """Do nothing, since the event has passed."""
+        """Do nothing, since the event is completed."""
 
     def elapsed_time(self, end: Event) -> float:
         """Return the time until another event, ms."""
@@ -344,7 +348,7 @@ class Capture:
     """A `torch.cuda.CUDAGraph`."""
 
     cuda: FakeCuda
-    # With result and arguments.
+    # The recorded calls, with result and arguments.
     calls: list[tuple[Callable[[], Any], Any, list[Any]]] = field(default_factory=list)
     broken: bool = False
     thread: int = 0
@@ -352,7 +356,7 @@ class Capture:
     pool: Any = None
 
     def end(self) -> None:
-        """Raise if the capture was ended by another thread; overwrite all results, as none was
+        """Raise an error if another thread ended the capture; overwrite all results, since none was
         computed.
         """
         if self.broken:
@@ -365,7 +369,7 @@ class Capture:
         self.spoil()
 
     def _results(self) -> Iterator[torch.Tensor]:
-        """Yield the tensors in memory of this graph's pool."""
+        """Yield the result tensors in the memory of this graph's pool."""
         for _, result, inputs in self.calls:
             own = {one.untyped_storage().data_ptr() for one in inputs}
             for one in tree_leaves(result):
@@ -378,10 +382,10 @@ class Capture:
         for one in self._results():
             one.fill_(_GARBAGE)
 
-    @torch.inference_mode()  # in which the tensors may have been made
+    @torch.inference_mode()  # the tensors may have been made in inference mode
     def replay(self) -> None:
-        """Compute all results again, in their memory, and overwrite those of other graphs in its
-        pool.
+        """Compute all results again in their memory, and overwrite the results of other graphs in
+        the pool.
         """
         self.cuda._require(self.stream.index)
         for other in self.cuda.captures:
@@ -396,8 +400,8 @@ class Capture:
 
 
 class HostCopies(TorchFunctionMode):  # type: ignore[misc]
-    """A context in which `torch.tensor` copies to a fake's GPU, which no capture allows, unless
-    there is nothing to copy.
+    """Within this context, `torch.tensor` copies to a simulated GPU. A capture forbids such a copy
+    unless the data is empty.
     """
 
     def __init__(self, cuda: FakeCuda) -> None:
@@ -416,13 +420,13 @@ class HostCopies(TorchFunctionMode):  # type: ignore[misc]
 
 
 class GpuTensor(torch.Tensor):
-    """A tensor whose operations go through a `FakeCuda`."""
+    """A tensor whose operations run through a `FakeCuda`."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl
-    values: torch.Tensor  # on the CPU
+    values: torch.Tensor  # the values, on the CPU
     cuda_of: FakeCuda
     index: int
-    streams: list[Stream]  # streams of `record_stream`
+    streams: list[Stream]  # arguments of `record_stream`
 
     @staticmethod
     def __new__(cls: Any, values: torch.Tensor, cuda: FakeCuda, index: int) -> GpuTensor:
@@ -439,7 +443,7 @@ class GpuTensor(torch.Tensor):
         return made
 
     def record_stream(self, stream: Any) -> None:
-        """Keep the stream, before whose operations the memory is not used again."""
+        """Record the stream; the memory is not reused before its operations end."""
         self.streams.append(stream)
 
     def data_ptr(self) -> int:
@@ -454,7 +458,7 @@ class GpuTensor(torch.Tensor):
         return True
 
     def untyped_storage(self) -> Any:
-        """Return the memory on the CPU."""
+        """Return the storage of the values on the CPU."""
         return self.values.untyped_storage()
 
     @classmethod
@@ -466,7 +470,8 @@ class GpuTensor(torch.Tensor):
         args, kwargs = tree_map(_values, (args, kwargs or {}))
         inputs = [one.values for one in own]
         result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
-        wrappers = {id(one.values): one for one in own}  # of what an operation in place returns
+        # an in-place operation returns one of its arguments
+        wrappers = {id(one.values): one for one in own}
 
         on_host = {
             id(one) for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)

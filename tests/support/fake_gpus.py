@@ -1,4 +1,6 @@
-"""The devices of a machine with two GPUs, for tests of which one a worker draws on."""
+"""The devices of a machine with two GPUs, for tests of the choice of the GPU on which a worker
+renders.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ import pytest
 from vlagents_ray.envs import graphics
 from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice
 
-# EGL counts otherwise than CUDA, has a device that CUDA does not know, and Mesa's last.
+# EGL numbers devices differently from CUDA, includes a device that CUDA does not have, and lists
+# Mesa's last.
 TWO_GPUS = [
     EglDevice(0, software=False, cuda=1),
     EglDevice(1, software=False, cuda=0),
@@ -28,7 +31,7 @@ def nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
         "LP_NUM_THREADS",
         *graphics.VULKAN_DRIVERS,
     ):
-        monkeypatch.setenv(name, "")  # so that what the test sets is undone
+        monkeypatch.setenv(name, "")  # monkeypatch restores the variable, whatever the test sets
         monkeypatch.delenv(name)
     monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)
 

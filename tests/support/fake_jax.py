@@ -1,4 +1,4 @@
-"""A JAX whose arrays are on a GPU, for tests without it: what weights use of JAX."""
+"""A simulation of JAX with arrays on a GPU, for tests of weights without a GPU or JAX."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 
 class Array:
-    """A `jax.Array` on a GPU."""
+    """A `jax.Array` on a simulated GPU."""
 
     arrays: ClassVar[weakref.WeakSet[Array]]
 
@@ -43,7 +43,7 @@ class Array:
 
 
 class Gpu:
-    """The GPU's memory, which holds a number of arrays."""
+    """The memory of a GPU, with room for a number of arrays."""
 
     def __init__(self) -> None:
         self.fits = sys.maxsize
@@ -58,7 +58,7 @@ class Gpu:
         return len(Array.arrays)
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
-        """Put the fake in the place of JAX, without arrays."""
+        """Replace JAX by the simulation, without any arrays."""
         Array.arrays = weakref.WeakSet()
         jax_numpy = SimpleNamespace(isfinite=lambda array: np.isfinite(np.asarray(array)))
         jax = SimpleNamespace(Array=Array, device_put=self.put, numpy=jax_numpy)

@@ -1,4 +1,4 @@
-"""An env that gives the cameras and states of every policy family, and a worker that steps it."""
+"""An environment with the cameras and states of each policy family, and a worker that runs it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vlagents_ray.envs import EvalEnv
 from vlagents_ray.interface import GOAL_IMAGE, Act
 
 DESK = "family_env:Desk"
-SIDE = 64  # px; some checkpoints take no other size than theirs
+SIDE = 64  # px; some checkpoints accept only this size
 STATES = {"xyz_axis_angle": 6, "gripper_qpos": 2, "joints": 7, "xyzrpy": 6, "agent_pos": 2}
 
 
 class Desk(EvalEnv):
-    """Pictures and states of noise; an episode succeeds by being two steps old."""
+    """An environment with random images and states. An episode succeeds after two steps."""
 
     max_steps = 3
 
@@ -76,7 +76,7 @@ class Desk(EvalEnv):
 def play(
     url: str, transport: TransportName, seed: int, steps: int = 3
 ) -> tuple[str, list[np.ndarray]]:
-    """The transport that carried it, and the actions of an episode's beginning."""
+    """Return the transport of the connection, and the first actions of an episode."""
     with Desk() as env, RemoteAgent(url, transport=transport, codec="raw", timeout_s=120) as agent:
         obs, _ = env.reset(seed=seed)
         agent.reset(obs, env.instruction, seed=seed)
@@ -86,7 +86,7 @@ def play(
 
 @ray.remote(num_cpus=0)
 class DeskActor:
-    """A worker on the policy's node."""
+    """A worker on the node of the policy."""
 
     def play(self, *arguments: Any) -> tuple[str, list[np.ndarray]]:
         return play(*arguments)

@@ -1,4 +1,4 @@
-"""The folders of tests that run in the environment of a model family or a simulator."""
+"""The folders of tests that need the Python environment of a model family or a simulator."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from vlagents_ray.registry import entries
 
-# folder -> the packages without which its tests cannot be imported; the authors' source may come
-# from a checkout
+# The packages without which the tests of each folder cannot be imported. A checkout may provide the
+# authors' source.
 _NEEDS = {
     name: entry.needs[bool(entry.checkouts) :]
     for name, entry in (entries("policies") | entries("envs")).items()

@@ -1,4 +1,6 @@
-"""Full or read-only disks for one command, mounted in a namespace that no other process sees."""
+"""Full or read-only disks for one command, mounted in a namespace that is invisible to other
+processes.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-FULL = "mount -t tmpfs -o size={size} tmpfs '{folder}'"  # so small that it fills up
+FULL = "mount -t tmpfs -o size={size} tmpfs '{folder}'"  # a size that soon fills up
 READ_ONLY = "mount --bind '{folder}' '{folder}' && mount -o remount,ro,bind '{folder}'"
 _HERE = Path(__file__).parent
 
@@ -15,8 +17,8 @@ _HERE = Path(__file__).parent
 def python_on(
     mount: str, folder: Path, code: str, *words: str, **options: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run `code` (`sys.argv[1]` is the folder, `words` follow) where `mount` was done to it.
-    Needs root.
+    """Run Python `code` after `mount` was applied to `folder`. `sys.argv[1]` is the folder,
+    followed by `words`. Root privileges are required.
     """
     mounted = mount.format(folder=folder, **options)
     command = [

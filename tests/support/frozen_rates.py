@@ -1,4 +1,4 @@
-"""How many requests were charged to a key, by buckets whose clocks stand still."""
+"""The number of requests charged to a key, counted with buckets whose clocks stand still."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ class FrozenBucket(TokenBucket):
     """A bucket that is never refilled."""
 
     def take(self, now: float, number: int = 1) -> float:
-        """Take tokens at the time at which the bucket was created."""
+        """Take tokens without a refill, at the time at which the bucket was created."""
         return super().take(self._refilled, number)
 
     @property
     def taken(self) -> float:
-        """The tokens that were taken so far."""
+        """Return the number of tokens taken so far."""
         return self._capacity - self._tokens
 
 
 def freeze(patch: pytest.MonkeyPatch) -> None:
-    """Give keys that are read from now on such buckets."""
+    """Let all keys that are read from now on use buckets that are never refilled."""
     patch.setattr(api_keys, "TokenBucket", FrozenBucket)
 
 
 def requests_charged(keys: Keys, name: str) -> float:
-    """The requests that were charged to the key of that name since `freeze`."""
+    """Return the number of requests charged to the key of that name since `freeze`."""
     bucket = keys._buckets.get(name)
     return bucket.taken if isinstance(bucket, FrozenBucket) else 0.0

@@ -1,4 +1,4 @@
-"""Policies with one parameter, which a learner trains, in this process and in a child process."""
+"""Policies with one parameter that a learner trains, in this process and in a child process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vlagents_ray.weights import trainable
 
 
 class Gain(TrainableAgent):
-    """Acts with its one parameter, and what a session has drawn."""
+    """A policy that returns its parameter and a random number of the session."""
 
     trainable: ClassVar[str | None] = "tree"
 
@@ -33,8 +33,8 @@ class Gain(TrainableAgent):
 
 
 class Doubled(Gain):
-    """Computes its actions from twice its parameter, which it computes once for each version, in
-    place.
+    """A policy that doubles its parameter in place once per version, and computes its actions from
+    the doubled value.
     """
 
     def initialize(self) -> None:
@@ -53,7 +53,7 @@ class Doubled(Gain):
 
 
 class DyingInAPush(Gain):
-    """Its process ends when the values of a push are checked."""
+    """A policy whose process ends when the values of a push are checked."""
 
     def initialize(self) -> None:
         super().initialize()
@@ -64,7 +64,7 @@ class DyingInAPush(Gain):
 
 
 class Counting(Doubled):
-    """States how many versions its process holds."""
+    """A policy that reports how many versions of weights its process keeps."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         held = [one for one in gc.get_objects() if isinstance(one, WeightsVersion)]
@@ -72,7 +72,7 @@ class Counting(Doubled):
 
 
 class OnSharedMemory(TrainableAgent):
-    """Has a torch layer in memory of the CPU that takes the place of a GPU's."""
+    """A policy with a torch layer in shared CPU memory, which simulates a GPU's memory."""
 
     trainable: ClassVar[str | None] = "layer"
 
@@ -91,12 +91,14 @@ class OnSharedMemory(TrainableAgent):
 
 
 def gains(gain: float) -> dict[str, Any]:
-    """The parameters with that gain."""
+    """Return the parameters with that gain."""
     return {"layer/gain": np.full(2, gain, np.float32)}
 
 
 def in_child(policy: str = "Gain", **config: Any) -> Any:
-    """The proxy of one of these policies, or of "module:Class", in a child process."""
+    """Return the proxy of one of these policies, or of the policy "module:Class", in a child
+    process.
+    """
     from vlagents_ray.serve.python_env.child_agent import ChildAgent
     from vlagents_ray.serve.python_env.child_main import Settings
     from vlagents_ray.serve.python_env.child_process import ChildProgram

@@ -1,8 +1,9 @@
 """The golden files of the protocol, for clients in any language: `python tests/support/golden.py`
 writes them all.
 
-They lie in clients/golden, whose README.md says what each contains. tests/protocol/test_golden.py
-holds the codec of this package to each frame's bytes, and to the meaning that is written beside it.
+The files are in clients/golden, whose README.md describes each of them.
+tests/protocol/test_golden.py checks that the codec of this package writes each frame's bytes, and
+reads the meaning stored next to the frame.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ from vlagents_ray.protocol.messages import Reply, Request, probe_answer
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "clients" / "golden"
-JPEG_FILE = GOLDEN / "gray.jpg"  # written once: another version of an encoder writes other bytes
+# written once, since another version of the encoder writes other bytes
+JPEG_FILE = GOLDEN / "gray.jpg"
 
 PIXELS = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)  # height 2, width 3, RGB
 JOINTS = np.array([0.0, 0.25, -0.5, 1.0, -1.5, 2.0, 0.125], np.float32)
-STEP = 4611686018427387905  # over 2**53, which some parsers of JSON round
+STEP = 4611686018427387905  # above 2**53, which some JSON parsers round
 CHUNK = np.arange(14, dtype=np.float32).reshape(2, 7) / 8 - 0.5
 TIMING = {
     "queue_ms": 0.125,
@@ -47,18 +49,18 @@ WEIGHTS = {"policy": {"version": 0, "fingerprint": ""}}
 
 @dataclass
 class Golden:
-    """A frame, and what it means."""
+    """A frame and its meaning."""
 
     name: str
     kind: str  # "requests", "replies", "malformed" (a reader rejects it), or "probe"
     says: str
     data: bytes
     meaning: Any = None
-    by_codec: bool = False  # whether the codec of this package writes it
+    by_codec: bool = False  # whether the codec of this package writes this frame
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A PNG file whose pixels are not compressed, so that every version of zlib writes the same
+    """Return a PNG file with uncompressed pixels, so that each version of zlib writes the same
     bytes.
     """
 
@@ -78,7 +80,9 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def meaning(value: Any) -> Any:
-    """A value as JSON without blobs; an object with the key `$` names what JSON does not have."""
+    """Return a value as JSON without blobs; an object with the key `$` stands for a value that JSON
+    cannot express.
+    """
     if isinstance(value, np.ndarray):
         kind = value.dtype.newbyteorder("<").str
         return {
@@ -99,7 +103,7 @@ def meaning(value: Any) -> Any:
 
 
 def of_obs(obs: Obs) -> dict[str, Any]:
-    """The meaning of an observation."""
+    """Return the meaning of an observation."""
     return {
         "cameras": meaning(obs.cameras),
         "gripper": obs.gripper,
@@ -109,7 +113,7 @@ def of_obs(obs: Obs) -> dict[str, Any]:
 
 
 def of_request(request: Request) -> dict[str, Any]:
-    """The meaning of a request: what it says, without what has its default."""
+    """Return the meaning of a request, without fields that have their default."""
     default = Request(request.op)
     said = {
         name: value
@@ -135,7 +139,7 @@ def of_request(request: Request) -> dict[str, Any]:
 
 
 def of_reply(reply: Reply) -> dict[str, Any]:
-    """The meaning of a reply."""
+    """Return the meaning of a reply."""
     found: dict[str, Any] = {"request_id": reply.request_id}
     if reply.error is not None:
         found["error"] = describe_error(reply.error)
@@ -157,7 +161,7 @@ def of_reply(reply: Reply) -> dict[str, Any]:
 
 
 def frames() -> list[Golden]:
-    """All frames."""
+    """Return all frames."""
     return [*_requests(), *_replies(), *_from_the_future(), *_malformed(), *_probes()]
 
 
@@ -331,7 +335,9 @@ def _replies() -> list[Golden]:
 
 
 def _from_the_future() -> list[Golden]:
-    """Replies of a later server of the same version, whose additions a client ignores."""
+    """Return replies of a later server with the same protocol version; a client ignores their
+    additions.
+    """
     action = {"$": ["nd", 1, "<f4", [7]]}
     known = {"request_id": "f", "act": {"action": meaning(CHUNK[0]), "done": False, "info": {}}}
     failed = {"request_id": "f", "error": {"code": "melted", "detail": "too hot"}}
@@ -422,8 +428,8 @@ def _probes() -> list[Golden]:
 
 
 def documents() -> dict[str, Any]:
-    """The JSON documents of HTTP, by name; clients/schema/v1.json has the schema of each, by the
-    first word.
+    """Return the JSON documents of HTTP by name. clients/schema/v1.json has the schema of each,
+    under the first word of its name.
     """
     error = UnknownSession("session 'robot-1': expired, closed, or never reset; reset it")
     return {
@@ -455,7 +461,7 @@ BOUNDARY = "golden-boundary"
 
 
 def form() -> bytes:
-    """The body of an act as `multipart/form-data` with the boundary BOUNDARY."""
+    """Return the body of an act as `multipart/form-data` with the boundary BOUNDARY."""
     obs = b'{"gripper": 1.0, "state": {"joints": [0.5, -1]}}'
     head = b'--golden-boundary\r\nContent-Disposition: form-data; name="%s"'
     return b"".join(

@@ -1,7 +1,8 @@
-"""A client as GR00T's own `PolicyClient` is (gr00t/policy/server_client.py): a REQ socket, msgpack,
-.npy files.
+"""A client that behaves like GR00T's own `PolicyClient` (gr00t/policy/server_client.py), with a REQ
+socket, msgpack and .npy files.
 
-GR00T is not on PyPI; this follows its code, and its answers are decoded by numpy's own reader.
+GR00T is not on PyPI, so this module follows its code. numpy's own reader decodes the arrays in the
+answers.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def encode(value: Any) -> Any:
 
 
 def encode_packed(value: Any) -> Any:
-    """As msgpack_numpy does, which GR00T's newest client uses."""
+    """Encode an array like msgpack_numpy, which GR00T's newest client uses."""
     if isinstance(value, np.ndarray):
         return {
             b"nd": True,
@@ -37,14 +38,16 @@ def encode_packed(value: Any) -> Any:
 
 
 def decode_n15(value: Any) -> Any:
-    """The server of N1.5, whose configs are JSON texts."""
+    """Decode an answer of a server of GR00T N1.5, in which modality configs are JSON texts."""
     if "__ModalityConfig_class__" in value:
         return modality_config(**json.loads(value["as_json"]))
     return decode(value)
 
 
 def modality_config(delta_indices: list[int], modality_keys: list[str]) -> dict[str, list[Any]]:
-    """Its fields; as the newest client, rejects a modality without keys."""
+    """Return the fields of a modality config. Like in the newest client, a modality without keys is
+    rejected.
+    """
     if not modality_keys:
         raise ValueError("modality_keys must not be empty")
     return {"delta_indices": delta_indices, "modality_keys": modality_keys}
@@ -61,7 +64,7 @@ def decode(value: Any) -> Any:
 
 
 class PolicyClient:
-    """`get_action`, `reset`, `ping`, `get_modality_config`."""
+    """A client with the methods `get_action`, `reset`, `ping` and `get_modality_config`."""
 
     def __init__(
         self,
@@ -97,13 +100,13 @@ class PolicyClient:
         return self.call_endpoint("ping", requires_input=False)
 
     def get_action(self, observation: dict, options: dict | None = None) -> tuple[dict, dict]:
-        """N1.6 and newer."""
+        """Return the actions of a server of GR00T N1.6 or newer."""
         return tuple(
             self.call_endpoint("get_action", {"observation": observation, "options": options})
         )
 
     def get_action_n15(self, observation: dict) -> dict:
-        """N1.5."""
+        """Return the actions of a server of GR00T N1.5."""
         return self.call_endpoint("get_action", observation)
 
     def reset(self, options: dict | None = None) -> dict:

@@ -1,4 +1,6 @@
-"""JPEG and PNG files that are valid, or nearly so, and take much time or memory for their size."""
+"""JPEG and PNG files that are valid or nearly valid, and take much time or memory relative to their
+size.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import struct
 import zlib
 from collections.abc import Callable
 
-BLOCKS = 1024 * 1024 // 64  # 8 x 8 blocks of a megapixel
+BLOCKS = 1024 * 1024 // 64  # number of 8 x 8 blocks in a megapixel
 _GREY = (0x11,)
 
 
@@ -19,8 +21,8 @@ def _bits(text: str) -> bytes:
     return int(text, 2).to_bytes(len(text) // 8, "big").replace(b"\xff", b"\xff\0")
 
 
-# One quantisation table; codes "0" for a DC difference of 0, "0" for a run of 16384 to 32767 blocks
-# without AC coefficients, and "10" for the end of a block.
+# One quantisation table and one Huffman table: code "0" is a DC difference of 0, "0" also a run of
+# 16384 to 32767 blocks without AC coefficients, and "10" the end of a block.
 TABLES = (
     segment(0xDB, b"\0" + b"\1" * 64)
     + segment(0xC4, b"\x00" + bytes([1] + [0] * 15) + b"\0")
@@ -39,7 +41,9 @@ def scan(first: int, last: int, data: bytes, components: int = 1) -> bytes:
 
 
 def jpeg(*parts: bytes, height: int = 1024, width: int = 1024, marker: int = 0xC2) -> bytes:
-    """A JPEG of grey pixels, all zero, with more segments or scans behind the first scan."""
+    """Return a JPEG with grey pixels, all zero, and with further segments or scans after the first
+    scan.
+    """
     data = _bits("0" * (BLOCKS if marker == 0xC2 else 0) or "010" * BLOCKS)
     first = scan(0, 0 if marker == 0xC2 else 63, data)
     return (
@@ -55,7 +59,7 @@ def _before_scan(part: bytes) -> bytes:
 
 
 def _restarts(interval: int, extra: bytes) -> bytes:
-    """A baseline JPEG of a megapixel with a restart marker after each `interval` blocks."""
+    """Return a baseline JPEG of a megapixel with a restart marker after each `interval` blocks."""
     pieces = []
     for number in range(BLOCKS // interval):
         pieces.append(_bits("010" * interval) + bytes((0xFF, 0xD0 | number % 8)) + extra)
@@ -118,7 +122,7 @@ def png(
     data: bytes = b"",
     after: bytes = b"",
 ) -> bytes:
-    """A PNG file with further chunks before and after its data."""
+    """Return a PNG file with further chunks before and after its data."""
     unpacked = bytes(height * (1 + 3 * width)) if rows is None else rows
     header = chunk(b"IHDR", struct.pack(">2I5B", width, height, *form))
     pixels = data or chunk(b"IDAT", zlib.compress(unpacked, 9))

@@ -1,5 +1,5 @@
-"""Valid messages with small mutations, and answers of a server that is after the memory of a
-robot's computer.
+"""Valid messages with small mutations, and answers of a server that attacks the memory of a robot's
+computer.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ _JUNK: list[Any] = [
     ),
 ]
 _NAMES = ["", "x", "endpoint", "encoded", "__ndarray__", "__image__", "__numpy__"]
-# msgpack's own, and extremes.
+# Type bytes of msgpack, and extreme values.
 _LENGTHS = b"\x00\x7f\x80\x90\xc1\xc4\xc6\xc7\xd9\xdb\xdc\xdd\xde\xdf\xff"
 
 
 def mutated(choose: random.Random, frame: bytes) -> bytes:
-    """`frame` with one to four faults: flipped, cut, repeated, swapped or inserted bytes."""
+    """Return `frame` with one to four faults: flipped, cut, repeated, swapped or inserted bytes."""
     data = bytearray(frame)
     for _ in range(choose.randint(1, 4)):
         if not data:
             return bytes(choose.randbytes(choose.randint(0, 40)))
-        # Faults in the beginning and among the keys do more harm than those in pixels.
+        # Faults near the beginning and among the keys break more than faults in pixels.
         at = (
             choose.randrange(min(len(data), 160))
             if choose.random() < 0.5
@@ -85,8 +85,8 @@ def mutated(choose: random.Random, frame: bytes) -> bytes:
 
 
 def changed(choose: random.Random, tree: dict[str, Any]) -> dict[str, Any]:
-    """A copy of `tree` in which one or two values are others, gone, under another key or where
-    they do not belong.
+    """Return a copy of `tree` in which one or two values are changed, removed, renamed or moved to
+    a wrong place.
     """
     copy = _copy(tree)
     for _ in range(choose.randint(1, 2)):
@@ -118,8 +118,8 @@ def _copy(value: Any) -> Any:
     return {key: _copy(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
-# A few bytes that name much.
-# Most memory that reading one of them may take: three times what a client copies at most.
+# Short messages that announce large contents. Reading one of them may take at most this much
+# memory, three times the largest copy that a client makes.
 ADDED_MB = 400
 
 

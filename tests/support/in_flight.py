@@ -1,4 +1,4 @@
-"""Requests to an engine without an endpoint."""
+"""Functions that send requests to an engine directly, without an endpoint."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Done = Callable[[Reply], Any]
 
 @dataclass(frozen=True)
 class Calls:
-    """The receiver of a message that calls a function with its replies."""
+    """The receiver of a message; it calls a function with the replies."""
 
     function: Callable[[list[Reply]], Any]
 
@@ -38,7 +38,7 @@ class Calls:
 
 @dataclass(frozen=True)
 class CallsWithOne:
-    """The receiver of a message of one request that calls a function with its reply."""
+    """The receiver of a message with one request; it calls a function with the reply."""
 
     function: Done
 
@@ -49,7 +49,7 @@ class CallsWithOne:
 
 
 class AnySession:
-    """A table in which every session exists."""
+    """A table of sessions in which every session exists."""
 
     def __contains__(self, session_id: object) -> bool:
         return True
@@ -60,7 +60,7 @@ def ignore(_: object) -> None:
 
 
 def message_of_one(done: Done = ignore) -> IncomingMessage:
-    """A message of one request, whose reply `done` gets."""
+    """Return a message with one request; `done` is called with its reply."""
     message = IncomingMessage("test")
     message.expect(1, CallsWithOne(done))
     return message
@@ -69,7 +69,7 @@ def message_of_one(done: Done = ignore) -> IncomingMessage:
 def pending(
     session_id: str, request: Request, done: Done = ignore, **fields: Any
 ) -> PendingRequest:
-    """A request in flight with the priority and the deadline that it states."""
+    """Return a request in flight, with its own priority and deadline."""
     priority = PRIORITIES[request.priority]
     one = PendingRequest(session_id, request, message_of_one(done), priority, **fields)
     if request.deadline_ms is not None:
@@ -78,8 +78,8 @@ def pending(
 
 
 def checked(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:
-    """A request that the engine has checked, which raises its errors, and that is not queued
-    yet.
+    """Return a request that the engine has checked but not queued. Errors of the check are
+    raised.
     """
     one = pending(session_id, request, done)
     one.reserved = engine.intake.reserve(one)
@@ -87,45 +87,47 @@ def checked(engine: Engine, session_id: str, request: Request, done: Done) -> Pe
 
 
 def submit(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:
-    """Queue a request; what is wrong with it is raised here."""
+    """Queue a request; errors of its check are raised here."""
     one = checked(engine, session_id, request, done)
     engine.queue.put(one)
     return one
 
 
 def asked(engine: Engine, session_id: str, request: Request) -> queue.SimpleQueue[Reply]:
-    """Queue a request; where the answer will come."""
+    """Queue a request, and return the queue that will contain the reply."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     submit(engine, session_id, request, replies.put)
     return replies
 
 
 def answered(engine: Engine, session_id: str, request: Request) -> Reply:
-    """Queue a request, and wait for the answer."""
+    """Queue a request, wait for the reply, and return it."""
     return asked(engine, session_id, request).get(timeout=30)
 
 
 def arrived(sender: Sender) -> IncomingMessage:
-    """A message that has just arrived from a sender, and is charged to its key."""
+    """Return a message that has just arrived from a sender and is charged to its key."""
     return sender.message(Account(sender._caller or NoKey.OPEN).charge())
 
 
 def send(
     sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]
 ) -> list[PendingRequest]:
-    """Send the requests of a message; `done` gets all replies."""
+    """Send the requests of a message; `done` is called with all replies."""
     message, decoded = arrived(sender), Decoded(list(requests), {})
     message.decoded(decoded)
     return sender.send(message, decoded, Calls(done))
 
 
 async def ask(sender: Sender, requests: Sequence[Request]) -> list[Reply]:
-    """Send the requests of a message, and wait for the replies."""
+    """Send the requests of a message, wait for the replies, and return them."""
     return await sender.ask(arrived(sender), Decoded(list(requests), {}))
 
 
 def in_order(decoded: Decoded) -> list[Request | Reply]:
-    """The requests of a message, with the answers to unreadable ones in their places."""
+    """Return the requests of a message in order, with an error reply in the place of each
+    unreadable request.
+    """
     found: list[Request | Reply] = list(decoded.requests)
     for place in sorted(decoded.refused):
         found.insert(place, decoded.refused[place])
@@ -133,12 +135,12 @@ def in_order(decoded: Decoded) -> list[Request | Reply]:
 
 
 def read_requests(*arguments: Any) -> list[Request | Reply]:
-    """What `decode_requests` reads, in order."""
+    """Return the requests that `decode_requests` reads, in order."""
     return in_order(decode_requests(*arguments))
 
 
 def answer_to_frame(engine: Engine, limits: MessageLimits, session_id: str, frame: bytes) -> bytes:
-    """The answer to a frame that arrives as over a Serve handle."""
+    """Return the answer to a frame that arrives over a Serve handle."""
     from vlagents_ray.serve.replica.replica import answer_frame
 
     pause = 0.0
@@ -151,8 +153,8 @@ def answer_to_frame(engine: Engine, limits: MessageLimits, session_id: str, fram
 
 @contextlib.contextmanager
 def kernel_timestamps() -> Iterator[None]:
-    """Within this context, the kernel stamps what arrives by TCP; it begins to a little after the
-    first connection asks for it.
+    """Let the kernel add timestamps to data that arrives over TCP within this context. The kernel
+    begins shortly after the first connection enables them.
     """
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,

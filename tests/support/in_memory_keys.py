@@ -1,4 +1,4 @@
-"""API keys without a file, which a test changes while they are in use."""
+"""API keys without a file, which a test can change while they are in use."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from vlagents_ray.serve.access.api_keys import Keys
 
 
 class ChangingKeys:
-    """`keys` sees a change when it reads them again, at every request if `api_keys._CHECK_S` is
-    0.
+    """Keys that a test can change. `keys` sees a change when it reads the keys again, which is at
+    each request if `api_keys._CHECK_S` is 0.
     """
 
     def __init__(self) -> None:
@@ -20,18 +20,18 @@ class ChangingKeys:
         self.keys = self.another()
 
     def another(self) -> Keys:
-        """The same keys, as another process has them."""
+        """Return the same keys as another process would read them."""
         return Keys(
             lambda: json.dumps({"keys": list(self._entries.values())}), lambda: self._version
         )
 
     def add(self, name: str, **allowed: Any) -> str:
-        """A key of that name; returns what its holder shows."""
+        """Add a key of that name, and return the secret that clients send."""
         token = f"vlr_{name}"
         self.change(name, name=name, sha256=hashlib.sha256(token.encode()).hexdigest(), **allowed)
         return token
 
     def change(self, key: str, **fields: Any) -> None:
-        """Give the key of that name other limits."""
+        """Change the limits of the key of that name."""
         self._entries[key] = self._entries.get(key, {}) | fields
         self._version += 1

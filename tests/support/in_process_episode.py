@@ -1,4 +1,4 @@
-"""One episode of an env with an agent in the test's process."""
+"""Run one episode of an environment with a policy in the test's process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vlagents_ray.policies.scripted import Scripted
 
 
 class Always(Agent):
-    """The same action in every step."""
+    """A policy that returns the same action in every step."""
 
     def __init__(self, *action: float) -> None:
         self.action = np.array(action, np.float32)
@@ -36,10 +36,11 @@ def run_episode(
     images: Images = "all",
     **settings: Any,
 ) -> EpisodeResult:
-    """`run_episodes` with a batch of one, which stays open, and the agent as its only session.
+    """Run `run_episodes` with one environment, which stays open, and with the agent as its only
+    session.
 
     Raises:
-        VLAgentsError: An error that is not the policy's.
+        VLAgentsError: An error that the policy did not cause.
     """
     observer, batch = EpisodeObserver(), SequentialBatch([env])
     observer.add_action = executed  # type: ignore[method-assign]
@@ -56,8 +57,8 @@ def run_episode(
 def play(
     env: EvalEnv, name: str, agent: Agent | str, *, seed: int = 0, **options: Any
 ) -> EpisodeResult:
-    """The episode of `seed` and the reset's `options`, run by an agent or by an expert,
-    "module:Class".
+    """Run the episode of `seed` with an agent or with an expert "module:Class", and return it. The
+    `reset_options` are passed to the environment.
     """
     if isinstance(agent, str):
         agent = Scripted.from_config({"expert": agent})

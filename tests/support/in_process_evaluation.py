@@ -19,7 +19,9 @@ from vlagents_ray.interface import Agent
 
 
 def rollout_by(config: EvalConfig, agents: AgentFactory) -> Rollout:
-    """The code of a worker that records what these settings choose."""
+    """Return the code of a worker that records videos and trajectories as these settings
+    require.
+    """
     recorders = partial(Recording, config.video, config.record, images=config.record_images)
     return Rollout(agents, recorders)
 
@@ -27,7 +29,9 @@ def rollout_by(config: EvalConfig, agents: AgentFactory) -> Rollout:
 def play(
     config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: Iterable[int] = ()
 ) -> Results:
-    """Play the plan, apart from the episodes of those numbers, one after another."""
+    """Run the episodes of the plan one after another, except those with the numbers in `left_out`;
+    return the results.
+    """
     worker = rollout_by(config, lambda _policy: make())
     with Store(resolve(config)) as store:
         store.begin_run(versions())
@@ -77,8 +81,8 @@ _WORKER = {
 
 
 def flat_config(**settings: Any) -> EvalConfig:
-    """An evaluation of one policy in one suite, from settings side by side; `seed` is the only
-    seed.
+    """Return an evaluation of one policy in one suite, from flat settings; `seed` is the
+    only seed.
     """
     if "seed" in settings:
         settings = settings | {"seeds": [settings["seed"]]}

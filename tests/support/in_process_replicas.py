@@ -1,4 +1,4 @@
-"""Replicas in this process, and a transport to them that fails on demand."""
+"""Replicas in this process, and a transport to them whose failures a test controls."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ from vlagents_ray.serve.sessions import SessionState
 
 
 class Replicas:
-    """Engines of one policy that know each other; requests go to the first that lives and does
-    not stop.
+    """Engines of one policy that know each other. Requests are sent to the first engine that is
+    alive and not stopping.
     """
 
     def __init__(
@@ -54,10 +54,12 @@ class Replicas:
     ) -> None:
         self.dead: set[int] = set()
         self.frozen: set[int] = set()
-        self.prefer = 0  # where new connections go, if that one lives and does not stop
-        self.lose_reply = False  # of the next frame, after it was acted on
-        self.stopping = False  # the server has no application any more, or none yet
-        self.frames: list[int] = []  # requests in each frame that was sent
+        # number of the replica for new connections, if it is alive and not stopping
+        self.prefer = 0
+        # whether the reply to the next frame is lost after the policy has acted
+        self.lose_reply = False
+        self.stopping = False  # whether the server has no application, as at its start and stop
+        self.frames: list[int] = []  # number of requests in each sent frame
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
@@ -74,7 +76,7 @@ class Replicas:
             engine.start()
 
     def agent(self, **options: Any) -> RemoteAgent:
-        """A client of them."""
+        """Return a client of the replicas."""
         agent = RemoteAgent("http://127.0.0.1:9", **options)
         timeout_s, resume = options.get("timeout_s", 30.0), options.get("resume", True)
         new_transport = partial(InProcess, self)
@@ -84,7 +86,7 @@ class Replicas:
         return agent
 
     def close(self) -> None:
-        """End all engines."""
+        """Close all engines."""
         for migrator in self.migrators:
             asyncio.run_coroutine_threadsafe(migrator.close(), self._loop).result(30)
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -94,7 +96,9 @@ class Replicas:
             engine.close()
 
     def hand_over(self, number: int) -> int:
-        """Hand the sessions of a replica over, as if it stopped; return how many the others took."""
+        """Hand over the sessions of a replica, as if it stopped; return how many sessions the other
+        replicas adopted.
+        """
         held = self.engines[number].sessions.ids()
         asyncio.run_coroutine_threadsafe(self.migrators[number].hand_over(), self._loop).result(30)
         others = [engine for engine in self.engines if engine is not self.engines[number]]
@@ -105,19 +109,19 @@ class Replicas:
 
 
 class InProcess:
-    """Frames to an engine and back."""
+    """A transport that passes frames to an engine in this process."""
 
     name = "in process"
     holds_sessions = True
 
     def __init__(self, replicas: Replicas, watch: ReplicaWatch | None = None) -> None:
-        """Reach `replicas`, which are not pinged."""
+        """Create a transport to `replicas`, without pings."""
         self._replicas = replicas
         self._sender: Sender | None = None
         self._number = -1
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """To the preferred replica, or the first that is there."""
+        """Connect to the preferred replica, or to the first that is available."""
         if self._replicas.stopping:
             raise UnknownApp("no application at this path")
         numbered = sorted(
@@ -137,7 +141,7 @@ class InProcess:
         raise PolicyUnavailable("no replica lives")
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """As a transport does."""
+        """Send a frame and return its replies."""
         if self._sender is None:
             raise PolicyUnavailable("not connected")
         self._replicas.frames.append(len(requests))
@@ -166,7 +170,7 @@ class InProcess:
         return decode_replies(answer)
 
     def close(self) -> None:
-        """As when a connection ends."""
+        """End the connection."""
         if self._sender is not None:
             self._sender.release()
             self._sender = None
@@ -179,7 +183,7 @@ class _Peer(Peer):
         self._number = number
 
     async def ask(self, method: Any, *args: Any, **kwargs: Any) -> Any:
-        """By a call in this process."""
+        """Call a method of the other replica in this process."""
         if self._number in self._replicas.dead:
             raise PeerEnded(self.name)
         if self._number in self._replicas.frozen:
@@ -189,7 +193,9 @@ class _Peer(Peer):
 
 
 def export(engine: Engine, session_id: str) -> SessionState | None:
-    """Take a session out of a replica, as another one does that adopts it; None if it stays."""
+    """Take a session out of a replica, as another replica does that adopts it; return None if the
+    session must stay.
+    """
     copied = answered(engine, session_id, Request("export"))
     if copied.info is None:
         return None

@@ -26,7 +26,7 @@ def jax_compiles() -> Iterator[list[str]]:
     try:
         yield found
     finally:
-        # There is no public one.
+        # JAX has no public function for this.
         from jax._src.monitoring import _unregister_event_duration_listener_by_callback
 
         _unregister_event_duration_listener_by_callback(note)

@@ -1,9 +1,9 @@
-"""Kubernetes manifests against their schemas, without Kubernetes.
+"""Check Kubernetes manifests against their schemas, without Kubernetes.
 
-Core kinds, and the pods inside KubeRay's, have the schemas that the package kubernetes-validate
-brings. KubeRay's own are on no package index; what is here names the keys that our manifests use,
-read from the custom resource definitions of KubeRay 1.6.2 and 1.7.0, and knows no others: a
-misspelt key is an error; the same holds for the kind of Prometheus' operator.
+The package kubernetes-validate contains the schemas of the core kinds and of pods inside KubeRay's
+kinds. No package index has KubeRay's own schemas. The models below have the keys that the manifests
+use, taken from the custom resource definitions of KubeRay 1.6.2 and 1.7.0. Any other key, such as a
+misspelt one, is an error. The same is true for the kind of Prometheus' operator.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class AutoscalerOptions(_Closed):
 
     @property
     def container(self) -> dict[str, Any]:
-        """What KubeRay adds to the head's pod."""
+        """Return the container that KubeRay adds to the head's pod."""
         return {
             "name": "autoscaler",
             "resources": self.resources,
@@ -88,13 +88,13 @@ class WorkerGroup(HeadGroup):
         if not self.min_replicas <= self.replicas <= self.max_replicas:
             raise ValueError(
                 f"{self.group_name}: {self.min_replicas} <= {self.replicas} <= {self.max_replicas} "
-                "is not so"
+                "is false"
             )
         return self
 
 
 class ClusterSpec(_Closed):
-    ray_version: str  # authOptions wants it, and 2.52 at least
+    ray_version: str  # authOptions requires this key, and at least 2.52
     auth_options: AuthOptions
     enable_in_tree_autoscaling: Literal[True]
     autoscaler_options: AutoscalerOptions
@@ -129,7 +129,7 @@ class JobSpec(_Closed):
 
 
 class Metadata(_Closed):
-    # KubeRay makes longer ones of it.
+    # KubeRay derives longer names from this name.
     name: str = Field(max_length=47, pattern=r"[a-z]([-a-z0-9]*[a-z0-9])?")
 
 
@@ -170,7 +170,7 @@ class MonitorSpec(_Closed):
 
 
 class PodMonitor(_Closed):
-    """Of Prometheus' operator."""
+    """A PodMonitor of Prometheus' operator."""
 
     api_version: Literal["monitoring.coreos.com/v1"]
     kind: Literal["PodMonitor"]
@@ -179,19 +179,19 @@ class PodMonitor(_Closed):
 
 
 def documents(file: Path) -> list[dict[str, Any]]:
-    """The manifests in a file."""
+    """Return the manifests in a file."""
     return [one for one in yaml.safe_load_all(file.read_text()) if one is not None]
 
 
 def manifest(kind: str, name: str) -> dict[str, Any]:
-    """The one of this kind and name in cluster/kuberay."""
+    """Return the manifest of this kind and name in cluster/kuberay."""
     found = [one for file in sorted(FOLDER.glob("*.yaml")) for one in documents(file)]
     [it] = [one for one in found if one["kind"] == kind and one["metadata"]["name"] == name]
     return it
 
 
 def check(document: dict[str, Any]) -> None:
-    """Raises what is wrong with a manifest: of pydantic or of kubernetes-validate."""
+    """Raise the validation error of pydantic or of kubernetes-validate if a manifest is invalid."""
     ours = {"RayService": RayService, "RayJob": RayJob, "PodMonitor": PodMonitor}
     if document["kind"] in ours:
         ours[document["kind"]].model_validate(document)
@@ -208,7 +208,7 @@ print(json.dumps({name: [app.status, app.message] for name, app in serve.status(
 
 
 def serve_runs(cluster: RayCluster) -> None:
-    """Wait until all applications of a cluster run; `AssertionError` if one fails."""
+    """Wait until all applications of a cluster run; raise `AssertionError` if one fails."""
 
     def runs() -> bool:
         states = json.loads(cluster.python(STATUS).splitlines()[-1])

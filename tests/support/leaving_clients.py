@@ -1,5 +1,5 @@
-"""A replica and its gateways in this process, and a client of each endpoint that acts, sends
-half a message, leaves.
+"""A replica and its gateways in this process, and for each endpoint a client that acts, sends half
+a message, and leaves.
 """
 
 from __future__ import annotations
@@ -79,25 +79,28 @@ from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray_dialects.messages import openpi as openpi_codec
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
-BOUND_S = 5.0  # nothing waits for longer
-# For a picture of this brightness the policy returns 8 MB, more than the kernel's buffers hold.
+BOUND_S = 5.0  # longest time for any wait
+# Brightness of a picture for which the policy returns 8 MB, more than the kernel's buffers can
+# contain.
 LARGE = 240
-HELD = 250  # the policy acts on pictures from this brightness on when its gate opens
+HELD = 250  # from this brightness on, the policy waits until its gate opens
 OTHERS = ("another", "a third")  # sessions of other clients
-SLOW_S = 0.02  # of each act, so that another thread reads the connections while the policy acts
+# duration of each act, so that another thread reads the connections while the policy acts
+SLOW_S = 0.02
 ACTED = "acted"
 LIMITS = MessageLimits(body_bytes=2**20)
 
 
-_LARGE_ACTION = np.random.default_rng(0).random(2**21, np.float32)  # which no protocol can compress
+# random values, which no protocol can compress
+_LARGE_ACTION = np.random.default_rng(0).random(2**21, np.float32)
 
 
 class Acts(list[int]):
-    """The brightness of the pictures that a policy has acted on, in all sessions."""
+    """The brightness of all pictures on which a policy acted, in all sessions."""
 
 
 class GatedPolicy(Agent):
-    """Notes the brightness of the pictures that it has acted on."""
+    """A policy that records the brightness of the pictures that it receives."""
 
     def __init__(self) -> None:
         self.acted = Acts()
@@ -121,7 +124,7 @@ class GatedPolicy(Agent):
 
 
 class SlowRelay:
-    """Forwards one connection to a port; answers stay unread while the `gate` is closed."""
+    """Forwards one connection to a port; answers are not read while the `gate` is closed."""
 
     def __init__(self, target: int, stack: contextlib.ExitStack) -> None:
         self.gate = threading.Event()
@@ -156,13 +159,13 @@ class SlowRelay:
 
 
 class StoppableServer:
-    """A replica that stops as one in Serve does, and the gateways, which stop at the same time."""
+    """A replica that stops like in Serve, and gateways that stop at the same time."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.stack = stack
         self.policy = GatedPolicy()
         self.engine = Engine(self.policy, EngineSettings(max_batch_size=1))
-        self.queued: list[Any] = []  # each request that was queued
+        self.queued: list[Any] = []  # all requests that were queued
         put = self.engine.queue.put
 
         def noted(*requests: Any) -> None:
@@ -176,8 +179,9 @@ class StoppableServer:
         self.near.open()
         self.engine.start()
         self.shutdown = Shutdown()
-        self._loop: asyncio.AbstractEventLoop | None = None  # of the requests to the server's port
-        self.requests = 0  # requests of HTTP, and WebSockets, that are under way
+        # the event loop of requests to the server's port
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.requests = 0  # number of HTTP requests and WebSockets in progress
         routes = dialect_routes(
             DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS)
         )
@@ -192,7 +196,7 @@ class StoppableServer:
         stack.callback(self.stop)
 
     def hold_policy(self) -> None:
-        """Let the policy act for another client until its gate opens."""
+        """Send a request of another client on which the policy acts until its gate opens."""
         for session in OTHERS:
             self.ask(session, "reset")
         while not self.engine.queue.window.overlaps:
@@ -202,7 +206,7 @@ class StoppableServer:
         assert self.policy.entered.wait(BOUND_S)
 
     def ask(self, session: str, op: Any) -> None:
-        """Reset or act in a session of another client, after all requests that wait."""
+        """Reset or act in a session of another client, after all waiting requests."""
         assert self._send(session, op, 1).get(timeout=BOUND_S).error is None
 
     def _send(self, session: str, op: Any, brightness: int) -> queue.SimpleQueue[Reply]:
@@ -212,7 +216,7 @@ class StoppableServer:
         return replies
 
     def freeze(self) -> threading.Event:
-        """Let no thread read the connections until the event that is returned is set."""
+        """Block all threads that read connections until the returned event is set."""
         continues = threading.Event()
         self.stack.callback(continues.set)
         schedules: list[Callable[[Callable[[], None]], object]] = [
@@ -234,8 +238,8 @@ class StoppableServer:
         return continues
 
     def is_stopping(self) -> bool:
-        """Whether all parts of the server have begun to stop that can begin before the policy's
-        gate opens.
+        """Return whether all parts of the server are stopping that do not wait for the policy's
+        gate.
         """
         gateways = self.gateways.values()
         closing = all(
@@ -244,8 +248,8 @@ class StoppableServer:
         return closing and (self.requests > 0 or self.engine.queue._closed)
 
     def stop(self) -> None:
-        """Stop the replica as Serve and `PolicyReplica` do: first what keeps Serve from ending
-        it.
+        """Stop the replica like Serve and `PolicyReplica` do: requests in progress end first, then
+        the engine and its endpoints.
         """
         if self._stopped:
             return
@@ -261,7 +265,9 @@ class StoppableServer:
                 closed.result()
 
     def relay(self, name: str) -> SlowRelay:
-        """Put a relay before the own port of the replica or of a dialect, for later clients."""
+        """Put a relay in front of the own port of the replica or of a dialect, for later
+        clients.
+        """
         port = self.own.address.port if name == "own port" else self.ports[name.lower()]
         relay = SlowRelay(port, self.stack)
         if name == "own port":
@@ -271,13 +277,13 @@ class StoppableServer:
         return relay
 
     def is_listening(self) -> bool:
-        """Whether the own port of the replica or of a dialect accepts connections."""
+        """Return whether the own port of the replica or of a dialect accepts connections."""
         return self.own._listener.fileno() >= 0 or any(
             dialect.alive() for dialect in self.gateways.values()
         )
 
     def _as_in_serve(self, app: ASGIApp) -> ASGIApp:
-        """Count the requests that are under way; cancel one of HTTP when its client leaves, as
+        """Count the requests in progress, and cancel an HTTP request when its client leaves, like
         Serve does.
         """
 
@@ -310,7 +316,7 @@ class StoppableServer:
         return run
 
     def open_gateway(self, name: str, **settings: Any) -> int:
-        """Serve a dialect with a port of its own; returns the port."""
+        """Serve a dialect with a separate port, and return the port."""
         cls, port = dialect_class(name), free_port()
         context = GatewayContext("app", self._agent, LIMITS, 100, 30.0, None, NoKey.OPEN)
         dialect = cls(name, cls.Config(port=port, **settings), context)
@@ -335,7 +341,7 @@ class StoppableServer:
 
 
 class LeavingClient(abc.ABC):
-    """One client, which has a session in which it has acted once."""
+    """A client with a session in which it has acted once."""
 
     closes_with_code = False  # whether its connection is a WebSocket
 
@@ -348,21 +354,21 @@ class LeavingClient(abc.ABC):
 
     @abc.abstractmethod
     def answer(self) -> str:
-        """Wait for the answer, which is `ACTED` or the code of an error."""
+        """Wait for the answer, and return `ACTED` or the code of an error."""
 
     @abc.abstractmethod
     def send_half(self) -> None:
-        """Send half of the message of an act."""
+        """Send the first half of an act message."""
 
     @abc.abstractmethod
     def end(self) -> str:
-        """Wait until the server has ended the connection; returns the close code and its reason,
-        if it has them.
+        """Wait until the server has ended the connection; return the close code and its reason, if
+        they exist.
         """
 
     @abc.abstractmethod
     def leave(self) -> None:
-        """End the connection at once."""
+        """Close the connection at once."""
 
 
 class WebSocketClient(LeavingClient):
@@ -420,7 +426,9 @@ class WebSocketClient(LeavingClient):
 
 
 class XPolicyLabClient(WebSocketClient):
-    """A client that repeats its message over a new connection if the server ends this one."""
+    """A client that repeats its message over a new connection if the server ends the
+    current one.
+    """
 
     def answer(self) -> str:
         try:
@@ -469,14 +477,15 @@ class HttpClient(LeavingClient):
         self._connection.endheaders(document[: len(document) // 2])
 
     def end(self) -> str:
-        return self.answer()  # of the half message: an idle connection ends with the process
+        # the answer to the half message, since an idle connection ends only with the process
+        return self.answer()
 
     def leave(self) -> None:
         self._connection.sock.shutdown(socket.SHUT_RDWR)
 
 
 class ThreadedClient(LeavingClient):
-    """A client whose calls wait for the answer, and therefore run on a thread."""
+    """A client whose calls wait for the answer, and therefore run in a thread."""
 
     def __init__(self, server: StoppableServer) -> None:
         super().__init__(server)
@@ -511,7 +520,7 @@ class ShmClient(ThreadedClient):
         return ACTED if error is None else error.code
 
     def send_half(self) -> None:
-        """Do nothing: a datagram is sent as a whole."""
+        """Do nothing, since a datagram is always sent as a whole."""
 
     def end(self) -> str:
         while (code := self.act(2)) != ConnectionLost.code:
@@ -560,7 +569,8 @@ class Gr00tClient(LeavingClient):
     def end(self) -> str:
         if hasattr(self, "_half"):
             return _end_of(self._half)
-        return "ended"  # ZeroMQ connects again by itself, and shows no end of a connection
+        # ZeroMQ connects again automatically, and does not report the end of a connection
+        return "ended"
 
     def leave(self) -> None:
         self._client.close()
@@ -639,7 +649,9 @@ class LeRobotClient(LeavingClient):
 
 
 class RemoteRobotClient(LeavingClient):
-    """A robot of LeRobot's remote inference. Its gateway opens with it, as that takes a while."""
+    """A robot of LeRobot's remote inference. The gateway takes a while to open, so only this client
+    opens it.
+    """
 
     def __init__(self, server: StoppableServer) -> None:
         super().__init__(server)
@@ -665,7 +677,7 @@ class RemoteRobotClient(LeavingClient):
         return "unavailable" if "stopping" in answer.body["message"] else answer.body["code"]
 
     def send_half(self) -> None:
-        """Do nothing: a sample is sent as a whole."""
+        """Do nothing, since a sample is always sent as a whole."""
 
     def end(self) -> str:
         while self._robot.presence.get(timeout=BOUND_S):
@@ -798,7 +810,7 @@ GATEWAYS = ("GR00T", "vlagents", "LeRobot", "lerobot_remote")
 
 
 def seconds_of(call: Callable[[], Any]) -> float:
-    """The duration of a call, s."""
+    """Return the duration of a call in seconds."""
     begun = time.perf_counter()
     call()
     return time.perf_counter() - begun

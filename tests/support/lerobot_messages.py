@@ -1,5 +1,5 @@
-"""The messages of LeRobot's asynchronous inference: look-alikes of its classes, with the same
-pickles.
+"""The messages of LeRobot's asynchronous inference: copies of its classes whose pickles are equal
+to LeRobot's.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ for _one in MESSAGES:
 
 @contextmanager
 def _importable() -> Iterator[None]:
-    """Let Python's pickler find the classes under LeRobot's names, whether it is installed or
-    not.
+    """Let Python's pickler find the classes under LeRobot's names, even if LeRobot is not
+    installed.
     """
     folders = HELPERS.split(".")
     names = [".".join(folders[: n + 1]) for n in range(len(folders))]
@@ -83,7 +83,7 @@ def _importable() -> Iterator[None]:
 
 
 def pickled(message: Any, protocol: int = pickle.DEFAULT_PROTOCOL) -> bytes:
-    """What LeRobot's client and server send."""
+    """Pickle a message like LeRobot's client and server."""
     with _importable():
         return pickle.dumps(message, protocol)
 
@@ -100,7 +100,7 @@ def _tensor(numbers: list[float]) -> np.ndarray:
 
 
 def actions_of(data: bytes) -> list[TimedAction]:
-    """What LeRobot's client reads, with arrays for tensors."""
+    """Return the actions that LeRobot's client would read, with arrays in place of tensors."""
     return _Unpickler(io.BytesIO(data)).load()
 
 
@@ -114,7 +114,7 @@ def setup(**changes: Any) -> RemotePolicyConfig:
 def robot_saw(
     timestep: int, pixel: int = 0, task: str = "abc", must_go: bool = False, **more: Any
 ) -> TimedObservation:
-    """An observation of a robot with `FEATURES`."""
+    """Return an observation of a robot with `FEATURES`."""
     values = {
         "shoulder.pos": 0.5,
         "gripper.pos": 0.25,
@@ -125,7 +125,7 @@ def robot_saw(
 
 
 def field_of(number: int, value: int | bytes) -> bytes:
-    """A field of a protobuf message: a number below 128, or bytes."""
+    """Return a field of a protobuf message with a number below 128, or with bytes."""
     if isinstance(value, int):
         return bytes([number << 3, value])
     size, length = [], len(value)
@@ -139,7 +139,7 @@ BEGIN, MIDDLE, END = 1, 2, 3
 
 
 def parts_of(data: bytes, size: int = 2 * 2**20) -> Iterator[bytes]:
-    """The messages of an observation, in parts as LeRobot's client sends them."""
+    """Return the messages of an observation, in parts like LeRobot's client sends them."""
     for at in range(0, len(data), size):
         state = END if at + size >= len(data) else BEGIN if at == 0 else MIDDLE
         yield field_of(1, state) + field_of(2, data[at : at + size])
@@ -149,8 +149,8 @@ class AsyncClient:
     """A client of LeRobot's service over gRPC, without its threads and its robot."""
 
     def __init__(self, port: int, **options: Any) -> None:
-        # A separate channel for each: gRPC shares the connections of channels with the same
-        # options.
+        # Each client has a separate channel, since gRPC shares the connections of channels with the
+        # same options.
         self.channel = grpc.insecure_channel(
             f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)], **options
         )
@@ -170,7 +170,7 @@ class AsyncClient:
         self.send_parts(parts_of(pickled(observation)), timeout=20)
 
     def actions(self) -> list[TimedAction]:
-        """The actions for what was sent last; none if the server has no observation."""
+        """Return the actions for the latest observation; empty if the server has none."""
         answer = self.get(b"", timeout=20)
         return actions_of(answer[answer.index(b"\x80") :]) if answer else []
 

@@ -1,8 +1,8 @@
-"""A simulated robot as LeRobot finds it, `--robot.type=mirror`: it is at once where an action sends
-it.
+"""A simulated robot that LeRobot finds with `--robot.type=mirror`. It reaches the position of an
+action at once.
 
-With `--teleop.type=mirror`, its operator corrects the policy now and then, by the keys of LeRobot's
-own loop.
+With `--teleop.type=mirror`, a simulated operator corrects the policy from time to time, with the
+keys of LeRobot's own loop.
 """
 
 import json
@@ -18,18 +18,19 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from mirror_policy import CAMERA, SIDE, colour_of
 
 MOTORS = ("shoulder.pos", "elbow.pos", "gripper.pos")
-KEYBOARD = "MIRROR_KEYBOARD"  # the descriptor that writes what the operator types
-WATCHED, MOVED = 5, 3  # actions of the policy before a correction, and of the operator in one
+KEYBOARD = "MIRROR_KEYBOARD"  # file descriptor to which the operator's key presses are written
+# number of the policy's actions before a correction, and of the operator's actions in a correction
+WATCHED, MOVED = 5, 3
 
 
 def moved_to(move: int) -> list[float]:
-    """Where the operator's move of that number, counted from 1, sends the motors."""
+    """Return the motor positions of the operator's move with that number, counted from 1."""
     return [move / 8, -move / 8, 0.5]
 
 
 class Operator:
-    """Who pauses the robot after some actions of the policy, moves it, and gives it back; waits
-    for what happens.
+    """An operator who pauses the robot after some actions of the policy, moves it, and returns
+    control. The operator waits for each change before the next key press.
     """
 
     def __init__(self) -> None:
@@ -37,7 +38,9 @@ class Operator:
         self._last: dict[str, float] = {}
 
     def sees(self, action: dict[str, float]) -> None:
-        """The robot gets an action; LeRobot's loop repeats the last one while it is paused."""
+        """Update the operator's state with the robot's next action. LeRobot's loop repeats the last
+        action while the policy is paused.
+        """
         paused, self._last = action == self._last, dict(action)
         if self.does == "watches" and not paused:
             self.watched += 1
@@ -49,7 +52,7 @@ class Operator:
             self._press("watches", b" ")
 
     def move(self) -> list[float]:
-        """Where the operator sends the motors next."""
+        """Return the next motor positions from the operator."""
         self.moves += 1
         if self.does == "corrects" and self.moves % MOVED == 0:
             self._press("ends", b"\t")
@@ -68,13 +71,13 @@ _operator = Operator()
 @dataclass
 class MirrorRobotConfig(RobotConfig):
     camera: str = CAMERA
-    # File with a line of JSON for each action: what it was seen to be, and where it is sent.
+    # File with a line of JSON for each action: the observed position and the commanded one.
     log: str = ""
-    actions: int = 0  # Ctrl-C after so many
+    actions: int = 0  # number of actions after which Ctrl-C is sent
 
 
 class MirrorRobot(Robot):
-    """Each of its images has another colour."""
+    """A robot whose images all differ in colour."""
 
     config_class, name = MirrorRobotConfig, "mirror"
     is_connected = is_calibrated = True
@@ -123,7 +126,7 @@ class MirrorTeleoperatorConfig(TeleoperatorConfig): ...
 
 
 class MirrorTeleoperator(Teleoperator):
-    """What the operator moves the robot with."""
+    """The operator's input device."""
 
     config_class, name = MirrorTeleoperatorConfig, "mirror"
     is_connected = is_calibrated = True

@@ -1,4 +1,6 @@
-"""A server with the live page, without Ray, and viewers: of it, and of the page of a command."""
+"""A server with the live page, without Ray, and viewers of this page and of the page of a
+command.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,7 @@ METADATA = {
 
 
 class Address:
-    """An address of the web, as `browser.Page.open` takes files."""
+    """A URL in the form in which `browser.Page.open` accepts files."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -63,14 +65,14 @@ class Address:
 
 
 class LivePage:
-    """The page of a command that evaluates."""
+    """The page of a running evaluation command."""
 
     def __init__(self) -> None:
         self.address = f"127.0.0.1:{free_port()}"
         self.url = f"http://{self.address}"
 
     def document(self) -> dict[str, Any]:
-        """What it shows; {} while it is not there."""
+        """Return the data that the page shows; {} while the page does not exist."""
         with (
             suppress(urllib.error.URLError, ConnectionError),
             urllib.request.urlopen(f"{self.url}/v1/live") as answer,
@@ -84,7 +86,7 @@ class LivePage:
         return found
 
     def steps(self) -> list[int]:
-        """Those in its learning curve."""
+        """Return the training steps in the learning curve."""
         return [
             point["step"]
             for curve in self.evaluation().get("curves", [])
@@ -109,7 +111,7 @@ class LiveServer:
         return f"http://127.0.0.1:{self.port}"
 
     def viewer(self, key: str = "") -> closing[ProxiedSocket]:
-        """A WebSocket that watches."""
+        """Return a WebSocket that receives the live page's data."""
         return closing(open_websocket(f"ws://127.0.0.1:{self.port}/v1/live", Credentials(key), 10))
 
 
@@ -122,9 +124,7 @@ def live_server(
     insecure: bool = False,
     settings: LiveConfig | None = None,
 ) -> Iterator[LiveServer]:
-    """A replica of `agent`, by default `noop`, with the parts that are on by default, until the
-    end of the context.
-    """
+    """Run a replica of `agent`, by default `noop`, with the parts that are on by default."""
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
     context = PartContext(
@@ -148,13 +148,13 @@ def live_server(
 
 
 def part_of(parts: ReplicaParts, kind: type[Part]) -> Part:
-    """The one part of that class."""
+    """Return the only part of that class."""
     [found] = [part for part in parts._parts.values() if isinstance(part, kind)]
     return found
 
 
 def ask(socket: ProxiedSocket, shown: Sequence[str] = ()) -> tuple[dict[str, Any], list[bytes]]:
-    """Ask for the next message; its document, and the files in it."""
+    """Request the next message, and return its document and its files."""
     socket.send(json.dumps({"shown": list(shown)}).encode(), 10)
     return read_message(socket.recv(10))
 

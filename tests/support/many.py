@@ -1,7 +1,7 @@
-"""How many examples a test draws that draws many: all of them, or a fifth in `make check`, whose
-profile is `quick`.
+"""The number of examples of tests that draw many: all of them, or a fifth in `make check`, which
+uses the profile `quick`.
 
-No profile limits the time of an example: on a busy machine that would be an absolute time.
+No profile limits the time of an example: on a busy machine a time limit would fail by chance.
 """
 
 from __future__ import annotations
@@ -19,5 +19,5 @@ if settings.get_current_profile_name() == "default":
 
 
 def many(number: int) -> int:
-    """So many examples, or the share of them that the profile of `--hypothesis-profile` draws."""
+    """Return `number`, or the share of it that the profile of `--hypothesis-profile` draws."""
     return number * settings().max_examples // _WHOLE

@@ -1,5 +1,5 @@
-"""Policies whose chunks are a known function of what they got, so that a test can say what
-LeRobot should do.
+"""Policies whose chunks are a known function of their input, so that a test can predict LeRobot's
+actions.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import DELAY, LEFTOVER
 
 CAMERA, SIDE, HZ, ROWS = "top", 48, 20, 2
-COUNT = 1 / 1024  # exact, and small, so that a gripper can be there
+COUNT = 1 / 1024  # exact in floating point, and small enough to be a gripper position
 CONTRACT = Contract(
     cameras={CAMERA: CameraSpec(SIDE, SIDE)},
     state={"joints": StateSpec(2, "rad")},
@@ -27,16 +27,17 @@ CONTRACT = Contract(
 
 
 def colour_of(image: int) -> int:
-    """The bytes of the robot's image of that number, counted from 1."""
+    """Return the value of all bytes of the robot's image with that number, counted from 1."""
     return image * 37 % 256
 
 
 def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.ndarray:
-    """The chunk, (2, 3) float32, of a session's act of that number, counted from 1.
+    """Return the chunk, (2, 3) float32, for a session's call with the number `acts`, counted from
+    1.
 
     Args:
         state: Two joints and the gripper, in [0, 1].
-        colour: The bytes of the image.
+        colour: The value of all bytes of the image.
     """
     shoulder, elbow, gripper = (float(number) for number in state)
     rows = [
@@ -47,10 +48,13 @@ def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.
 
 
 class MirrorPolicy(Agent):
-    """The policy; `begun` has the instruction and the seed of each episode."""
+    """A policy that returns `mirrored` chunks; `begun` has the instruction and the seed of each
+    episode.
+    """
 
     contract = CONTRACT
-    begun: ClassVar[list[tuple[str | None, object]]] = []  # by all sessions, which are copies
+    # shared by all sessions, which are copies
+    begun: ClassVar[list[tuple[str | None, object]]] = []
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         self.instruction, self.acts = instruction or "", 0
@@ -64,14 +68,14 @@ class MirrorPolicy(Agent):
 
 
 class CountingPolicy(Agent):
-    """A policy with real-time chunking, whose rows (n, n, n) go on counting in `COUNT` from the
-    plan, else from 1.
+    """A policy with real-time chunking. Its rows (n, n, n) continue to count in `COUNT` from the
+    given plan, or from 1 without a plan.
     """
 
     contract = replace(CONTRACT, chunk=40)
     continues_plans = True
     longest_prefix = 0
-    # rows, (H, 3), and the delay of each act with a plan.
+    # Rows, (H, 3), and delay of the plan in each call that has one.
     plans: ClassVar[list[tuple[np.ndarray, int]]] = []
 
     def act(self, obs: Obs) -> Act:

@@ -1,7 +1,8 @@
-"""Mutants: small defects, drawn over the subjects of the core, each run against its tests.
+"""Mutation tests: small defects, drawn from all subjects of the core, and each run against the
+subject's tests.
  `python -m tests.support.mutants --seed 56 --count 60` runs them in a copy of the checkout, and
-writes a line of JSON for each. A mutant that survives shows a test that is missing, code that
-nothing needs, or a change that means the same. `--list` only prints them.
+writes a line of JSON for each. A surviving mutant shows a missing test, unnecessary code, or a
+change without an effect. `--list` only prints them.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 
-# What no test may need here: mutants are run against tests that take seconds.
+# Excluded markers: mutants run only against tests that take seconds.
 MARKS = (
     "not (ray or server or hosts or sim or vulkan or gpu or browser or node or compiler or alone"
     " or slow or integration)"
 )
-RELATED_FILES = 6  # test files that are run first
+RELATED_FILES = 6  # number of test files that run first
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A part of the core, and the tests that can find a defect in it, cheapest first."""
+    """A part of the core, and the tests that can detect its defects, fastest first."""
 
     sources: tuple[str, ...]  # patterns of files
     tests: tuple[str, ...]  # folders and files
@@ -134,7 +135,7 @@ class Mutant:
     start: int  # byte of the file at which `before` begins
 
     def in_source(self, source: bytes) -> bytes:
-        """Return the bytes of the file with the change."""
+        """Return the bytes of the file with the change applied."""
         end = self.start + len(self.before.encode())
         return source[: self.start] + self.after.encode() + source[end:]
 
@@ -144,7 +145,7 @@ class Mutant:
 
 
 def changed_node(node: ast.AST) -> ast.AST | None:
-    """Return the node with a defect, or None if this kind of node gets none."""
+    """Return the node with a defect; None if this kind of node has no mutation."""
     changed = copy.deepcopy(node)
     match changed:
         case ast.Compare() if type(changed.ops[0]) in _COMPARISONS:
@@ -169,7 +170,7 @@ def changed_node(node: ast.AST) -> ast.AST | None:
 
 
 def executed_nodes(node: ast.AST) -> Iterator[ast.AST]:
-    """The nodes that a program executes, except those of types and of messages of errors."""
+    """Yield the nodes that a program executes, except types and error messages."""
     if isinstance(node, ast.Raise):
         return
     yield node
@@ -182,7 +183,7 @@ def executed_nodes(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def mutants_of(subject: str, file: Path) -> Iterator[Mutant]:
-    """All mutants of a file."""
+    """Yield all mutants of a file."""
     source = file.read_bytes()
     line_starts = [0, *itertools.accumulate(map(len, source.splitlines(keepends=True)))]
 
@@ -202,7 +203,9 @@ def mutants_of(subject: str, file: Path) -> Iterator[Mutant]:
 
 
 def _is_replaceable(node: ast.AST, text: str) -> bool:
-    """Whether the text alone is the node: parts of an f-string have no text that is."""
+    """Return whether the text alone represents the node. Parts of an f-string are not
+    replaceable.
+    """
     if not isinstance(node, ast.expr):
         return True
     try:
@@ -213,9 +216,9 @@ def _is_replaceable(node: ast.AST, text: str) -> bool:
 
 
 def draw(seed: int, count: int) -> list[Mutant]:
-    """Draw `count` mutants, as many of each subject, interleaved.
+    """Draw `count` mutants in total, equally many of each subject, and interleave the subjects.
 
-    The draws of a subject depend on the seed and on its own sources alone.
+    The draws of a subject depend only on the seed and on the subject's sources.
     """
     turns: list[tuple[int, str, Mutant]] = []
     for name, subject in SUBJECTS.items():
@@ -228,7 +231,9 @@ def draw(seed: int, count: int) -> list[Mutant]:
 
 
 def files_of_tests(mutant: Mutant) -> tuple[list[str], list[str]]:
-    """The test files that are about the module of the mutant, and the others of its subject."""
+    """Return the test files most related to the module of the mutant, and the remaining files of
+    its subject.
+    """
     files: list[Path] = []
     for place in SUBJECTS[mutant.subject].tests:
         path = ROOT / place
@@ -241,7 +246,7 @@ def files_of_tests(mutant: Mutant) -> tuple[list[str], list[str]]:
         imports = import_name in text
         return 100 * (module.name in file.stem) + 50 * imports + min(text.count(module.name), 40)
 
-    # Models of other libraries are in environments of their own.
+    # Models of other libraries have separate environments.
     names = dict.fromkeys(
         str(file.relative_to(ROOT)) for file in files if "families" not in file.parts
     )
@@ -250,7 +255,7 @@ def files_of_tests(mutant: Mutant) -> tuple[list[str], list[str]]:
 
 
 def copy_checkout(folder: Path) -> None:
-    """Copy the files of the checkout, with those that are not committed yet."""
+    """Copy the files of the checkout, including uncommitted files."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         check=True,
@@ -271,7 +276,7 @@ def play(root: Path, tests: Sequence[str], python: str, limit_s: float) -> tuple
         root: The copy of the project.
         tests: Files or names of tests.
         python: The program that runs pytest.
-        limit_s: Seconds until the run ends without a result.
+        limit_s: Time limit of the run, in seconds.
 
     Returns:
         "killed", "survived" or "out of time", and the test that failed or the last line of pytest.
@@ -298,7 +303,7 @@ def play(root: Path, tests: Sequence[str], python: str, limit_s: float) -> tuple
         return "out of time", f"no result after {limit_s:g} s"
     failures = re.findall(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
     last_line = done.stdout.strip().rpartition("\n")[2]
-    if done.returncode in (0, 5):  # 5: no test is left after MARKS
+    if done.returncode in (0, 5):  # exit status 5: no test remains after MARKS
         return "survived", last_line
     if done.returncode in (1, 2, 4):
         return "killed", failures[0] if failures else last_line
@@ -306,7 +311,7 @@ def play(root: Path, tests: Sequence[str], python: str, limit_s: float) -> tuple
 
 
 def play_mutant(mutant: Mutant, root: Path, python: str, limit_s: float) -> dict[str, object]:
-    """Play a mutant against the tests of its subject, those about its module first."""
+    """Run the tests of the mutant's subject against it, the most related tests first."""
     began = time.monotonic()
     changed = root / mutant.file
     source = changed.read_bytes()
@@ -331,11 +336,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=56)
     parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--list", action="store_true", help="print the mutants, and play none")
+    parser.add_argument(
+        "--list", action="store_true", help="print the mutants without running tests"
+    )
     parser.add_argument("--only", type=int, nargs="+", help="numbers of mutants, as --list prints")
-    parser.add_argument("--jobs", type=int, default=1, help="mutants that are played at once")
-    parser.add_argument("--limit-s", type=float, default=240.0, help="seconds of a run of pytest")
-    parser.add_argument("--python", default=sys.executable, help="what runs pytest")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="number of mutants that run at the same time"
+    )
+    parser.add_argument(
+        "--limit-s", type=float, default=240.0, help="time limit of a run of pytest, in seconds"
+    )
+    parser.add_argument("--python", default=sys.executable, help="Python program that runs pytest")
     parser.add_argument("--out", type=Path, default=Path("mutants.jsonl"), help="results, appended")
     options = parser.parse_args()
 

@@ -1,12 +1,12 @@
-"""What a test needs, by its markers: what this machine cannot give is skipped, what no marker names
-is rejected.
+"""The requirements of tests, declared by markers. A test whose requirement this machine lacks is
+skipped; the use of a resource without its marker is an error.
 
-So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no
-simulator. The marker `integration` is the tier that `make test` leaves out.
- On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests
-need but a GPU, sources and assets that are on no package index, a browser where apt has none,
-libraries that others load wherever they are installed, and other versions of Python: only tests
-marked `gpu`, `source`, `assets`, `browser`, `library` and `python` may be skipped there.
+So `make check`, which excludes these markers, never starts Ray and never loads a simulator. `make
+test` excludes the marker `integration`.
+ On CI, `VLAGENTS_FAIL_ON_SKIP=1` turns a skipped test into a failure. CI cannot install a GPU,
+ sources and assets that are on no package index, a browser that apt lacks, libraries that would
+ change the behaviour of other packages, and other versions of Python. So only tests marked `gpu`,
+ `source`, `assets`, `browser`, `library` and `python` may be skipped there.
 """
 
 from __future__ import annotations
@@ -32,13 +32,12 @@ from typescript_client import node_version
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.python_env.create import find_python, has_gpu
 
-# Ray makes a session's folder in this one: in no process of the test does one start that finds a
-# file in its place.
-# short: a longer name would be replaced, as sockets in it could not be named.
+# A file in the place of Ray's session folder, so that no process of the test can start Ray. The
+# path is short, since Ray replaces a path that is too long for the names of sockets.
 _NO_RAY = "/dev/null/not-marked-ray"
 INTEGRATION = "integration"
 _RAY = ("ray", "server", "hosts")
-# Few machines have what tests of these need, or they take minutes: they are of the tier
+# Tests with these markers need a rare machine or take minutes, so they belong to the tier
 # `integration`.
 _INTEGRATION = ("browser", "compiler", "hosts", "node", "vulkan")
 _SIMULATORS = {
@@ -57,8 +56,8 @@ _SIMULATORS = {
 
 
 def left_out(file: Path, markexpr: str) -> bool:
-    """Whether `-m 'not (a or b)'` or `-m integration` leaves out all of a file, which then need
-    not be imported.
+    """Return whether `-m 'not (a or b)'` or `-m integration` excludes all tests of a file, which
+    then need not be imported.
     """
     names = re.fullmatch(r"not \((\w+(?: or \w+)*)\)", markexpr)
     if file.suffix != ".py" or (names is None and markexpr != INTEGRATION):
@@ -74,14 +73,14 @@ def left_out(file: Path, markexpr: str) -> bool:
 
 
 def mark_tier(item: pytest.Item) -> None:
-    """Mark a test of `integration` that one of its other markers makes one."""
+    """Add the marker `integration` to a test if one of its other markers implies it."""
     if any(item.get_closest_marker(name) for name in _INTEGRATION):
         item.add_marker(INTEGRATION)
 
 
 def skip_what_is_missing(item: pytest.Item) -> None:
-    """Skip what this machine cannot run; the Vulkan device is looked for when the first test
-    wants it.
+    """Skip a test whose requirements this machine lacks. The Vulkan device is searched for when the
+    first test needs it.
     """
     for marker in item.iter_markers():
         why_missing = _WHY_MISSING.get(marker.name)
@@ -121,7 +120,7 @@ def _no_python(version: str) -> str | None:
 
 @functools.cache
 def no_hosts() -> str | None:
-    """Why tests cannot have several hosts here; None if they can."""
+    """Return why tests cannot simulate several hosts here; None if they can."""
     from benchmarks.hosts import require
 
     try:
@@ -145,8 +144,8 @@ def _no_vulkan() -> str | None:
     return ManiSkill.missing()
 
 
-# For the markers of what a machine may lack: the reason, or None if it has it, by the marker's
-# arguments.
+# For each marker of a requirement, a function of the marker's arguments that returns why this
+# machine lacks it; None if it does not.
 _WHY_MISSING: dict[str, Callable[..., str | None]] = {
     "gpu": _no_gpu,
     "source": _no_source,
@@ -163,7 +162,7 @@ _WHY_MISSING: dict[str, Callable[..., str | None]] = {
 
 @contextmanager
 def nothing_else(item: pytest.Item) -> Iterator[None]:
-    """Reject Ray, torch and simulators for the length of a test, unless its markers name them."""
+    """Block Ray, torch and simulators during the test, unless its markers name them."""
     marked = {marker.name for marker in item.iter_markers()}
     modules = set()
     if not marked & {"sim", "vulkan"}:
@@ -186,8 +185,8 @@ def nothing_else(item: pytest.Item) -> Iterator[None]:
 
 
 class _Refusal(Loader):
-    """Loads none of some modules, as if they were not installed; those that are loaded already
-    are not asked for.
+    """Prevents the import of some modules, as if they were not installed. Modules that are already
+    loaded are not affected.
     """
 
     def __init__(self, modules: set[str]) -> None:
@@ -229,7 +228,8 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 
 
 def _failed_if_skipped(report: Report) -> Report:
-    expected_failure = hasattr(report, "wasxfail")  # pytest counts it as skipped, too
+    # pytest also counts an expected failure as skipped
+    expected_failure = hasattr(report, "wasxfail")
     if report.skipped and not expected_failure and os.environ.get("VLAGENTS_FAIL_ON_SKIP") == "1":
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome = "failed"
@@ -237,12 +237,12 @@ def _failed_if_skipped(report: Report) -> Report:
     return report
 
 
-BESIDE = Path(__file__).parents[3] / "shared" / "assets"  # the checkout
+BESIDE = Path(__file__).parents[3] / "shared" / "assets"  # next to the checkout
 
 
 def assets(simulator: str) -> Path | None:
-    """The folder of a simulator's data that no package brings, e.g. of "libero"; None where
-    there is none.
+    """Return the folder with a simulator's data that is in no package, e.g. of "libero"; None if it
+    does not exist.
     """
     folder = Path(os.environ.get("VLAGENTS_RAY_ASSETS", BESIDE)) / simulator
     return folder if folder.is_dir() else None

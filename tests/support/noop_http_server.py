@@ -1,6 +1,6 @@
-"""The HTTP and WebSocket endpoints over a `noop` policy, without Ray.
+"""The HTTP and WebSocket endpoints of a `noop` policy, without Ray.
 
-`python noop_http_server.py HOST` prints its port and serves.
+`python noop_http_server.py HOST` prints the port and serves.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vlagents_ray.serve.engine.engine import Engine
 def main(host: str) -> None:
     engine = Engine(Noop())
     engine.start()
-    local = asdict(LocalAddress(socket="", boot_id=boot_id()))  # nobody listens there
+    local = asdict(LocalAddress(socket="", boot_id=boot_id()))  # no process listens there
     metadata = {"policy": "noop", "version": "0", "protocol": PROTOCOL_VERSION, "local": local}
     inside = build_http_app(engine, lambda: metadata, DEFAULT_LIMITS)
     app = AccessMiddleware(inside, None, "noop")

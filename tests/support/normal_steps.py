@@ -1,5 +1,5 @@
-"""The log-probability of a flow's random steps, as the papers write it (Flow-GRPO, πRL), for
-comparison with ours.
+"""The log-probability of a flow's random steps as in the papers (Flow-GRPO, πRL), to compare with
+this package's function.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 
 
 def logprob_of_steps(velocity: Callable[[Any, float], Any], chain: np.ndarray, level: float) -> Any:
-    """That of each number of a chain (K + 1, H, D), summed over the steps; `velocity` is of (1,
-    H, D).
+    """Return the log-probability of each number of a chain (K + 1, H, D), summed over the steps.
+    `velocity` returns (1, H, D).
     """
     import torch
 
@@ -24,7 +24,8 @@ def logprob_of_steps(velocity: Callable[[Any, float], Any], chain: np.ndarray, l
             velocity(before[None], float(t))[0],
             level * (t / (1 - (t if t < 1 else s))) ** 0.5,
         )
-        clean, noise = before - t * v, before + (1 - t) * v  # as the model estimates both
+        # the model's estimates of data and noise
+        clean, noise = before - t * v, before + (1 - t) * v
         mean = (1 - s) * clean + (s - sigma**2 * (t - s) / (2 * t)) * noise
         total += torch.distributions.Normal(mean, sigma * (t - s) ** 0.5).log_prob(after)
     return total

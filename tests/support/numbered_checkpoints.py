@@ -1,6 +1,4 @@
-"""A policy whose checkpoint is a number, and a library that counts how often each checkpoint is
-loaded.
-"""
+"""A policy whose checkpoint is a number, and a library that counts the loads of each checkpoint."""
 
 from __future__ import annotations
 
@@ -23,7 +21,9 @@ from vlagents_ray.serve.models.checkpoints import Checkpoints
 
 
 class Numbered(Agent):
-    """Acts by its number and how often its session has acted."""
+    """A policy whose actions contain its checkpoint's number and the number of calls in the
+    session.
+    """
 
     shared = ("library",)
 
@@ -39,7 +39,8 @@ class Numbered(Agent):
     def initialize(self) -> None:
         self.library.load(self)
         self.number = float(self.name.rpartition("/")[2])
-        self.itself = self  # as agents do; only a garbage collection frees it
+        # a reference cycle, like in real policies: only garbage collection frees the policy
+        self.itself = self
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.steps = 0
@@ -60,22 +61,23 @@ class Numbered(Agent):
 
 
 class Library:
-    """Makes agents, and says what became of them."""
+    """Creates policies, and records loads, closed policies and batches."""
 
     def __init__(self) -> None:
         self.loads: Counter[str] = Counter()
         self.closed: list[str] = []
         self.alive: weakref.WeakValueDictionary[str, Agent] = weakref.WeakValueDictionary()
         self.batches: list[tuple[str, list[str]]] = []
-        self.joints: dict[str, int] = {}  # that a checkpoint's contract asks for
-        self.held: dict[str, threading.Event] = {}  # loading waits for it
-        self.begun: queue.SimpleQueue[str] = queue.SimpleQueue()  # loads
+        self.joints: dict[str, int] = {}  # number of joints in a checkpoint's contract
+        self.held: dict[str, threading.Event] = {}  # events for which loading waits
+        # names of the checkpoints whose loading has begun
+        self.begun: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def make(self, settings: Mapping[str, Any]) -> Agent:
         return Numbered(self, settings)
 
     def hold(self, name: str) -> threading.Event:
-        """Have the loading of `name` wait for the event."""
+        """Return an event; loading of `name` waits until it is set."""
         return self.held.setdefault(name, threading.Event())
 
     def load(self, agent: Numbered) -> None:
@@ -88,15 +90,15 @@ class Library:
         self.alive[agent.name] = agent
 
     def wait_for(self, name: str) -> None:
-        """Until loading of `name` has begun once more."""
+        """Wait until loading of `name` has begun once more."""
         while self.begun.get(timeout=10) != name:
             pass
 
     def engine(
         self, *, choices: Sequence[str] = (), steps: bool = False, loaded: int = 2, **options: Any
     ) -> Engine:
-        """A running one whose own checkpoint is "a/1"; `choices` are such as "b/2", by their
-        first letter.
+        """Return a running engine whose default checkpoint is "a/1". Each of `choices`, such as
+        "b/2", is selected with its first letter.
         """
         config = {"checkpoint": "a/{step}", "checkpoint_step": 1}
         named = {choice[0]: {"checkpoint": choice} for choice in choices}
@@ -107,17 +109,17 @@ class Library:
 
 
 def ask(engine: Engine, session: str, op: str, **fields: Any) -> queue.SimpleQueue[Reply]:
-    """Where the answer will come."""
+    """Send a request, and return the queue that will contain the reply."""
     return asked(engine, session, Request(op, Obs(**fields.pop("obs", {})), **fields))  # type: ignore[arg-type]
 
 
 def begin(engine: Engine, session: str, **kwargs: Any) -> queue.SimpleQueue[Reply]:
-    """Reset with these options."""
+    """Send a reset with these options."""
     return ask(engine, session, "reset", kwargs=kwargs)
 
 
 def reset(engine: Engine, session: str, **kwargs: Any) -> str:
-    """The checkpoint that a session is told it got."""
+    """Reset a session, and return the checkpoint in the reply."""
     reply = begin(engine, session, **kwargs).get(timeout=10)
     if reply.error is not None:
         raise reply.error
@@ -126,7 +128,7 @@ def reset(engine: Engine, session: str, **kwargs: Any) -> str:
 
 
 def act(engine: Engine, session: str) -> list[float]:
-    """The number of its checkpoint, and of the act."""
+    """Return the number of the session's checkpoint and of the call."""
     reply = ask(engine, session, "act").get(timeout=10)
     if reply.error is not None:
         raise reply.error

@@ -1,6 +1,6 @@
-"""What this process holds at a moment: open files and threads.
+"""The open files and threads of this process.
 
-Policies that tests serve import it, in each replica: it does without pytest.
+Policies that tests serve import this module in each replica, so it does not import pytest.
 """
 
 from __future__ import annotations
@@ -12,20 +12,24 @@ import threading
 
 
 def descriptors() -> set[str]:
-    """Open files and sockets; a descriptor whose number is used again counts as another one."""
+    """Return open files and sockets. A reused descriptor number counts as a different
+    descriptor.
+    """
     files = set()
     for number in os.listdir("/proc/self/fd"):
-        # The descriptor of this listing, and those closed meanwhile.
+        # The descriptor of this listing and recently closed ones no longer exist.
         with contextlib.suppress(FileNotFoundError):
             files.add(f"{number}: {os.readlink(f'/proc/self/fd/{number}')}")
     return files
 
 
 def running_threads() -> set[threading.Thread]:
-    """The threads that run now."""
+    """Return the running threads."""
     return set(threading.enumerate())
 
 
 def unpooled_threads() -> list[str]:
-    """Names of the threads outside of executors, whose pools grow when they must, up to a size."""
+    """Return the names of threads outside of executors, since the pools of executors grow up to a
+    size.
+    """
     return [thread.name for thread in threading.enumerate() if not re.search(r"_\d+$", thread.name)]

@@ -1,5 +1,6 @@
-"""Benchmarks for vla-eval: one written as its documentation asks, and its own RoboTwin and
-RoboDojo with stand-ins for their simulators. Imported with the peers' Python only.
+"""Benchmarks for vla-eval: one that follows vla-eval's documentation, and vla-eval's own RoboTwin
+and RoboDojo with stand-ins for their simulators. Only the Python of the peers' environment imports
+this module.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from vla_eval.benchmarks.robodojo.benchmark import RoboDojoBenchmark
 from vla_eval.benchmarks.robotwin import RoboTwinBenchmark
 
 STEPS = 7
-CHUNK = 3  # rows that the policy returns, and after which the cameras of RoboTwin are rendered
+CHUNK = 3  # number of rows that the policy returns, and after which RoboTwin renders its cameras
 
 
 class Pictures(StepBenchmark):
-    """Each step shows another picture; an episode succeeds if every action names the one that it
-    answers.
+    """Each step shows another picture. An episode succeeds if each action contains the value of the
+    picture that it answers.
     """
 
     def get_tasks(self) -> list[dict[str, Any]]:
@@ -46,9 +47,11 @@ class Pictures(StepBenchmark):
 
 
 class _TwoArms:
-    """A stand-in for a simulator: the picture and the left arm's state are the step's number.
+    """A stand-in for a simulator, in which the picture and the left arm's state are the step's
+    number.
 
-    An episode succeeds if each action is a row of the chunk for the picture at its beginning.
+    An episode succeeds if each action is a row of the chunk for the picture at the beginning of
+    that chunk.
     """
 
     step_lim = STEPS
@@ -85,7 +88,7 @@ class _TwoArms:
 
 
 class _RoboTwinScene(_TwoArms):
-    """What RoboTwin's environments offer to vla-eval."""
+    """The interface of RoboTwin's environments that vla-eval uses."""
 
     def take_action(self, action: np.ndarray, action_type: str) -> None:
         assert action_type == "qpos"
@@ -115,11 +118,11 @@ class RoboTwin(RoboTwinBenchmark):
         return self._env.get_obs()
 
     def cleanup(self) -> None:
-        """There is no simulator."""
+        """Do nothing, since there is no simulator."""
 
 
 class _RoboDojoScene(_TwoArms):
-    """What RoboDojo's environments offer to vla-eval."""
+    """The interface of RoboDojo's environments that vla-eval uses."""
 
     def take_action(self, action: dict[str, np.ndarray]) -> None:
         self.execute(np.concatenate(list(action.values())))
@@ -150,4 +153,4 @@ class RoboDojo(RoboDojoBenchmark):
         return self._env.get_obs()
 
     def cleanup(self) -> None:
-        """There is no simulator."""
+        """Do nothing, since there is no simulator."""

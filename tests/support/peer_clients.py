@@ -1,9 +1,9 @@
-"""Other systems' own clients, several at once: `peer_clients.py CLIENT URL CLIENTS CALLS`, with the
-peers' Python.
+"""Run several clients of another system at the same time: `peer_clients.py CLIENT URL CLIENTS
+CALLS`, with the Python of the peers' environment.
 
-Each sends observations that say whose they are, under two instructions in turn, and prints what it
-was answered: for each client a list of [what it sent, the rows it got], as JSON in the last line.
-It imports nothing of ours.
+Each client sends observations that identify it, under two alternating instructions. The last line
+of the output is JSON: for each client a list of [sent observation, received rows]. The script
+imports nothing of this package.
 """
 
 from __future__ import annotations
@@ -19,9 +19,12 @@ import numpy as np
 
 
 def observations(client: int, calls: int) -> list[dict[str, Any]]:
-    """Pixel, a number in the state, and an instruction that changes once."""
+    """Return the observations of a client: a pixel, a number in the state, and an instruction that
+    changes once.
+    """
     tasks = [f"task {client + 100 * (call >= calls // 2)}" for call in range(calls)]
-    pixels = [(client * 16 + call) % 255 for call in range(calls)]  # 255 is slow
+    # the value 255 makes the policy slow
+    pixels = [(client * 16 + call) % 255 for call in range(calls)]
     return [
         {"pixel": p, "number": float(client + 1), "task": t}
         for p, t in zip(pixels, tasks, strict=True)
@@ -33,7 +36,7 @@ def image(pixel: int) -> np.ndarray:
 
 
 def openpi(url: str, client: int, calls: int) -> list[Any]:
-    """openpi-client, as its LIBERO example uses it: given host and port, or a whole URL."""
+    """openpi-client as in its LIBERO example, with host and port, or with a whole URL."""
     from openpi_client import image_tools
     from openpi_client.action_chunk_broker import ActionChunkBroker
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
@@ -57,7 +60,8 @@ def openpi(url: str, client: int, calls: int) -> list[Any]:
         if not all(ms >= 0 for ms in timing):
             raise RuntimeError(f"timing: {answer}")
         said.append([one, answer["actions"].tolist()])
-    # The broker slices whatever arrays are in an answer; it must find the actions alone.
+    # The broker slices every array of an answer, so the answer must contain no arrays except the
+    # actions.
     if said:
         chunk = len(said[-1][1])
         broker = ActionChunkBroker(policy, chunk)
@@ -68,8 +72,8 @@ def openpi(url: str, client: int, calls: int) -> list[Any]:
 
 
 def roboarena(url: str, client: int, calls: int) -> list[Any]:
-    """RoboArena's client, which is openpi's with an `endpoint` in each request, and is not on
-    PyPI.
+    """RoboArena's client, which is openpi's with an `endpoint` in each request. It is not
+    on PyPI.
     """
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
@@ -98,7 +102,7 @@ def roboarena(url: str, client: int, calls: int) -> list[Any]:
 
 
 def openpi_error(url: str, client: int, calls: int) -> list[Any]:
-    """What openpi-client raises for an observation that lacks a key."""
+    """Return the error that openpi-client raises for an observation that lacks a key."""
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
     policy = WebsocketClientPolicy(url)
@@ -110,8 +114,8 @@ def openpi_error(url: str, client: int, calls: int) -> list[Any]:
 
 
 def openpi_keyed(url: str, client: int, calls: int) -> Any:
-    """The fragment of the URL is the API key, which this client sends by itself. What it gets,
-    or why nothing.
+    """Connect with the fragment of the URL as the API key, which this client sends itself. Return
+    the answers, or the reason of a failure.
     """
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
     from websockets.exceptions import InvalidStatus
@@ -132,7 +136,7 @@ def openpi_keyed(url: str, client: int, calls: int) -> Any:
 
 
 def openvla(url: str, client: int, calls: int) -> list[Any]:
-    """requests and json-numpy, as OpenVLA documents it: plain, and in every second call encoded
+    """requests and json-numpy as in OpenVLA's documentation. Every second call encodes the document
     twice.
     """
     import json_numpy
@@ -159,12 +163,12 @@ def openvla(url: str, client: int, calls: int) -> list[Any]:
 
 
 def openvla_patched(url: str, client: int, calls: int) -> list[Any]:
-    """The same with the json module patched, in OpenVLA's own words."""
+    """The same client with json_numpy's patch of the json module, like in OpenVLA's own code."""
     import json_numpy
     import requests
 
     json_numpy.patch()
-    action = requests.post(  # noqa: S113 - as its users write it
+    action = requests.post(  # noqa: S113 - users of OpenVLA write it so
         f"{url}/act",
         json={"image": np.zeros((256, 256, 3), dtype=np.uint8), "instruction": "do something 7"},
     ).json()
@@ -172,7 +176,7 @@ def openvla_patched(url: str, client: int, calls: int) -> list[Any]:
 
 
 def vla_eval(url: str, client: int, calls: int, codec: str = "png") -> list[Any]:
-    """vla-eval's Connection, two episodes."""
+    """vla-eval's Connection, with two episodes."""
     from vla_eval.connection import Connection
 
     async def talk() -> list[Any]:
@@ -197,7 +201,7 @@ def vla_eval(url: str, client: int, calls: int, codec: str = "png") -> list[Any]
 
 
 def vla_eval_run(url: str, client: int, calls: int, benchmark: str = "Pictures") -> list[Any]:
-    """A run of vla-eval, its orchestrator and all: `calls` episodes of a benchmark of
+    """Run vla-eval including its orchestrator: `calls` episodes of a benchmark of
     `peer_benchmark`.
     """
     from vla_eval.orchestrator import Orchestrator
@@ -218,12 +222,12 @@ def vla_eval_run(url: str, client: int, calls: int, benchmark: str = "Pictures")
 
 
 def robotwin_run(url: str, client: int, calls: int) -> list[Any]:
-    """A run of vla-eval's RoboTwin."""
+    """Run vla-eval's RoboTwin."""
     return vla_eval_run(url, client, calls, "RoboTwin")
 
 
 def robodojo_run(url: str, client: int, calls: int) -> list[Any]:
-    """A run of vla-eval's RoboDojo."""
+    """Run vla-eval's RoboDojo."""
     return vla_eval_run(url, client, calls, "RoboDojo")
 
 

@@ -1,8 +1,8 @@
-"""Python environments with other systems' clients from PyPI, some of whose requirements conflict
-with ours.
+"""Python environments with clients of other systems from PyPI. Some of their requirements conflict
+with this package's.
 
-They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and
-`.venv-peers-NAME` of single programs; each is created at first use.
+The environments are `.venv-peers` and `.venv-peers-torch` of this checkout, which the benchmark
+also uses, and `.venv-peers-NAME` for single programs. Each is created at its first use.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ CLIENTS = Path(__file__).with_name("peer_clients.py")
 
 
 def peers_python(environment: str = "") -> Path:
-    """The Python of the first environment, or of the second if it is `TORCH`, with the pinned
-    packages in it.
+    """Return the Python of `.venv-peers`, or of `.venv-peers-torch` if `environment` is `TORCH`,
+    with the pinned packages.
     """
     requirements = TORCH_REQUIREMENTS if environment == TORCH else REQUIREMENTS
     return _made(environment, requirements.read_text(), lambda folder: set_up(folder, requirements))
 
 
 def environment(name: str, wanted: Sequence[str], python: str) -> Path:
-    """The Python of an environment of one program, with `wanted`, arguments of `uv pip install`."""
+    """Return the Python of an environment for one program. `wanted` are arguments of `uv pip
+    install`.
+    """
 
     def make(folder: Path) -> None:
         install(create(folder, find_python(python)), wanted)
@@ -50,8 +52,8 @@ def _made(end: str, wanted: str, make: Callable[[Path], object]) -> Path:
 def drive(
     python: Path, client: str, *words: object, script: Path = CLIENTS, timeout_s: float = 120
 ) -> Any:
-    """What a client of `peer_clients.py`, or of another script, has to say at its end; its error
-    is this process's.
+    """Run a client of `peer_clients.py` or of another script, and return the JSON in its last line.
+    A failure of the client raises an error here.
     """
     command = [str(python), str(script), client, *map(str, words)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
@@ -62,8 +64,8 @@ def drive(
 
 
 def package(requirement: str) -> Path:
-    """A folder for PYTHONPATH with that version of a package, alone: what it needs is the
-    environment's.
+    """Return a folder for PYTHONPATH with that version of a package, without its requirements,
+    which the environment provides.
     """
     folder = FOLDER / requirement.replace("==", "-")
     done = folder / ".installed"

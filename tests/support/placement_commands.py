@@ -1,5 +1,5 @@
-"""Commands that tests of placement run on each host: a server of two applications, an
-evaluation, a robot.
+"""Commands that tests of placement run on each host: a server with two applications, an evaluation,
+and a robot.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from vlagents_ray import RemoteAgent
 from vlagents_ray.interface import Obs
 
 PORT = 8000
-# By application: what each of its replicas takes one of.
+# The custom resource of which each replica of an application takes one.
 RESOURCE = {"one": "of_one", "two": "of_two"}
 REPLICAS = {"one": 1, "two": 2}
 
 
 class Meeting(Line):
-    """Its first episode begins when as many workers as are `expected` have come to play one."""
+    """An environment whose first episode begins when `expected` workers have each begun one."""
 
     def __init__(self, folder: str, expected: int) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Meeting(Line):
 
 
 def serve() -> None:
-    """Until standard input ends."""
+    """Serve both applications until standard input ends."""
     from vlagents_ray.serve.launch.deployment_file import deployment, together
     from vlagents_ray.serve.launch.server import running_server
 
@@ -52,13 +52,13 @@ def serve() -> None:
             for app, number in REPLICAS.items()
         }
     )
-    with running_server(both, host="0.0.0.0", port=PORT, address="auto", insecure=True):  # noqa: S104 - of hosts
+    with running_server(both, host="0.0.0.0", port=PORT, address="auto", insecure=True):  # noqa: S104 - other hosts connect
         print("ready", flush=True)
         sys.stdin.read()
 
 
 def play(app: str, workers: str, transport: str, out: str) -> None:
-    """An evaluation with so many workers; prints each one's host and transport."""
+    """Run an evaluation with a number of workers, and print the host and the transport of each."""
     import ray
 
     from vlagents_ray.evaluate import evaluate
@@ -66,8 +66,8 @@ def play(app: str, workers: str, transport: str, out: str) -> None:
     from vlagents_ray.evaluate.results.reader import Results
 
     ray.init("auto", log_to_driver=False)
-    # Workers of the evaluation before that are still ending hold their node's CPUs: new ones would
-    # go elsewhere.
+    # Workers of the previous evaluation that are still ending occupy the CPUs of their node, so new
+    # workers would start elsewhere.
     wait_for(lambda: ray.available_resources().get("CPU") == ray.cluster_resources()["CPU"])
     met = Path(out, "met")
     met.mkdir(parents=True)
@@ -95,8 +95,8 @@ def play(app: str, workers: str, transport: str, out: str) -> None:
 
 
 def robot(url: str) -> None:
-    """Ten acts by each transport that reaches another machine; prints which was chosen, and
-    which were used.
+    """Act ten times over each transport that reaches another machine, and print the transports
+    used.
     """
     obs = Obs(
         {"front": np.zeros((224, 224, 3), np.uint8)}, state={"position": np.ones(1, np.float32)}

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 
 class WithoutPaths(http.server.BaseHTTPRequestHandler):
-    """A server that has no application at any path."""
+    """A server without an application at any path."""
 
     protocol_version = "HTTP/1.1"
 

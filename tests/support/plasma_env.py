@@ -1,6 +1,6 @@
-"""An env in an actor that acts over plasma.
+"""An environment in a Ray actor that sends observations over plasma.
 
-Each actor is a process that imports this module, and none of the modules of a test.
+Each actor is a process that imports this module, but no test module.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from vlagents_ray.client.transports.select import TransportName
 
 @ray.remote(num_cpus=0)
 class EnvActor:
-    """An env in an actor: it has one session with `app`."""
+    """An environment in an actor, with one session of `app`."""
 
     def __init__(self, app: str, transport: TransportName = "plasma", size: int = 224) -> None:
         self.agent = RemoteAgent(f"serve://{app}", transport=transport)
         self.obs = Obs({name: np.full((size, size, 3), 7, np.uint8) for name in ("front", "wrist")})
 
     def open(self) -> int:
-        """Reset, act once; returns this process's id."""
+        """Reset, act once, and return this process's id."""
         self.agent.reset(self.obs, f"of {os.getpid()}")
         self.agent.act(self.obs)
         return os.getpid()
 
     def act(self, times: int) -> set[str]:
-        """The instructions that the policy answered with."""
+        """Act `times` times, and return the instructions in the policy's answers."""
         instructions = set()
         while times != 0:
             instructions.add(self.agent.act(self.obs).info["instruction"])
@@ -39,16 +39,18 @@ class EnvActor:
         return instructions
 
     def storm(self) -> None:
-        """Act until killed."""
+        """Act until the process is killed."""
         self.act(-1)
 
     def channel(self) -> bytes:
-        """Ray's id of the plasma channel."""
+        """Return Ray's id of the plasma channel."""
         key: bytes = self.agent._connection.transport._channel.binary()  # type: ignore[attr-defined]
         return key
 
     def die_writing(self) -> None:
-        """Die in the middle of a frame: its pixels lie in a file that has been cut off."""
+        """Crash in the middle of writing a frame, because the pixels are in a mapped file that was
+        truncated.
+        """
         with tempfile.TemporaryFile() as file:
             file.truncate(mmap.PAGESIZE * 3)
             pixels = np.frombuffer(mmap.mmap(file.fileno(), 0), np.uint8).reshape(64, -1, 3)

@@ -1,4 +1,4 @@
-"""Probes of a WebSocket, as a client makes them."""
+"""Probes of a WebSocket, as clients send them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import os
 
 
 def bytes_probe(size: int) -> bytes:
-    """A probe of `size` bytes."""
+    """Return a probe of `size` bytes."""
     return b"VLA?" + bytes(4) + os.urandom(size - 8)
 
 
 def is_probe_answer(message: bytes, probe: bytes) -> bool:
-    """Whether a message is the answer to that probe."""
+    """Return whether a message is the answer to that probe."""
     return message == b"VLA!" + len(probe).to_bytes(8, "little")

@@ -1,12 +1,12 @@
-"""The processes that run tests: which tests may run at the same time in those of pytest-xdist, and
-which run in a separate process.
+"""Control of the processes that run tests: which tests may run at the same time in pytest-xdist's
+processes, and which tests run in a fresh process.
 
-The tests that ran in this process before may have left connections, such as Ray's, which come and
-go at any time: a test that counts what its process holds is marked `own_process`.
+Earlier tests may have left connections in this process, such as Ray's, which open and close at any
+time. So a test that counts the resources of its process is marked `own_process`.
 
-A test that is marked `alone` runs while no other test does. Each test takes two file locks. All
-tests share the second one, except one marked `alone`, which takes it exclusively. The first lock is
-held while a test waits for the second, so that tests run in the order they arrive.
+A test that is marked `alone` runs while no other test runs. Each test takes two file locks. All
+tests share the second lock, except a test marked `alone`, which takes it exclusively. A test keeps
+the first lock while it waits for the second, so that tests run in the order of their arrival.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ count_frozen = gc.get_freeze_count
 
 
 def freeze_heap() -> None:
-    """Keep what was imported and collected, which lives to the end, out of every garbage
-    collection of a test.
+    """Exclude imported modules and collected tests, which live until the end, from garbage
+    collection.
 
-    A control loop asks before each run whether there are frozen objects, and Python counts them
-    all: 0.1 s for a million. Here they are counted once.
+    A control loop checks before each run whether there are frozen objects, and Python counts them
+    all, which takes 0.1 s for a million. This function counts them once.
     """
     gc.freeze()
     number = count_frozen()
@@ -46,7 +46,9 @@ def freeze_heap() -> None:
 
 
 class _FreshProcesses:
-    """A pytest that has imported one file, and forks a fresh process for each test it is sent."""
+    """A pytest process that has imported one file, and forks a fresh process for each test it
+    receives.
+    """
 
     def __init__(self, file: Path, root: Path) -> None:
         self.file = file
@@ -72,11 +74,13 @@ class _FreshProcesses:
         self._lines = os.fdopen(self._answers, "rb")
 
     def failure_of(self, name: str) -> str | None:
-        """Run the test of that name in a separate process; returns None if it passed."""
+        """Run the test of that name in a fresh process; return the failure, or None if the test
+        passed.
+        """
         with contextlib.suppress(BrokenPipeError):
             os.write(self._asks, json.dumps(name).encode() + b"\n")
         line = self._lines.readline()
-        if not line:  # pytest has ended
+        if not line:  # the pytest process has ended
             self._pytest.wait()
             self._log.seek(0)
             return self._log.read().decode(errors="replace")
@@ -84,24 +88,26 @@ class _FreshProcesses:
         return failure
 
     def kill(self) -> None:
-        """End pytest, and the test that it runs."""
+        """Kill the pytest process and the test that it runs."""
         os.killpg(self._pytest.pid, signal.SIGKILL)
         self.end()
 
     def end(self) -> None:
-        """End pytest, which ends once it is sent no more."""
+        """Let the pytest process end, by closing its input."""
         os.close(self._asks)
         self._pytest.wait()
         self._lines.close()
         self._log.close()
 
 
-_fresh: _FreshProcesses | None = None  # of the file whose tests run
+_fresh: _FreshProcesses | None = None  # the pytest process of the file whose tests are running
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is marked `own_process` in a fresh process, and any other one here."""
+    """Run a test that is marked `own_process` in a fresh process. Return None for any other test,
+    which pytest then runs here.
+    """
     global _fresh  # noqa: PLW0603 - one for each process
     if pyfuncitem.get_closest_marker("own_process") is None or _INSIDE in os.environ:
         return None
@@ -109,7 +115,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         _fresh = _FreshProcesses(pyfuncitem.path, pyfuncitem.config.rootpath)
     try:
         failure = _fresh.failure_of(pyfuncitem.nodeid.partition("::")[2])
-    except BaseException:  # its time is over
+    except BaseException:  # the test has reached its time limit
         _fresh.kill()
         _fresh = None
         raise
@@ -119,7 +125,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """End what forks the processes of a file once its tests are over."""
+    """End the pytest process of a file when the file's tests are over."""
     global _fresh
     if _fresh is not None and (nextitem is None or nextitem.path != item.path):
         ending, _fresh = _fresh, None
@@ -128,7 +134,9 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop(session: pytest.Session) -> bool | None:
-    """Fork a process for each test that is sent here, in a pytest of `_FreshProcesses`."""
+    """Fork a process for each test that is sent here; this runs in the pytest process of
+    `_FreshProcesses`.
+    """
     if _INSIDE not in os.environ:
         return None
     asked, answered = map(int, os.environ[_INSIDE].split())
@@ -146,7 +154,7 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 
 
 def _play_and_exit(test: pytest.Item, answered: int) -> None:
-    """Play a test, say what failed, and end this process."""
+    """Run a test, send its failure, and end this process."""
     status = 1
     try:
         test.ihook.pytest_runtest_protocol(item=test, nextitem=None)
@@ -164,24 +172,23 @@ def _play_and_exit(test: pytest.Item, answered: int) -> None:
 
 
 def share_cores() -> None:
-    """Give the linear algebra of each process of a test run one thread, in what is started from
-    here on.
+    """Limit linear algebra to one thread in each process that is started from now on.
 
-    With a thread for each core in each process, threads wait for one another by spinning, on cores
-    that other tests need.
+    With one thread per core in each process, threads that wait for each other spin on cores that
+    other tests need.
     """
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
 
 
-WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # None where one process runs all tests
+WORKER = os.environ.get("PYTEST_XDIST_WORKER")  # None if one process runs all tests
 _RUN = os.environ.get("PYTEST_XDIST_TESTRUNUID", "")
 _LOCKS = Path(tempfile.gettempdir())
 
 
 @contextmanager
 def turn(item: pytest.Item) -> Iterator[None]:
-    """Run a test beside others, or alone."""
+    """Run a test next to other tests, or alone, depending on its markers."""
     if WORKER is None:
         yield
         return
@@ -201,7 +208,7 @@ def own_ray_folder() -> Path | None:
     """Make a folder for the Ray clusters of this process, so that they do not find those of other
     processes.
 
-    None where one process runs all tests. The caller removes the folder.
+    Returns None if one process runs all tests. The caller removes the folder.
     """
     if WORKER is None:
         return None

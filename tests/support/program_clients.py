@@ -1,9 +1,9 @@
-"""Programs that others wrote, as their users start them: `program_clients.py PROGRAM PORT`, with
-the program's Python.
+"""Third-party programs, started like their users start them: `program_clients.py PROGRAM PORT`,
+with the program's Python.
 
-Each function acts with one program on constant pictures, and prints as JSON what its robot executed
-and what a policy should have seen, in our terms: "executed" rows, "state" by name, "gripper" (1 is
-open) and "cameras". It imports nothing of ours.
+Each function runs one program with constant pictures. It prints as JSON the "executed" rows of the
+robot, and the input that a policy should have received, in this package's terms: "state" by name,
+"gripper" (1 is open) and "cameras". The script imports nothing of this package.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def picture(step: int, height: int = 224, width: int = 224) -> np.ndarray:
 
 
 def numbers(dim: int) -> np.ndarray:
-    """A state whose numbers a float32 holds."""
+    """Return a state whose numbers float32 represents exactly."""
     return np.arange(1, dim + 1) / 32
 
 
@@ -40,12 +40,12 @@ def said(executed: Any, cameras: Sequence[str], gripper: float | None = None, **
     }
 
 
-# Inspect Robots: its evaluation, with the policy of a plug-in and an embodiment that follows the
+# Inspect Robots: its evaluation, with the policy of a plug-in, and with an embodiment that has the
 # plug-in's own spaces.
 
 
 def _inspect_robots(policy: Any) -> np.ndarray:
-    """What the embodiment executed in an episode of an evaluation."""
+    """Return the actions that the embodiment executed in one episode of an evaluation."""
     import inspect_robots as ir
 
     executed: list[np.ndarray] = []
@@ -136,12 +136,12 @@ def unitree_g1(port: int) -> Said:
     return said(executed, ["ego_view"], left_arm=state[:7], right_arm=state[8:15], **legs)
 
 
-# Others
+# Other programs
 
 
 def strands_robots(port: int) -> Said:
-    """Its policy for servers of Cosmos 3, which speak openpi's protocol, with the actions under
-    another name.
+    """Run its policy for servers of Cosmos 3, which use openpi's protocol with another name for the
+    actions.
     """
     from strands_robots.policies import create_policy
 
@@ -157,14 +157,14 @@ def strands_robots(port: int) -> Said:
 
     state = numbers(8)
     rows = np.asarray(_acts(act))
-    # DROID's gripper is 1 when closed, as is the robot's of this program.
+    # In DROID and in this program's robot, gripper 1 is closed.
     rows[:, 7] = 1 - rows[:, 7]
     return said(rows, ["front", "wrist"], 1 - state[7], joints=state[:7])
 
 
 def strands_robots_sim(port: int) -> Said:
-    """Its client of GR00T N1.5; its LIBERO robot makes the gripper -1 or 1, so that column is
-    left out.
+    """Run its client of GR00T N1.5. Its LIBERO robot rounds the gripper to -1 or 1, so that column
+    is left out.
     """
     import asyncio
 
@@ -185,8 +185,8 @@ def strands_robots_sim(port: int) -> Said:
 
 
 def positronic(port: int) -> Said:
-    """Its client of RoboArena's protocol, with the observations of its DROID codec, which number
-    cameras from 1.
+    """Run its client of RoboArena's protocol with the observations of its DROID codec, which
+    numbers cameras from 1.
     """
     from positronic.offboard.roboarena import RoboarenaClient
 
@@ -210,13 +210,13 @@ def positronic(port: int) -> Said:
     rows = np.array(_acts(act))
     client.reset()
     client.close()
-    rows[:, 7] = 1 - rows[:, 7]  # DROID's gripper is 1 when closed
+    rows[:, 7] = 1 - rows[:, 7]  # in DROID, gripper 1 is closed
     return said(rows, ["front", "wrist"], state[7], joints=state[:7])
 
 
 def provael(port: int) -> Said:
-    """Its policy for openpi's servers, which executes the first row of each chunk, without a
-    gripper's convention.
+    """Run its policy for openpi's servers, which executes the first row of each chunk and has no
+    convention for the gripper.
     """
     from provael.policies.openpi_adapter import OpenPiAdapter
 
@@ -234,7 +234,7 @@ def provael(port: int) -> Said:
 
 
 def _acts(act: Callable[[int], Any]) -> list[Any]:
-    """The rows of as many chunks as an episode of `STEPS` steps takes."""
+    """Return the rows of all chunks that an episode of `STEPS` steps needs."""
     rows: list[Any] = []
     while len(rows) < STEPS:
         rows += list(act(len(rows)))

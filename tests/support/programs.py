@@ -1,9 +1,8 @@
-"""Programs that others wrote, and what became of their tests; `tables` writes them into
-docs/programs.md.
+"""Third-party programs and the outcomes of their tests; `tables` writes them into docs/programs.md.
 
-A test that runs one is marked `@pytest.mark.program(NAME)`, NAME being one of `PROGRAMS`. `pytest
---verified` notes the outcomes with the versions in `programs.json`, and `make programs` does all of
-it.
+A test that runs a program is marked `@pytest.mark.program(NAME)` with a name in `PROGRAMS`. `pytest
+--verified` records the outcomes and the versions in `programs.json`. `make programs` runs the tests
+and writes the tables.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ from verified import ROOT, installed_version
 
 NOTED = ROOT / "tests" / "programs.json"
 PYPI = "PyPI"
-# Folders beside the torch of .venv.
+# Folders with packages that use the torch of .venv.
 BESIDE = {"stable-baselines3": "STABLE_BASELINES3_SRC", "torchrl": "TORCHRL_SRC"}
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program of others.
+    """A third-party program.
 
-    One with `requirements` has an environment with these, and is a function of `program_clients.py`
-    that acts with it on a server with `dialects`.
+    A program with `requirements` has an environment with these packages. A function of
+    `program_clients.py` runs it with a server that has `dialects`.
     """
 
-    packages: tuple[str, ...]  # whose versions matter; or the variable of a checkout
-    connects: str  # dialect or interface
+    packages: tuple[str, ...]  # the packages whose versions matter, or the variable of a checkout
+    connects: str  # the dialect or interface through which the program connects
     source: str = PYPI
-    said: str = ""  # setting or advice of the docs, besides `dialects`
+    said: str = ""  # further settings or advice for the docs, besides `dialects`
     requirements: tuple[str, ...] = ()
     python: str = "3.11"
-    client: str = ""  # name of the function
+    client: str = ""  # the name of the function in `program_clients.py`
     dialects: Mapping[str, Any] = field(default_factory=dict)
-    dim: int = 7  # dim of an action
-    used: int = 4  # rows of a chunk that are executed
+    dim: int = 7  # number of values in an action
+    used: int = 4  # number of rows of a chunk that the program executes
     options: tuple[str, ...] = ()  # options of `uv pip install`
 
 
@@ -51,7 +50,8 @@ def _adapter(name: str, version: str, *more: str) -> tuple[str, ...]:
     return (f"inspect-robots-{name}=={version}", "inspect-robots==0.60.0", *more)
 
 
-_OPENPI = ("openpi-client==0.1.2", "typing_extensions")  # which it imports, and does not require
+# typing_extensions is imported by openpi-client, but missing in its requirements
+_OPENPI = ("openpi-client==0.1.2", "typing_extensions")
 _CAMERAS = {"front": "top_cam", "left": "left_cam", "right": "right_cam"}
 _A2 = {
     "cameras": {
@@ -253,8 +253,8 @@ PROGRAMS = {
         dialects={"openpi": {"mapping": "openpi-libero"}},
     ),
 }
-# Programs with a protocol of their own: what they speak, and the size of a dialect, estimated by
-# those that there are.
+# Programs with other protocols: each protocol, and the size of a dialect for it, estimated from the
+# existing dialects.
 OTHERS = {
     "positronic 0.4.1, `RemotePolicy`": (
         "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines"
@@ -270,7 +270,7 @@ OTHERS = {
 
 
 class RunPrograms:
-    """A pytest plugin that notes the outcomes of the tests marked `program`, by program and
+    """A pytest plugin that records the outcomes of the tests marked `program`, by program and
     version.
     """
 
@@ -304,7 +304,7 @@ class RunPrograms:
 
 
 def notes() -> dict[str, dict[str, dict[str, Any]]]:
-    """What is noted of each program, by its Python."""
+    """Return the recorded outcomes of each program, by Python version."""
     found: dict[str, dict[str, dict[str, Any]]] = (
         json.loads(NOTED.read_text()) if NOTED.is_file() else {}
     )
@@ -312,7 +312,7 @@ def notes() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def versions(program: Program) -> str:
-    """The versions of a program's packages, as the table shows them."""
+    """Return the versions of a program's packages for the table."""
     pinned = _pins(program)
     found = {name: pinned.get(name) or _installed(name) for name in program.packages}
     return ", ".join(
@@ -321,7 +321,9 @@ def versions(program: Program) -> str:
 
 
 def _pins(program: Program) -> dict[str, str]:
-    """The versions that a program's environment has, or that of the peers' clients, by package."""
+    """Return the pinned versions in a program's environment, or in the environment of the peers'
+    clients, by package.
+    """
     wanted = (
         list(program.requirements)
         or (ROOT / "benchmarks/peers/requirements.txt").read_text().splitlines()
@@ -341,7 +343,9 @@ def _python(program: Program) -> str:
 
 
 def ran() -> Iterator[str]:
-    """Yield the rows of the table of programs, one for each Python in which one was tried."""
+    """Yield the rows of the table of programs, one for each Python with which a program was
+    tested.
+    """
     yield from (
         "| program | versions | from | connects to | tests | advice |",
         "|---|---|---|---|---|---|",
@@ -363,8 +367,8 @@ def ran() -> Iterator[str]:
 
 
 def settings() -> Iterator[str]:
-    """Yield a block of YAML with the dialects of each program's server."""
-    import yaml  # which the light environments of some families lack
+    """Yield YAML blocks with the dialects of each program's server."""
+    import yaml  # the small environments of some families lack yaml
 
     yield "```yaml"
     for name, program in PROGRAMS.items():

@@ -1,4 +1,4 @@
-"""What Prometheus would read of the only node of the cluster that this process is in."""
+"""The metrics that Prometheus would read from the only node of this process's Ray cluster."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import ray
 
 
 class Scraped(NamedTuple):
-    """A value of one of our series."""
+    """A value of one of this package's metrics."""
 
-    name: str  # without Ray's prefix
+    name: str  # the name without Ray's prefix
     tags: dict[str, str]
     value: float
 
     def key(self, *tags: str) -> str:
-        """The name, and those of `tags` that it has, sorted."""
+        """Return the name and the sorted values of `tags` that the metric has."""
         return " ".join(
             [self.name, *(f"{tag}={self.tags[tag]}" for tag in sorted(tags) if tag in self.tags)]
         )
 
 
 def scrape() -> list[Scraped]:
-    """Read all of our series."""
+    """Read all metrics of this package."""
     (node,) = ray.nodes()
     url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
     with urllib.request.urlopen(url, timeout=10) as answer:

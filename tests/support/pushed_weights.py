@@ -1,5 +1,5 @@
-"""New weights for one engine or policy, without a learner: whether a loaded policy acts with
-weights that are pushed, and as before with those that it had.
+"""Pushes of new weights to one engine or policy, without a learner, and a check that a policy acts
+with pushed weights, and again as before with its original weights.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import own_copy
 
-_FACTOR = 0.8  # factor of all numbers of a network, whose actions then differ, and remain finite
+_FACTOR = 0.8  # factor for all numbers of a network, with which actions change but remain finite
 
 
 def push(engine: Engine, named: Mapping[str, Any], **options: Any) -> int:
-    """Make an engine act with new weights, as the only replica; return their version."""
+    """Push new weights to an engine as the only replica, and return their version."""
     number = engine.weights.number + 1
     engine.weights.stage(number, named, PushOptions(**options))
     engine.weights.commit(number, PushOptions(**options))
@@ -30,9 +30,9 @@ def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray], part: str 
     """Push other weights and the loaded ones, twice, and compare the actions.
 
     Args:
-        agent: Initialized.
-        act: Returns the first action of an episode, always of the same one.
-        part: In the names of the values that are pushed; all are if it is empty.
+        agent: The policy, initialized.
+        act: A function that returns the first action of the same episode in each call.
+        part: A text in the names of the pushed values; if it is empty, all values are pushed.
     """
     weights = ModelWeights(agent, threading.Lock())
     as_loaded = act()
@@ -53,8 +53,8 @@ def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray], part: str 
     assert other.shape == as_loaded.shape
     assert not np.allclose(other, as_loaded)
 
-    # A checkpoint's values may be in the memory of its file, aligned otherwise than pushed values.
-    # By the alignment a CPU's kernels differ, in the last bits of their results.
+    # The values of a checkpoint may be in the memory of its file, with another alignment than
+    # pushed values. The alignment changes the CPU's kernels and thus the last bits of results.
     restored = push(2, loaded)
     np.testing.assert_allclose(restored, as_loaded, rtol=1e-5, atol=1e-6)
 

@@ -1,5 +1,5 @@
-"""Policies for separate Python environments; before they are loaded they need only numpy and
-this package.
+"""Policies for separate Python environments. Before they are loaded, they need only numpy and this
+package.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vlagents_ray.registry import named_class
 
 
 class Dances(Protocol):
-    """An ability that the package does not know."""
+    """An ability that this package does not define."""
 
     tempo: float
 
@@ -49,9 +49,7 @@ RESTED = threading.Event()
 
 
 class ActsAfterRest(Agent):
-    """Does not return from an act before the loaded policy has been asked to rest, which fails for
-    some durations.
-    """
+    """A policy whose `act` waits until `rest` was called. `rest` fails for some durations."""
 
     contract = Contract(action=ActionSpec(dim=1))
     tempo = 1.0
@@ -78,15 +76,15 @@ class ActsAfterRest(Agent):
         return "rested"
 
 
-ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds
+ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # living sessions of this process
 
 
 class Telling(Agent):
-    """Brings `eval_fakes.Line` to zero, and says in every `info` what it runs on and how many acts
-    it has behind it.
+    """A policy that solves `eval_fakes.Line`. Its `info` has the versions and ids of its process,
+    and the number of calls in the session.
 
-    `needs` is imported when it is loaded; what it says at each reset is also a line of the file
-    `notes`.
+    The module `needs` is imported when the policy is loaded. Each reset also writes its `info` as a
+    line to the file `notes`.
     """
 
     contract = Contract(action=ActionSpec(dim=1))
@@ -136,7 +134,7 @@ class Telling(Agent):
         return acts
 
     def told(self) -> dict[str, Any]:
-        """What this process is, and this session."""
+        """Return the properties of this process and of this session."""
         try:
             ray = importlib.metadata.version("ray")
         except importlib.metadata.PackageNotFoundError:
@@ -159,7 +157,7 @@ class Telling(Agent):
 
 
 class Compiling(Telling):
-    """Reports what a policy reports that compiles two sizes, and fails at one."""
+    """A policy that reports the compilation of two sizes, one of which fails."""
 
     def initialize(self) -> None:
         super().initialize()
@@ -170,7 +168,7 @@ class Compiling(Telling):
 
 
 class Unpicklable(Telling):
-    """Its sessions cannot move."""
+    """A policy whose sessions cannot be moved."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         told = super().reset(obs, instruction, **kwargs)
@@ -179,14 +177,14 @@ class Unpicklable(Telling):
 
 
 class Broken(Telling):
-    """Cannot load."""
+    """A policy that fails to load."""
 
     def initialize(self) -> None:
         raise FileNotFoundError("no checkpoint here")
 
 
 class Dying(Telling):
-    """Ends its process while it loads."""
+    """A policy whose process ends while it loads."""
 
     def initialize(self) -> None:
         print("the driver is too old", file=sys.stderr, flush=True)
@@ -194,8 +192,8 @@ class Dying(Telling):
 
 
 class Able(Agent):
-    """Has the abilities whose protocols its config names; each method returns its name, the
-    episode's instruction and its arguments.
+    """A policy with the abilities whose protocols its config names. Each method returns its name,
+    the episode's instruction and its arguments.
     """
 
     def __new__(cls, protocols: Sequence[str] = ()) -> Able:
@@ -221,18 +219,19 @@ class Able(Agent):
 
 @dataclass(frozen=True, eq=False)
 class PreparedValue:
-    """What `Preparing` prepares of an observation."""
+    """A value that `Preparing` prepares from an observation."""
 
     value: float
-    at_s: float  # time of `time.monotonic` at which it was prepared
+    at_s: float  # time of the preparation, from `time.monotonic`
 
 
-PREPARED: weakref.WeakSet[PreparedValue] = weakref.WeakSet()  # those that this process holds
+# living prepared values of this process
+PREPARED: weakref.WeakSet[PreparedValue] = weakref.WeakSet()
 
 
 class Preparing(Agent):
-    """Answers with what was prepared of each observation, and how long before the batch; its
-    batches are slow.
+    """A policy with slow batches. It returns the value prepared for each observation, and the time
+    between the preparation and the batch.
     """
 
     contract = Contract(action=ActionSpec(dim=1))
@@ -261,8 +260,8 @@ class Preparing(Agent):
 
 
 class OnGpu(Agent):
-    """Reports what a policy reports that runs on a GPU: passes of the duration that an observation
-    has, replays of a CUDA graph, and memory that was exhausted.
+    """A policy that reports like a policy on a GPU: passes with the duration in the observation,
+    replays of a CUDA graph, and exhausted memory.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("report",)
@@ -284,7 +283,9 @@ class OnGpu(Agent):
 
 
 def value_of(member: str) -> dict[str, Any]:
-    """The value of an attribute of `Able`, which a server takes for an id of weights."""
+    """Return the value of an attribute of `Able`, in a form that a server accepts as an id of
+    weights.
+    """
     return {"digest": f"value of {member}", "revision": None}
 
 

@@ -1,5 +1,5 @@
-"""RAPTOR of examples/raptor: the reference that its authors ship with the weights, and flights
-with a policy.
+"""RAPTOR of examples/raptor: the reference data that its authors publish with the weights, and
+flights with a policy.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from raptor import INPUTS, Raptor
 
 from vlagents_ray import Act, Obs
 
-TOLERANCE = 1e-6  # the authors' own, of the mean; here of the largest error
+TOLERANCE = 1e-6  # the authors' own tolerance of the mean error, here of the largest error
 Acts = Callable[[Sequence[Obs]], Sequence[Act]]
 
 
 class LocatedRaptor(Raptor):
-    """States its process at each reset and act, for tests that kill it: a session may have moved
-    since its reset.
+    """A RAPTOR policy that reports its process at each reset and act, for tests that kill the
+    process. A session may have moved since its reset.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -35,7 +35,7 @@ class LocatedRaptor(Raptor):
 
 
 def reference() -> tuple[np.ndarray, np.ndarray]:
-    """The inputs, (500, 2, 22), and the actions, (500, 2, 4), of two sequences."""
+    """Return the inputs, (500, 2, 22), and the actions, (500, 2, 4), of two sequences."""
     import foundation_policy
     import h5py
 
@@ -44,7 +44,7 @@ def reference() -> tuple[np.ndarray, np.ndarray]:
 
 
 def observation(inputs: np.ndarray) -> Obs:
-    """An observation of the policy's 22 inputs."""
+    """Return an observation with the policy's 22 inputs."""
     ends = np.cumsum([spec.dim for spec in INPUTS.values()])[:-1]
     return Obs(state=dict(zip(INPUTS, np.split(inputs, ends), strict=True)))
 
@@ -56,8 +56,8 @@ def loaded() -> Raptor:
 
 
 def fly(seeds: Sequence[int], acts: Acts, steps: int) -> np.ndarray:
-    """Fly from the start of each seed; the states of the quadrotors after each step, (steps, 17,
-    flights).
+    """Fly from the start of each seed, and return the quadrotors' states after each step, (steps,
+    17, flights).
     """
     batch = HoverBatch(len(seeds))
     obs = batch.reset(seeds=seeds)
@@ -69,13 +69,13 @@ def fly(seeds: Sequence[int], acts: Acts, steps: int) -> np.ndarray:
 
 
 def together(policy: Raptor, flights: int) -> Acts:
-    """Acts of a policy in this process, in one batch."""
+    """Return a function that acts for all flights in one batch, with a policy in this process."""
     sessions = [session(policy) for _ in range(flights)]
     return lambda obs: policy.act_batch(obs, sessions)
 
 
 def session(policy: Raptor) -> Raptor:
-    """A copy in an episode, which shares the weights."""
+    """Return a copy of the policy in a new episode, with shared weights."""
     one = Raptor()
     one.weights = policy.weights
     one.reset(Obs(), None)

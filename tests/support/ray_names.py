@@ -1,7 +1,7 @@
-"""The names of Ray that this package uses though they are not public, as its code has them.
+"""The non-public names of Ray that this package uses, as they appear in its code.
 
-`python tests/support/ray_names.py` lists those that `USES` states, and fails if the installed Ray
-lacks one.
+`python tests/support/ray_names.py` lists the names in `USES`, and fails if the installed Ray lacks
+one.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 
 from vlagents_ray.ray_tools.private import USES, first_missing
 
-# tests/test_layout.py holds that no other module imports any.
+# tests/test_layout.py checks that no other module imports any.
 ADAPTER = Path(__file__).parents[2] / "vlagents_ray" / "ray_tools" / "private.py"
 
 
 def used(file: Path) -> set[str]:
-    """The dotted names of Ray that a file uses, where a part of the name is private."""
+    """Return the dotted names of Ray in a file that have a private part."""
     tree = ast.parse(file.read_text())
     known = {"ray": "ray"}
     for node in ast.walk(tree):
@@ -43,12 +43,12 @@ def used(file: Path) -> set[str]:
 
 
 def _is_private(name: str) -> bool:
-    """Has it a part that is private? `__version__` and its like are not."""
+    """Return whether the name has a private part; names like `__version__` are not private."""
     return any(part.startswith("_") and not part.endswith("__") for part in name.split("."))
 
 
 def main() -> int:
-    """List them; return the exit status."""
+    """Print the names, and return the exit status."""
     import ray
 
     lacking = 0

@@ -1,8 +1,8 @@
-"""Processes of servers and of Ray.
+"""Find, start and stop processes of servers and of Ray.
 
-Those of a Ray that has a separate folder (RAY_TMPDIR, --temp-dir) are known by it. `serving` runs
-`vlagents-ray serve` as users do; `leaked` searches the places where other processes can read a
-secret.
+The processes of a Ray with a separate folder (RAY_TMPDIR, --temp-dir) are identified by this
+folder. `serving` runs `vlagents-ray serve` like a user; `leaked` searches files, command lines and
+environments, where other processes could read a secret.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vlagents_ray.serve.ports import free_port
 
 
 def words(process: psutil.Process) -> list[str]:
-    """Its command line; empty if it has ended or is about to."""
+    """Return the command line of a process; empty if the process has ended or is ending."""
     try:
         return process.cmdline()
     except psutil.Error:
@@ -39,8 +39,8 @@ def words(process: psutil.Process) -> list[str]:
 
 @contextmanager
 def ray_folder() -> Iterator[Path]:
-    """A folder for a Ray of one's own, which is ended with it; short, because the names of
-    sockets are limited.
+    """Yield a folder for a separate Ray, which is killed at the end. The path is short, because the
+    names of sockets are limited.
     """
     folder = Path(tempfile.mkdtemp(prefix="r"))
     try:
@@ -51,8 +51,8 @@ def ray_folder() -> Iterator[Path]:
 
 
 def processes(folder: Path, named: str = "") -> list[int]:
-    """The processes of the Ray whose files are in `folder`, or those of them that are `named`
-    so.
+    """Return the processes of the Ray whose files are in `folder`; with `named`, only those whose
+    program contains this text.
     """
     found = []
     for process in Path("/proc").glob("[0-9]*"):
@@ -60,9 +60,9 @@ def processes(folder: Path, named: str = "") -> list[int]:
             command = (process / "cmdline").read_bytes()
             ours = str(folder).encode() in command + (process / "environ").read_bytes()
             ours = ours or (is_titled(process) and has_open_files(process, str(folder)))
-        except OSError:  # it has ended, or is not ours
+        except OSError:  # the process has ended, or belongs to another user
             continue
-        # What follows may be what setproctitle left of the environment.
+        # The text after the first NUL may be a rest of the environment that setproctitle left.
         program = command.partition(b"\0")[0]
         if ours and named.encode() in program:
             found.append(int(process.name))
@@ -70,8 +70,8 @@ def processes(folder: Path, named: str = "") -> list[int]:
 
 
 def wait_for_end(folder: Path, *named: str) -> None:
-    """Until no process of that Ray that is `named` so is left; says which are if they do not
-    end.
+    """Wait until no process of that Ray whose program contains one of `named` is left; fail with
+    the remaining ones if they do not end.
     """
     try:
         wait_for(lambda: not any(processes(folder, name) for name in named))
@@ -92,7 +92,9 @@ def _said(pid: int) -> str:
 
 
 def end(folder: Path) -> None:
-    """Kill what is left of that Ray: two agents of a killed one take a minute to notice."""
+    """Kill the remaining processes of that Ray, since two agents notice only after a minute that it
+    was killed.
+    """
     for pid in processes(folder):
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -103,7 +105,7 @@ START_S, STOP_S = 180, 180
 
 
 def free_address() -> str:
-    """A "host:port" on which nobody listens."""
+    """Return a free "host:port"."""
     return f"127.0.0.1:{free_port()}"
 
 
@@ -111,10 +113,11 @@ def free_address() -> str:
 def serving(
     policy: str, log: Path, address: str | None = None, *options: str, cwd: Path | None = None
 ) -> Iterator[str]:
-    """A server for the length of the context, on a free port unless one is given; yields
-    "host:port" once healthy.
+    """Run a server during the context, on a free port unless `address` is given, and yield
+    "host:port" once it is healthy.
 
-    With a `cwd` it is as a reader types it there: what tests add to PYTHONPATH is not in it.
+    With a `cwd`, the command runs there like a user's command, without the folders that tests add
+    to PYTHONPATH.
     """
     address = address or free_address()
     command = ["vlagents-ray", "serve", policy, "--port", address.rpartition(":")[2], *options]
@@ -125,7 +128,7 @@ def serving(
             stdout=output,
             stderr=subprocess.STDOUT,
             cwd=cwd,
-            # As tests have set it meanwhile.
+            # PYTHONPATH as tests may have changed it in the meantime.
             env=ENV if cwd is not None else ENV | {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
         )
     try:
@@ -138,7 +141,7 @@ def serving(
             time.sleep(0.2)
         yield address
     finally:
-        server.terminate()  # as Ctrl-C, which what a shell runs in the background never hears
+        server.terminate()  # equivalent to Ctrl-C, which processes in a shell's background ignore
         try:
             server.wait(STOP_S)
         except subprocess.TimeoutExpired:
@@ -148,7 +151,7 @@ def serving(
 
 
 def healthy(address: str) -> bool:
-    """Does it answer, with its policy loaded?"""
+    """Return whether the server answers and its policy is loaded."""
     try:
         with urllib.request.urlopen(f"http://{address}/healthz", timeout=5) as answer:
             return answer.status == 200
@@ -157,8 +160,8 @@ def healthy(address: str) -> bool:
 
 
 def leaked(secret: str, folders: Iterable[Path]) -> list[str]:
-    """The files below `folders` that hold it, and processes but this one, by their command lines
-    and environments.
+    """Return the files in `folders`, the command lines, and the environments of other processes
+    that contain the secret.
     """
     sought = secret.encode()
     files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
@@ -172,6 +175,6 @@ def leaked(secret: str, folders: Iterable[Path]) -> list[str]:
         try:
             if sought in file.read_bytes():
                 found.append(str(file))
-        except OSError:  # it has ended, or is another user's
+        except OSError:  # the process has ended, or belongs to another user
             continue
     return found

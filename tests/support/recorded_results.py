@@ -1,5 +1,5 @@
-"""Folders of results as an evaluation writes them, without running episodes: for tests of their
-readers.
+"""Folders of results like an evaluation writes them, without running episodes, for tests of readers
+of results.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ TIMING = {
     "total_ms": 21.5,
 }
 
-# (case, seed) -> the step that solved it, None for never.
+# Maps (case, seed) to the step in which the episode was solved; None if it was not solved.
 Outcome = Callable[[EvalCase, int], int | None]
 
 
 def runs(
     out: Path, *, episodes: int = 12, steps: list[int] | None = None, **changes: Any
 ) -> EvalConfig:
-    """Settings of two policies, one of them a sweep, in two suites."""
+    """Return settings with two policies, one of them a sweep over steps, in two suites."""
     policies = [
         {
             "name": "learner",
@@ -57,7 +57,9 @@ def runs(
 
 
 def better_later(case: EvalCase, seed: int) -> int | None:
-    """Solved the more often the longer training was; by the base policy every fourth time."""
+    """Return an outcome whose probability of success increases with the training step; the base
+    policy succeeds in every fourth episode.
+    """
     chance = 0.25 if case.step is None else case.step / 2500
     drawn = np.random.default_rng([seed, len(case.env)]).uniform()
     return 10 + seed % 60 if drawn < chance else None
@@ -70,10 +72,10 @@ def record(
     videos: bool = False,
     troubles: bool = False,
 ) -> Results:
-    """Record every episode of `config`; with `troubles`, one error of a policy and one lost
-    episode.
+    """Record every episode of `config`. With `troubles`, the first episode ends with an error of
+    the policy, and the second is lost.
 
-    `videos` are of those that failed, or of all if `config.video` says so.
+    With `videos`, failed episodes have videos, or all episodes if `config.video` is "all".
     """
     with Store(resolve(config)) as store:
         store.begin_run(versions())

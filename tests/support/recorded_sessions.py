@@ -1,4 +1,4 @@
-"""A replica without Ray or sockets that records its sessions, and a robot of it."""
+"""A replica without Ray or sockets that records its sessions, and a robot that connects to it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEIGHT, WIDTH = 33, 48
 
 
 class Brightness(Agent):
-    """Returns a chunk that depends on each pixel, on the state, on the step and on the seed."""
+    """A policy whose chunk depends on each pixel, the state, the step and the seed."""
 
     def __init__(self, gain: float = 1.0, chunk: int = 4) -> None:
         self.gain, self.rows = gain, chunk
@@ -41,7 +41,7 @@ class Brightness(Agent):
 
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
-            raise RuntimeError("as it was asked to")
+            raise RuntimeError("as requested")
         seen = np.array([obs.cameras["front"].astype(np.float64).mean(), obs.state["joints"][0]])
         noise = self._rng.normal(size=(obs.info.get("rows", self.rows), 2))
         return Act(
@@ -72,7 +72,7 @@ class Robot:
     def play(
         self, acts: int, seed: int = 0, first: int = 0, instruction: str = "stack the cups"
     ) -> list[np.ndarray]:
-        """Begin an episode, and return the chunks of so many acts."""
+        """Begin an episode, act `acts` times, and return the chunks."""
         reset = self.ask(Request("reset", seen(first), instruction, {"seed": seed}))
         assert reply_of(reset).error is None
         return [self.act(seen(first + i)) for i in range(acts)]
@@ -89,7 +89,7 @@ def reply_of(reply: Reply) -> Reply:
 
 
 def seen(i: int, side: int = WIDTH) -> Obs:
-    """The observation at a robot's step i."""
+    """Return the observation at a robot's step `i`."""
     image = np.random.default_rng(i).integers(0, 256, (HEIGHT, side, 3), np.uint8)
     state = {"joints": np.array([i, -i], np.float32)}
     return Obs({"front": image}, 0.5, state, {"captured_at": 1e9 + i, "offset": i / 4})
@@ -97,7 +97,7 @@ def seen(i: int, side: int = WIDTH) -> Obs:
 
 @contextmanager
 def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Iterator[Recorded]:
-    """A replica that records as `parts: {record: ...}` with these settings says."""
+    """Run a replica that records with these settings of `parts: {record: ...}`."""
     engine = Engine(agent or Brightness())
     engine.start()
 

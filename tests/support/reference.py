@@ -1,7 +1,7 @@
-"""The reference of commands and settings: `python tests/support/reference.py` writes its pages.
+"""Write the reference of commands and settings: `python tests/support/reference.py`.
 
-The pages are docs/reference/cli.md, run_file.md, deployment.md and policies.md. They are made from
-the parsers of the commands and from the models of the settings, so that they cannot differ.
+The pages are docs/reference/cli.md, run_file.md, deployment.md and policies.md. They are generated
+from the parsers of the commands and from the models of the settings, so they always match the code.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _ABOUT_POLICIES = """\
 This page lists the keys below `args.config` of [a deployment file](deployment.md), which `--set KEY=VALUE` also sets,
 and the keys of its `wrappers`. [Models](../policies/index.md) explains them.
 """
-# Keys that the model requires, and for which the command has a default.
+# Keys that the model requires, but for which the command has a default.
 _DEFAULTS_OF_COMMANDS = {"out": "`runs/NAME`"}
 # Pages that explain a setting, by "Model.field".
 SEE = {
@@ -104,13 +104,13 @@ def pages() -> dict[Path, str]:
 
 
 def help_pages() -> dict[str, HelpPage]:
-    """Return the help of each command, by the words that are typed."""
+    """Return the help of each command; the keys are the words that a user types."""
     found: dict[str, HelpPage] = {}
     for path, command in commands_of(get_command(app)):
         if path == "vlagents-ray robot":
             parser, _, _ = robot_parser()
             assert isinstance(parser, CommandParser)
-            # The names of plug-ins depend on what is installed.
+            # The names of plug-ins depend on the installed packages.
             found[path] = CommandParser.help_page(parser)
             found[f"{path} check"] = check_parser().help_page()
         else:
@@ -120,7 +120,7 @@ def help_pages() -> dict[str, HelpPage]:
 
 def _title(page: str) -> str:
     """Return the title of a page, whose path is relative to docs/."""
-    if page.startswith("reference/"):  # may not be written yet
+    if page.startswith("reference/"):  # the page may not exist yet
         return Path(page).stem.replace("_", " ")
     lines = (ROOT / "docs" / page).read_text().splitlines()
     return next(line.removeprefix("# ") for line in lines if line.startswith("# "))
@@ -182,7 +182,9 @@ def _panel(panel: HelpPanel, rows: Iterable[Any]) -> Iterator[str]:
 
 
 def _term(term: str) -> str:
-    """Return an option and its value; alternatives of a value are listed, as `|` ends a cell."""
+    """Return an option and its value. Alternatives of a value are a list, since `|` would end a
+    cell of the table.
+    """
     names, space, metavar = term.rpartition(" ") if term.startswith("-") else ("", "", term)
     if "|" not in term:
         return f"`{term}`"
@@ -192,7 +194,7 @@ def _term(term: str) -> str:
 
 
 def _code(default: str) -> str:
-    """Return a default; a value is code, and words are words."""
+    """Return a default as code if it is a value, or as plain words."""
     return f"`{default}`" if re.fullmatch(r"[\w./:-]+", default) else _cell(default)
 
 
@@ -207,7 +209,7 @@ def _prose(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a text outside code, without Markdown in it."""
+    """Escape Markdown characters in a text outside code."""
     return text.replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_")
 
 
@@ -285,7 +287,7 @@ def _target(place: str) -> Any:
 
 
 def _models(model: type[BaseModel], prefix: str) -> Iterator[str]:
-    """Yield the section of a model, and those of the models in its fields, each once."""
+    """Yield the sections of a model and of the models in its fields, each once."""
     paths = dict(sections(model, prefix))
     anchors = {found: path.replace(".", "") for found, path in paths.items()}
     for found, path in paths.items():
@@ -390,7 +392,7 @@ def _table(
 
 
 def _description(field: FieldInfo, name: str, owner: type[BaseModel] | None) -> str:
-    """Return the description of a field, or that of the field which it overrides."""
+    """Return the description of a field, or the description of the base class's field."""
     if field.description or owner is None:
         return field.description or ""
     for base in owner.__mro__[1:]:
@@ -457,7 +459,7 @@ def _type(annotation: Any) -> str:
 
 
 def _default(name: str, field: FieldInfo) -> str:
-    """Return the default of a field as YAML; its sections are in tables of their own."""
+    """Return the default of a field as YAML; nested sections have separate tables."""
     if field.is_required():
         return _DEFAULTS_OF_COMMANDS.get(name, "required")
     value = field.get_default(call_default_factory=True)

@@ -1,6 +1,6 @@
-"""What must agree before a version is published: `make release` runs this file first.
+"""Check the consistency of a version before it is published: `make release` runs this file first.
 
-The version is in `pyproject.toml`. Other files repeat it, and the changelog has a section of it.
+The version is in `pyproject.toml`. Other files repeat it, and the changelog has a section for it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tomllib
 
 ROOT = Path(__file__).parents[2]
 VERSION: str = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-# The files that repeat the version, and what stands before it there.
+# The files that repeat the version, and the text before it.
 REPEATED = {
     "CITATION.cff": r"^version: ",
     "cluster/ray/aws.yaml": r"image: REGISTRY/vlagents-ray:",
@@ -36,14 +36,14 @@ def other_versions() -> list[str]:
 
 
 def unfinished(changelog: str) -> list[str]:
-    """Return what the changelog lacks for the release of this version."""
+    """Return the parts that the changelog lacks for the release of this version."""
     if re.search(rf"^## \[{re.escape(VERSION)}\] - \d{{4}}-\d\d-\d\d$", changelog, re.MULTILINE):
         return []
     return [f"CHANGELOG.md: expected a heading '## [{VERSION}] - YYYY-MM-DD'"]
 
 
 def denials() -> list[str]:
-    """Return one line for each page that says that the package is not released."""
+    """Return one line for each page with the statement that the package is not released."""
     pages = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
     return [
         f"{page.relative_to(ROOT)}: expected no sentence that this version is not released"
@@ -60,7 +60,7 @@ def changed_files() -> list[str]:
 
 
 def main() -> int:
-    """Print each problem, or else the version alone; return the exit status."""
+    """Print each problem, or the version if there is none; return the exit status."""
     changelog = (ROOT / "CHANGELOG.md").read_text()
     problems = [*other_versions(), *unfinished(changelog), *denials(), *changed_files()]
     print(*(problems or [VERSION]), sep="\n", file=sys.stderr if problems else sys.stdout)

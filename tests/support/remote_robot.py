@@ -1,4 +1,4 @@
-"""A robot of LeRobot's remote inference over Zenoh, as LeRobot's client speaks it."""
+"""A robot of LeRobot's remote inference over Zenoh, which uses the protocol of LeRobot's client."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _WAIT_S = 20.0
 
 
 def on_wire(feature: dict[str, Any]) -> dict[str, Any]:
-    """A feature with all of its fields, as LeRobot's client sends it."""
+    """Return a feature with all fields that LeRobot's client sends."""
     return {"dtype": "float32", "kind": "tensor", "names": [], **feature}
 
 
 def rgb(image: np.ndarray, **changes: Any) -> dict[str, Any]:
-    """The record of an image."""
+    """Return the record of an RGB image."""
     return {
         "__lerobot_type__": "rgb",
         "encoding": "raw",
@@ -60,7 +60,7 @@ class RemoteRobot:
 
     def __init__(self, port: int, deployment: str = "so101") -> None:
         self._zenoh = open_zenoh(port)
-        self._declared: list[Any] = []  # Zenoh takes back what nothing refers to
+        self._declared: list[Any] = []  # Zenoh undeclares objects without a reference
         self._key = f"lerobot/inference/v1/deployments/{deployment}"
         self.answers: queue.Queue[Envelope] = queue.Queue()
         self.session_id, self.generation, self.sequence = "", 0, 0
@@ -89,17 +89,17 @@ class RemoteRobot:
         self.leave()
 
     def leave(self) -> None:
-        """End the connection without a word, as a robot that loses its network."""
+        """Close the connection without a message, like a robot that loses its network."""
         if self._zenoh is not None:
             self._zenoh.close()
             self._zenoh = None
 
     def query(self, key: str, request: Envelope) -> Envelope:
-        """The only reply to a query."""
+        """Send a query, and return its only reply."""
         with self._zenoh.declare_querier(key) as querier:
             deadline = time.monotonic() + _WAIT_S
             while not querier.matching_status.matching:
-                assert time.monotonic() < deadline, f"nobody answers at {key}"
+                assert time.monotonic() < deadline, f"no server answers at {key}"
                 time.sleep(0.005)
 
         replies: list[bytes] = []
@@ -121,7 +121,7 @@ class RemoteRobot:
         return messages.decode(reply)
 
     def open(self, request_id: str = "", **changes: Any) -> Envelope:
-        """Ask for a session."""
+        """Request a session."""
         body = {
             "expected_artifact": self.descriptor["artifact_identity"],
             "features": [on_wire(FRONT), on_wire(STATE)],
@@ -138,7 +138,7 @@ class RemoteRobot:
         return self.query(f"{self.instance_key}/open", request)
 
     def begin(self, **changes: Any) -> RemoteRobot:
-        """Open a session, and reset it, as LeRobot's client does."""
+        """Open a session and reset it, like LeRobot's client does."""
         self.accepted = self.open(**changes)
         assert self.accepted.message_type == "accepted", self.accepted
         self.session_id = self.accepted.session_id
@@ -160,7 +160,7 @@ class RemoteRobot:
         return f"{self.instance_key}/sessions/{self.session_id}"
 
     def control(self, operation: str, generation: int | None = None) -> Envelope:
-        """Ask for an operation."""
+        """Request a control operation."""
         self.generation = self.generation if generation is None else generation
         request = Envelope(
             "control",
@@ -210,7 +210,7 @@ class RemoteRobot:
         self._zenoh.put(f"{self.session_key}/{suffix}", data)
 
     def act(self, pixel: int, task: str = "abc", **changes: Any) -> Envelope:
-        """The answer to an observation."""
+        """Send an observation, and return the answer."""
         request = self.send(pixel, task, **changes)
         answer = self.answers.get(timeout=_WAIT_S)
         expected = (request.instance_id, request.session_id, request.generation, request.request_id)
@@ -226,7 +226,7 @@ class RemoteRobot:
         with self._zenoh.declare_publisher(key) as publisher:
             deadline = time.monotonic() + _WAIT_S
             while not publisher.matching_status.matching:
-                assert time.monotonic() < deadline, f"nobody reads {key}"
+                assert time.monotonic() < deadline, f"no subscriber at {key}"
                 time.sleep(0.005)
 
     @staticmethod

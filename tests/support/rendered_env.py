@@ -1,4 +1,4 @@
-"""An env that names the renderer of its images."""
+"""An environment that reports the renderer of its images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vlagents_ray.envs.graphics import Renderer
 
 
 class Drawn(Line):
-    """Its renderer is Mesa, in software."""
+    """An environment that reports Mesa's software renderer."""
 
     def renderer(self) -> Renderer:
         return Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)

@@ -1,8 +1,8 @@
-"""What uv resolves of pyproject.toml and the plug-ins' requirements: the table of docs/install.md,
-the images' locks.
+"""Resolve the requirements of pyproject.toml and of the plug-ins with uv, for the table in
+docs/install.md and for the images' lock files.
 
-`python tests/support/resolved.py extras` writes the table again, `… locks` the locks, over the
-network.
+`python tests/support/resolved.py extras` updates the table, and `… locks` the lock files. Both need
+the network.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "install.md"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
-# RoboCasa wants 10 GB besides its packages, CALVIN a checkout.
+# RoboCasa needs 10 GB in addition to its packages, and CALVIN a checkout.
 WITHOUT_IMAGE = {"robocasa", "calvin"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 _PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
 PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
-OF_DEVELOPMENT = {"all", "check", "docs", "dev"}  # for Python 3.11 alone; "all" brings plug-ins
-# Extras of the plug-ins, with what their distribution needs. No two distributions have an extra of
-# the same name.
+# for Python 3.11 only; "all" installs the plug-ins
+OF_DEVELOPMENT = {"all", "check", "docs", "dev"}
+# Extras of the plug-ins, with the requirements of their distribution. No two distributions have an
+# extra of the same name.
 OF_PLUGINS: dict[str, list[str]] = {
     extra: [*project["dependencies"], *requirements]
     for project in PLUGINS
@@ -43,14 +44,14 @@ OF_PLUGINS: dict[str, list[str]] = {
 }
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"] | OF_PLUGINS
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
-SERVER_PYTHON = "3.11"  # server python of the images
-PLATFORM = "x86_64-manylinux_2_36"  # Debian bookworm's
+SERVER_PYTHON = "3.11"  # Python of the servers in the images
+PLATFORM = "x86_64-manylinux_2_36"  # the platform of Debian bookworm
 BEGIN, END = "<!-- resolved {} -->", "<!-- /resolved -->"
 
 
 def direct(extra: str | None) -> list[str]:
-    """The requirements of an extra with those of the extras that it names, and of the install
-    without one.
+    """Return the requirements of an extra, of the extras that it includes, and of the install
+    without an extra.
     """
     found = list(PROJECT["dependencies"]) if extra is None else direct(None)
     for text in EXTRAS[extra] if extra else []:
@@ -58,20 +59,21 @@ def direct(extra: str | None) -> list[str]:
         if wanted.name != PROJECT["name"]:
             found.append(text)
             continue
-        for name in sorted(wanted.extras):  # a set, whose order differs between processes
+        # sorted, since the order of a set differs between processes
+        for name in sorted(wanted.extras):
             found += direct(name)
     return list(dict.fromkeys(found))
 
 
 def lines(file: Path) -> list[str]:
-    """The requirements in a file, without comments."""
+    """Return the requirements in a file, without comments."""
     kept = (line.partition(" #")[0].strip() for line in file.read_text().splitlines())
     return [line for line in kept if line and not line.startswith("#")]
 
 
 def overrides(requirements: Sequence[str]) -> list[str]:
-    """The lines of torch.txt but for packages of which the requirements pin a version, as for
-    another CUDA.
+    """Return the lines of torch.txt, except packages whose version the requirements pin, such as
+    for another CUDA version.
     """
     wanted = map(Requirement, requirements)
     pinned = {one.name for one in wanted if any(part.operator == "==" for part in one.specifier)}
@@ -79,12 +81,12 @@ def overrides(requirements: Sequence[str]) -> list[str]:
 
 
 def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[str, Any]]:
-    """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit
-    the platform.
+    """Return the resolved packages like in a `pylock.toml`, with `name`, `version`, and the
+    `wheels` for the platform.
 
     Raises:
-        LookupError: Nothing fits.
-        RuntimeError: uv failed otherwise, as without a network.
+        LookupError: No versions fit together.
+        RuntimeError: uv failed for another reason, such as a missing network.
     """
     command = [
         sys.executable,
@@ -97,7 +99,7 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
         "--format",
         "pylock.toml",
     ]
-    # uv would look for that Python, which it does not need to resolve requirements.
+    # Otherwise uv would search for that Python, which it does not need to resolve requirements.
     command += ["--no-python-downloads"]
     command += ["--python-version", python, "--python-platform", PLATFORM, *words]
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
@@ -112,23 +114,23 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
     return list(tomllib.loads(done.stdout)["packages"])
 
 
-# The table of docs/install.md.
+# The table in docs/install.md.
 
 
 def extras() -> list[str | None]:
-    """Those with a row; None is the install without one."""
+    """Return the extras with a row in the table; None is the install without an extra."""
     return [None, *(extra for extra in EXTRAS if extra not in OF_DEVELOPMENT)]
 
 
 def digest() -> str:
-    """Of all that the table depends on in this repository."""
+    """Return a digest of everything in this repository on which the table depends."""
     wanted = [PYTHONS, {str(extra): direct(extra) for extra in extras()}, lines(TORCH)]
     return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
 
 
 def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
-    """How many packages come, and which of them have to be compiled, where no versions with
-    wheels alone fit.
+    """Return the number of packages, and those that must be compiled if wheels alone do not
+    suffice.
     """
     found, built = "no", list[str]()
     for words in ([], ["--no-build"]):
@@ -142,8 +144,8 @@ def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
 
 
 def table(only: Sequence[str], old: dict[str, str]) -> str:
-    """All rows, of which those that `only` names are resolved, or all if it is empty; `old` has
-    the others.
+    """Return the table. The rows in `only` are resolved again, or all rows if it is empty; `old`
+    has the other rows.
     """
     with ThreadPoolExecutor(8) as pool:
         cells = {
@@ -170,31 +172,31 @@ def row(*texts: str) -> str:
 
 
 def rows(page: str) -> dict[str, str]:
-    """The lines of the table that a page has, by extra."""
+    """Return the lines of the page's table by extra."""
     return {line.split("|")[1].strip(" `"): line for line in written(page).splitlines()[3:-1]}
 
 
 def written(page: str) -> str:
-    """The table in the page, with its digest before it."""
+    """Return the table in the page, including the digest before it."""
     found = re.search(f"{BEGIN.format('(.*)')}.*?{END}", page, re.DOTALL)
     if found is None:
         raise ValueError(f"{PAGE} has no {BEGIN.format('DIGEST')} … {END}")
     return found[0]
 
 
-# The locks of the images.
+# The lock files of the images.
 
 
 def families() -> list[Path]:
-    """The requirements of families and simulators that have an image."""
+    """Return the requirements files of families and simulators that have an image."""
     files = ROOT.glob("plugins/*/*/requirements/*.txt")
     with_image = (file for file in files if "." not in file.stem and file.stem not in WITHOUT_IMAGE)
     return sorted(with_image, key=lambda file: file.stem)
 
 
 def simulators() -> list[str]:
-    """The extras of simulators that have an image: all but SIMPLER, which is in the image of
-    ManiSkill.
+    """Return the extras of simulators that have an image: all except SIMPLER, which is in
+    ManiSkill's image.
     """
     of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
     of_plugins = []
@@ -206,7 +208,7 @@ def simulators() -> list[str]:
 
 
 def locks() -> dict[str, tuple[str, list[str]]]:
-    """Of each lock's name the Python and the requirements."""
+    """Return the Python and the requirements of each lock file by name."""
     servers = ["serve", "sim", *simulators()]
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
     for file in families():
@@ -219,7 +221,9 @@ def locks() -> dict[str, tuple[str, list[str]]]:
 
 
 def lock(name: str) -> str:
-    """A requirements file of all packages, each with the digests of the files that fit an image."""
+    """Return a requirements file with all packages, and with digests of the files that fit an
+    image.
+    """
     python, requirements = locks()[name]
     text = [f"# {name}, for Python {python} on {PLATFORM}: `make locks` writes it."]
     for package in resolve(requirements, python):

@@ -1,4 +1,4 @@
-"""An evaluation on a simulated arm, with a scripted person at it."""
+"""An evaluation on a simulated arm with a scripted operator."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _CONTRACT = Contract(
 
 
 class Arm(SimulatedRobot):
-    """A simulated arm that `--robot robot_trials:Arm` names. Before the action `fails_at`, from
-    0, it fails once.
+    """A simulated arm, selected with `--robot robot_trials:Arm`. It fails once, before the action
+    with the number `fails_at`, counted from 0.
     """
 
     def __init__(self, fails_at: int | None = None) -> None:
@@ -51,8 +51,8 @@ class Arm(SimulatedRobot):
 
 
 class Reaching(Agent):
-    """Absolute targets; policies differ in where they go, and say their names wherever a policy
-    can.
+    """A policy with absolute targets. Policies with different names have different targets, and
+    report their names in all metadata.
     """
 
     contract = _CONTRACT
@@ -79,7 +79,7 @@ class Reaching(Agent):
 
 
 def plan(out: Path, **changes: Any) -> EvalConfig:
-    """Two policies, two tasks, short trials."""
+    """Return a plan with two policies, two tasks and short trials."""
     robot = {
         "arm": "robot_trials:Arm",
         "hz": 200,
@@ -109,7 +109,9 @@ def tasks(max_steps: int = 4) -> dict[str, dict[str, Any]]:
 
 
 class Policies:
-    """A factory of agents, which notes which of them run: the first of each are rehearsals."""
+    """A factory of agents that records their names in order; the first agent of each name runs the
+    rehearsal.
+    """
 
     def __init__(self, make: Callable[[str], Agent] = Reaching) -> None:
         self.made: list[str] = []
@@ -121,7 +123,7 @@ class Policies:
 
 
 class Evaluation:
-    """An evaluation on a thread."""
+    """An evaluation in a thread."""
 
     def __init__(self, config: EvalConfig, operator: Operator, arm: Arm) -> None:
         self.summary: Summary | None = None
@@ -135,7 +137,7 @@ class Evaluation:
     def _run(self) -> None:
         try:
             self.summary = self._play()
-        except BaseException as error:  # noqa: BLE001 - looked at by the test
+        except BaseException as error:  # noqa: BLE001 - the test reads it
             self.error = error
 
     def join(self) -> None:
@@ -144,8 +146,8 @@ class Evaluation:
 
 
 class ScriptedPerson(TerminalOperator):
-    """A person at the terminal who types what `answer` returns for each question; `printed` is
-    what they read.
+    """An operator at the terminal who types the result of `answer` for each question; `printed` has
+    the output.
     """
 
     def __init__(
@@ -163,7 +165,7 @@ class ScriptedPerson(TerminalOperator):
 
 
 def typed(lines: Sequence[str]) -> Callable[[str], str]:
-    """These lines one after the other, and then the person leaves."""
+    """Return an answer function that types these lines in order, and then ends the input."""
     left = iter(lines)
 
     def answer(_: str) -> str:
@@ -176,8 +178,8 @@ def typed(lines: Sequence[str]) -> Callable[[str], str]:
 
 
 def judged(verdicts: str) -> Callable[[str], str]:
-    """Ready at once; these verdicts, a letter each, one after the other and then from the
-    beginning.
+    """Return an answer function that is always ready, and types these verdicts, one letter each,
+    again and again.
     """
     letters = itertools.cycle(verdicts)
 
@@ -189,7 +191,9 @@ def judged(verdicts: str) -> Callable[[str], str]:
 
 @contextlib.contextmanager
 def captured_output() -> Iterator[Callable[[], bytes]]:
-    """All that this process writes to stdout and stderr, also from C and other threads."""
+    """Capture all output of this process to stdout and stderr, including output from C and other
+    threads.
+    """
     read, write = os.pipe()
     kept = {number: os.dup(number) for number in (1, 2)}
     parts: list[bytes] = []

@@ -1,19 +1,20 @@
-"""Whether passes round as the authors' own do."""
+"""A check that a policy's passes round like the authors' own passes."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_AS_LARGE = 1.25  # errors of small networks differ by about a tenth from draw to draw
+_AS_LARGE = 1.25  # errors of small networks vary by about a tenth between draws
 
 
 def check_rounding(ours: np.ndarray, theirs: np.ndarray, exact: np.ndarray) -> None:
-    """Check that the error of our actions is at most about that of the authors' passes.
+    """Check that the rounding error of this package's actions is not larger than the error of the
+    authors' passes.
 
     Args:
-        ours: Actions in a coarse type.
-        theirs: The same by the authors' own passes.
-        exact: Those of the authors' passes in float32, with the same weights.
+        ours: Actions of this package in a coarse type.
+        theirs: Actions of the authors' passes in the same type.
+        exact: Actions of the authors' passes in float32, with the same weights.
     """
     our_error, their_error = (
         float(np.linalg.norm(actions - exact) / np.linalg.norm(exact)) for actions in (ours, theirs)

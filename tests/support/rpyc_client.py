@@ -1,4 +1,6 @@
-"""RPyC as a client says it, without the package: for frames that the real one would never send."""
+"""A client of RPyC's protocol without the package, for frames that the real client would never
+send.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +20,18 @@ VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4
 
 
 def request(sequence: int, handler: int, boxed: Any) -> bytes:
-    """The frame of a request whose arguments are boxed already."""
+    """Return the frame of a request whose arguments are already boxed."""
     return rpyc._frame(1, (sequence, (handler, boxed)))
 
 
 def call(method: str, *args: Any, sequence: int = 1) -> bytes:
-    """The frame that calls a method of the root by its name."""
+    """Return the frame that calls a method of the root object by name."""
     boxed = (TUPLE, ((LOCAL, ROOT), (VALUE, method), (VALUE, args), (VALUE, ())))
     return request(sequence, Handler.CALLATTR, boxed)
 
 
 def document(pixel: int = 1, instruction: str | None = "x", side: int = 16, **info: Any) -> str:
-    """An observation of vlagents 0.3."""
+    """Return an observation of vlagents 0.3."""
     arm = {
         "cameras": {"front": np.full((side, side, 3), pixel, np.uint8)},
         "camera_data_type": "raw",
@@ -51,7 +53,9 @@ class Client:
         self.socket.sendall(data)
 
     def receive(self) -> tuple[int, Any, Any]:
-        """(kind, sequence, content) of the next message; `EOFError` if the server hung up."""
+        """Return (kind, sequence, content) of the next message; raise `EOFError` if the server
+        closed the connection.
+        """
         header = self.file.read(5)
         if len(header) < 5:
             raise EOFError
@@ -62,7 +66,7 @@ class Client:
         return message[0], sequence, content
 
     def act(self, text: str) -> list:
-        """The first step's action of the only robot."""
+        """Return the first action for the only robot."""
         self.send(call("act", text))
         kind, _, content = self.receive()
         if kind != 2:

@@ -1,8 +1,8 @@
-"""What a process of pytest-xdist takes at once, and which of it begins first.
+"""The order in which tests are assigned to the processes of pytest-xdist, and in which units.
 
-Whatever takes longest begins first, so that the processes end at about the same time.
-`seconds.json` has the seconds of each file that takes long, by tier; a run with
-VLAGENTS_TEST_SECONDS=tests/support/seconds.json records its own there.
+The slowest units begin first, so that the processes end at about the same time. `seconds.json` has
+the durations of slow files by tier. A run with VLAGENTS_TEST_SECONDS=tests/support/seconds.json
+records its durations there.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ import pytest
 
 _SECONDS = Path(__file__).parent / "seconds.json"
 _LEAST_S = 8.0  # shortest duration of a file that is recorded
-# Of several hosts each: one at a time, as two of them starve each other of CPU.
+# These tests simulate several hosts each. They run one at a time, since two of them would starve
+# each other of CPU.
 _CLUSTERS = "tests/cluster/"
 
 
 def unit(nodeid: str) -> str:
-    """The file of a test, or the folder whose files one process runs."""
+    """Return the file of a test, or the folder whose files one process runs."""
     return _CLUSTERS if nodeid.startswith(_CLUSTERS) else nodeid.partition("::")[0]
 
 
 def seconds(config: pytest.Config) -> Counter[str]:
-    """How long the units of a tier took, those of which that is known."""
+    """Return the known durations of the units of a tier."""
     found: Counter[str] = Counter()
     for file, took in json.loads(_SECONDS.read_text()).get(config.option.markexpr, {}).items():
         found[unit(file)] += took
@@ -37,7 +38,9 @@ def seconds(config: pytest.Config) -> Counter[str]:
 
 
 def in_order(nodeids: Sequence[str]) -> dict[str, str]:
-    """The unit of each test, with a number that is another one where other units came between."""
+    """Return the unit of each test, with a number that increases when another unit begins, so that
+    separated parts of a unit differ.
+    """
     found: dict[str, str] = {}
     number, before = 0, ""
     for nodeid in nodeids:
@@ -48,8 +51,8 @@ def in_order(nodeids: Sequence[str]) -> dict[str, str]:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Where `--dist loadfile` asks for files, send units; what of one runs alone, later than the
-    rest, is apart.
+    """With `--dist loadfile`, assign whole units to processes. The tests of a unit that run alone,
+    after all others, form a separate part.
     """
     if config.option.dist != "loadfile":
         return None
@@ -67,7 +70,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Record what each file took, where that is asked for of a run in several processes."""
+    """Record the duration of each file if VLAGENTS_TEST_SECONDS is set and several processes run
+    tests.
+    """
     name = os.environ.get("VLAGENTS_TEST_SECONDS")
     if name is None or not config.getoption("numprocesses", None):
         return

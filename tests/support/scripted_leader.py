@@ -1,4 +1,4 @@
-"""Leaders for tests, which do at each tick what the test says."""
+"""Scripted leaders for tests of teleoperation."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from vlagents_ray import Obs
 
 
 class HoldingLeader:
-    """Has a robot of two joints all the time, and holds it; made without arguments, as commands
-    make a leader.
+    """A leader that always controls a robot with two joints. It has no arguments, so that commands
+    can create it.
     """
 
     def engaged(self) -> bool:
@@ -22,7 +22,9 @@ class HoldingLeader:
 
 
 class ScriptedLeader:
-    """Wants the robot while `wants` is set or true, and commands what `command` says or returns."""
+    """A leader that is engaged while `held` is set or `wants` returns true, and whose actions come
+    from `command`.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Policies that integration tests serve; Ray's workers import this module by PYTHONPATH."""
+"""Policies that integration tests serve. Ray's workers import this module through PYTHONPATH."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from vlagents_ray.policies.scripted import Scripted
 
 
 class Reacher(Agent):
-    """Written as in the paper, without a thought for sessions: state in attributes, some of them
-    mutable.
+    """A policy written like in the paper, without regard to sessions: its state is in attributes,
+    some of them mutable.
     """
 
     def __init__(self, scale: float = 1.0) -> None:
@@ -53,7 +53,7 @@ class Reacher(Agent):
 
 
 class Trainable(TrainableAgent):
-    """Acts with its one parameter, large enough for Ray's object store."""
+    """A policy whose action is its one parameter, which is large enough for Ray's object store."""
 
     trainable = "tree"
 
@@ -65,8 +65,8 @@ class Trainable(TrainableAgent):
 
 
 class OnOneGpu(TrainableAgent):
-    """A torch policy that has a GPU in common with its learner; or, on the CPU, memory in the
-    place of that GPU's.
+    """A torch policy on the same GPU as its learner; on the CPU, shared memory takes the place of
+    the GPU's memory.
     """
 
     trainable = "layer"
@@ -86,7 +86,7 @@ class OnOneGpu(TrainableAgent):
 
 
 class Remembering(Agent):
-    """Looks at the last three observations, and says so in its contract."""
+    """A policy that uses the last three observations, which its contract declares."""
 
     contract = Contract(history=3)
 
@@ -105,8 +105,8 @@ class Remembering(Agent):
 
 
 class Ledger(Agent):
-    """Writes down each act as its batch begins, in a file of its process: of which episode, for
-    which observation.
+    """A policy that writes each act to a file of its process when the batch begins, with the
+    episode and the number of the observation.
     """
 
     def __init__(self, folder: str) -> None:
@@ -136,7 +136,7 @@ class Ledger(Agent):
 
 
 class Located(Agent):
-    """Counts the acts of a session, and returns its process."""
+    """A policy that counts the acts of a session, and returns its process id."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.acts = 0
@@ -148,8 +148,8 @@ class Located(Agent):
 
 
 class Hanging(Agent):
-    """Never returns from an act when told so: it waits ("sleep"), or keeps the interpreter's
-    lock besides ("lock").
+    """A policy that never returns from an act if the observation requests it: it waits ("sleep"),
+    or also keeps the GIL ("lock").
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
@@ -166,7 +166,9 @@ class Hanging(Agent):
 
 
 class Gated(Agent):
-    """Loads when a file appears, and makes another one, GATE.loading, while it waits."""
+    """A policy that loads when the file GATE appears, and creates the file GATE.loading while it
+    waits.
+    """
 
     def __init__(self, gate: str) -> None:
         self.gate = gate
@@ -181,7 +183,7 @@ class Gated(Agent):
 
 
 class Broken(Agent):
-    """Cannot load."""
+    """A policy that fails to load."""
 
     def initialize(self) -> None:
         raise FileNotFoundError("no checkpoint here")
@@ -191,15 +193,16 @@ class Broken(Agent):
 
 
 class Accountant(Agent):
-    """If it is to count, says what its process holds: descriptors, threads, mappings of clients'
-    memory, bytes.
+    """A policy that, on request, reports the resources of its process: descriptors, threads,
+    mappings of clients' memory, and bytes.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         if not kwargs.get("count"):
             return {}
         gc.collect()
-        ctypes.CDLL(None).malloc_trim(0)  # what is free, and only not given back, is held by nobody
+        # return free memory to the system, so that only memory in use is counted
+        ctypes.CDLL(None).malloc_trim(0)
         process = psutil.Process()
         return {
             "descriptors": process.num_fds(),
@@ -213,8 +216,8 @@ class Accountant(Agent):
 
 
 class Echo(Agent):
-    """Answers with what it was sent, and with what its process holds; if a `gate` is named, when
-    that file exists.
+    """A policy that returns the values that it received, and the resources of its process. If the
+    observation names a `gate`, it first waits until that file exists.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
@@ -237,7 +240,9 @@ class Echo(Agent):
 
 
 class Ticking(Agent):
-    """Rows that name the observation that they answer and their own number, after 0.2 s."""
+    """A policy that returns after 0.2 s. Each row contains the tick of its observation and the
+    row's number.
+    """
 
     contract = Contract(
         state={"tick": StateSpec(1)}, action=ActionSpec(dim=2, delta=False), chunk=50
@@ -277,8 +282,8 @@ class Witness(Agent):
 
 
 class Mirror(Agent):
-    """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's
-    number.
+    """A policy whose actions identify the observation: a pixel, the sum of the first state, the
+    number of calls, and the number in the instruction.
 
     A white picture takes it two seconds, or, if the instruction begins with a path, until that file
     exists.
@@ -326,7 +331,7 @@ class Mirror(Agent):
 
 
 class BatchedMirror(Mirror):
-    """`Mirror` in batches, whose sizes it notes."""
+    """`Mirror` with batches; it records their sizes."""
 
     def __init__(self) -> None:
         super().__init__(chunk=2)
@@ -343,7 +348,7 @@ class BatchedMirror(Mirror):
 
 
 class TwoArms(Mirror):
-    """`Mirror` for two arms of six joints with a gripper each."""
+    """`Mirror` for two arms with six joints and a gripper each."""
 
     contract = replace(
         Mirror.contract, action=ActionSpec(dim=14, gripper_open=1.0, gripper_closed=0.0)
@@ -368,7 +373,7 @@ class Stored(Agent):
         while Path(f"{self.path}.held").exists():
             time.sleep(0.02)
         self.number = float(Path(self.path).read_text()) * self.scale
-        find_checkpoint(self.path)  # which makes it known by its digest
+        find_checkpoint(self.path)  # computes the digest by which the checkpoint is known
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.steps = 0
@@ -383,8 +388,8 @@ class Stored(Agent):
 
 
 class Stochastic(ToZero):
-    """Says on demand how likely its actions were, and always which weights chose them: the
-    version in a file.
+    """A policy that returns the version of its weights, read from a file, and on request the
+    log-probability and the value of its actions.
     """
 
     def __init__(self, version: str) -> None:
@@ -407,8 +412,8 @@ class Stochastic(ToZero):
 
 
 class Hesitant(Scripted):
-    """The expert, who now and then stays where it is, each session when its own dice say: some
-    run out of time.
+    """The expert, but with random pauses drawn for each session, so that some episodes run out of
+    time.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -423,7 +428,7 @@ class Hesitant(Scripted):
 
 
 class Proportional(TrainableAgent, ToZero):
-    """Steps to zero with a gain that a learner trains."""
+    """A policy that steps to zero with a gain that a learner trains."""
 
     trainable = "tree"
 

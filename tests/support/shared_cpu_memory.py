@@ -1,9 +1,9 @@
-"""Shared memory of the CPU in place of a GPU's: torch's files of it have the lifetime of CUDA's
-handles.
+"""Shared CPU memory that simulates a GPU's memory: torch's shared files have the same lifetime as
+CUDA's handles.
 
-Readers are counted as torch 2.13 counts those of a GPU's memory (torch/csrc/CudaIPCTypes.cpp and
-StorageSharing.cpp): in a shared file with a header of 64 bytes, in unsigned numbers, and with a
-limbo for memory that was freed before.
+Readers are counted like the readers of a GPU's memory in torch 2.13 (torch/csrc/CudaIPCTypes.cpp
+and StorageSharing.cpp): in a shared file with a header of 64 bytes, as unsigned numbers, and with a
+limbo list for memory that was freed before its readers ended.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ _FILES = itertools.count()
 
 
 class ReaderCounts:
-    """Torch's counts of the readers of memory that this process has sent."""
+    """Torch's reference counts of the readers of memory that this process has sent."""
 
     def __init__(self) -> None:
-        # Readers keep files of counts open by their names, so that no name is ever used again, as
-        # torch's are not.
+        # Readers keep the files of counts open by name. So names are never reused, like in torch.
         self.name = f"/readers_{os.getpid()}_{next(_FILES)}"
         self.next = 0
-        self.limbo: list[tuple[int, Any]] = []  # slots, and their storages
+        self.limbo: list[tuple[int, Any]] = []  # slots and their storages
         self._path = _FOLDER / self.name[1:]
         self._path.write_bytes(bytes(_HEADER + 8 * _SLOTS))
         weakref.finalize(self, self._path.unlink)
@@ -48,21 +47,23 @@ class ReaderCounts:
 
     @classmethod
     def release(cls, name: str, slot: int) -> None:
-        """Take a reader away, in any process; a file that is gone is no error."""
+        """Decrement a count, in any process; a missing file is not an error."""
         if (_FOLDER / name[1:]).exists():
             cls._change(name, slot, -1)
 
     def delete(self, slot: int, storage: Any) -> None:
-        """Free memory whose owner is done with it; what still has readers goes into limbo."""
+        """Free memory that its owner no longer needs; memory with readers moves to the
+        limbo list.
+        """
         self.limbo.append((slot, storage))
         self.collect()
 
     def collect(self) -> None:
-        """Free memory in limbo without readers."""
+        """Free memory in the limbo list that has no readers."""
         self.limbo = [(slot, storage) for slot, storage in self.limbo if self.value(slot) > 0]
 
     def value(self, slot: int) -> int:
-        """Return a count as torch reads it, which is unsigned."""
+        """Return a count as torch reads it, as an unsigned number."""
         with self._path.open("rb") as file:
             file.seek(_HEADER + 8 * slot)
             return int(struct.unpack("<Q", file.read(8))[0])
@@ -77,15 +78,15 @@ class ReaderCounts:
 
 
 class SharedCpuMemory:
-    """Takes the CPU for one GPU."""
+    """Presents the CPU as one GPU."""
 
     def __init__(self, gpu: str = GPU, *peers: str) -> None:
         self.uuid, self.peers = gpu, peers
-        self.handles = 0  # that this process has handed out and not taken back
+        self.handles = 0  # number of handles that this process has created and not released
         self.counts = ReaderCounts()
 
     def install(self) -> None:
-        """Let this process hand over tensors on the CPU as if they were on a GPU."""
+        """Let this process share tensors on the CPU as if they were on a GPU."""
         shared_values._MEMORY = self  # type: ignore[assignment]
 
     def gpu(self, value: Any) -> str:
@@ -104,7 +105,7 @@ class SharedCpuMemory:
 
     @contextmanager
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
-        # Moves the values there, so that writes are seen by all.
+        # Moves the values into shared memory, so that all processes see later writes.
         manager, file, size = storage._share_filename_cpu_()
         slot = self.counts.share()
         self.handles += 1
@@ -134,6 +135,6 @@ class SharedCpuMemory:
 
 
 def files_of_torch() -> set[str]:
-    """The files of shared memory that this process has mapped."""
+    """Return the files of shared memory that this process has mapped."""
     lines = Path("/proc/self/maps").read_text().splitlines()
     return {line.partition("/dev/shm")[2] for line in lines if "/dev/shm/torch_" in line}

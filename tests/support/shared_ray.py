@@ -1,11 +1,11 @@
-"""The one Ray of this test process, and one Serve on it, where test files deploy their policies one
-after the other.
+"""One Ray instance with Serve for the whole test process, on which test files deploy their policies
+one after the other.
 
-A file that needs a Ray, but not its own, takes the fixture `shared_ray`. Ray starts when the first
-such file needs it, and ends before the first test of a file without the fixture, which may start a
-Ray of its own. The order of the files in tests/conftest.py makes that happen once. Only tests of
-launching, of crashes and of settings of Ray itself start their own; so do tests of commands that
-start one, as they would inherit the environment of the shared one.
+A file that needs Ray, but no separate instance, uses the fixture `shared_ray`. Ray starts for the
+first such file, and stops before the first test of a file without the fixture, which may start a
+separate instance. The order of files in conftest.py makes this happen only once. Only tests of
+launching, of crashes and of Ray's settings start a separate instance. So do tests of commands that
+start Ray, since these would inherit the environment of the shared instance.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ import pytest
 from vlagents_ray.serve.ports import LOOPBACK, free_port, keep
 
 FIXTURE = "shared_ray"
-_CPUS = 4  # only an account: replicas, and workers of evaluations
-# For a policy to be ready, with packages that Ray installs; CI may have a fraction of two cores.
+_CPUS = 4  # only a number for Ray's accounting, for replicas and workers of evaluations
+# Time limit for a policy to be ready, including packages that Ray installs; CI may have a fraction
+# of two cores.
 _READY_S = 400.0
 _EXAMPLES = Path(__file__).parents[2] / "examples"
-# Policies that tests serve: their own, and those of examples with several files.
+# Folders of policies that tests serve: the tests' own policies, and examples with several files.
 _POLICIES = (Path(__file__).parent, _EXAMPLES / "raptor", _EXAMPLES / "two_models")
 
 _running: contextlib.ExitStack | None = None
-_port = 0  # port of Serve's HTTP
+_port = 0  # Serve's HTTP port
 
 
 def start() -> None:
-    """Start Ray, unless it runs."""
+    """Start Ray unless it is running."""
     global _running, _port  # noqa: PLW0603 - one for each process
     if _running is not None:
         return
@@ -43,9 +44,10 @@ def start() -> None:
     _port = free_port()
     with contextlib.ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
-        # Instead of 10 s, for which tests would wait.
+        # 2 s instead of 10 s, since tests wait for metrics.
         patch.setenv("RAY_metrics_report_interval_ms", "2000")
-        # Instead of 0.1 s: Serve's controller needs half of its CPU, for as long as this Ray runs.
+        # 0.3 s instead of 0.1 s, since with 0.1 s Serve's controller uses half a CPU while this Ray
+        # runs.
         patch.setenv("RAY_SERVE_CONTROL_LOOP_INTERVAL_S", "0.3")
         patch.setenv("PYTHONPATH", os.pathsep.join(map(str, _POLICIES)), prepend=os.pathsep)
         stack.enter_context(own_ray(LOOPBACK, _port, num_cpus=_CPUS))
@@ -53,7 +55,7 @@ def start() -> None:
 
 
 def stop() -> None:
-    """End Ray and Serve, if they run."""
+    """Stop Ray and Serve if they are running."""
     global _running
     if _running is None:
         return
@@ -69,8 +71,8 @@ def stop() -> None:
 
 @contextlib.contextmanager
 def shared_server(config: Any) -> Iterator[Any]:
-    """Serve a deployment on the shared Ray for the length of the context, as `running_server` does
-    on one of its own.
+    """Serve a deployment on the shared Ray during the context, like `running_server` does on a
+    separate Ray.
 
     Args:
         config: A `Deployment`.
@@ -89,7 +91,7 @@ def shared_server(config: Any) -> Iterator[Any]:
     from vlagents_ray.serve.launch.haproxy import wait_for_haproxy
     from vlagents_ray.serve.launch.server import Server, deploy, wait_for_proxies, wait_until_ready
 
-    assert _running is not None, f"the file has to take the fixture {FIXTURE}"
+    assert _running is not None, f"the test file must use the fixture {FIXTURE}"
     config = with_gateways_at(config, LOOPBACK)
     for app in config.applications:
         keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))

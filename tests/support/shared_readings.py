@@ -1,4 +1,6 @@
-"""The samples of an observation, read once for all of them and once for each."""
+"""A check that inputs of the same observation, computed once for all its samples, give the same
+actions as when computed for each sample.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ def check_shared_readings(
     module: ModuleType,
     atol: float,
 ) -> None:
-    """Require of a policy that its acts are those without `shared_frames` of its module, which
-    runs afterwards.
+    """Check that a policy's actions do not change when `shared_frames` of its module is
+    disabled.
     """
     shared = policy.act_batch(views, [begun(policy, number) for number in range(len(views))])
     with pytest.MonkeyPatch.context() as patch:

@@ -17,7 +17,7 @@ LIMITS = MessageLimits(body_bytes=4 * 2**20)
 
 
 class Keeper(Agent):
-    """Keeps its observations, as a policy with history does."""
+    """A policy that keeps its observations, like a policy with history."""
 
     gate: threading.Event | None = None
 

@@ -1,8 +1,7 @@
-"""What users write down, and so what must not change unnoticed: names, settings, paths, series,
-columns, options.
+"""The public surface that users depend on, and that must not change unnoticed: names, settings,
+paths, metrics, columns and options.
 
-`python tests/support/surface.py` writes tests/surface.txt again, whose changes are seen in a
-review.
+`python tests/support/surface.py` writes tests/surface.txt again, so that reviewers see each change.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ MODULES = (
 
 
 def surface() -> str:
-    """Return all of it, one entry a line, in sections."""
+    """Return the whole surface, one entry per line, in sections."""
     sections = {
         "Python: public names and their arguments": python_names(),
         "Errors: codes in answers, and their classes": error_codes(),
@@ -72,7 +71,7 @@ def python_names() -> Iterator[str]:
             if not (inspect.isclass(value) or inspect.isfunction(value)) or hasattr(
                 value, "model_fields"
             ):
-                yield f"{name}.{one}"  # settings have a section of their own
+                yield f"{name}.{one}"  # settings have a separate section
                 continue
             yield f"{name}.{one}{_arguments(value)}"
             if inspect.isclass(value):
@@ -95,7 +94,7 @@ def _arguments(value: Any) -> str:
     except (TypeError, ValueError):
         return ""
     kept = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
-    if [one.name for one in kept] == ["args", "kwargs"]:  # a class without an `__init__` of its own
+    if [one.name for one in kept] == ["args", "kwargs"]:  # a class without its own `__init__`
         kept = []
     return f"({', '.join(_argument(one) for one in kept)})"
 
@@ -109,7 +108,7 @@ def _argument(one: inspect.Parameter) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A default, without what differs from one run or machine to the next."""
+    """Return a default without parts that differ between runs or machines."""
     if inspect.isclass(value) or inspect.isroutine(value):
         return str(value.__qualname__)
     text = (
@@ -198,7 +197,7 @@ def paths() -> Iterator[str]:
     weights = importlib.import_module("vlagents_ray_learn.weights_endpoint")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
-    engine = SimpleNamespace(stats=None)  # the routes need it only for requests
+    engine = SimpleNamespace(stats=None)  # the routes need the engine only for requests
     app = http.build_http_app(engine, dict, None, more=[*watched, *pushed])
     for route in app.routes:
         methods = " ".join(sorted((getattr(route, "methods", None) or {"WS"}) - {"HEAD"}))
@@ -206,7 +205,9 @@ def paths() -> Iterator[str]:
 
 
 def series() -> list[str]:
-    """By the calls that make them, since Ray's own series cannot be listed."""
+    """Return the metrics from the calls that create them, since Ray's own metrics cannot be
+    listed.
+    """
     files = (
         *ROOT.glob("vlagents_ray/serve/**/*.py"),
         *ROOT.glob("plugins/*/vlagents_ray_*/**/*.py"),
@@ -221,7 +222,7 @@ def series() -> list[str]:
         name_of_call = getattr(call.func, "id", "") if isinstance(call, ast.Call) else ""
         if name_of_call == "series":
             _, kind, name, _, *tags = call.args
-        elif name_of_call == "make":  # `partial` of it, with the first argument
+        elif name_of_call == "make":  # a `partial` of `series` with the first argument
             kind, name, _, *tags = call.args
         else:
             continue
@@ -293,7 +294,7 @@ def variables() -> list[str]:
 
 
 def lines_that_differ(before: str, after: str) -> Iterable[str]:
-    """What was removed, with -, and what was added, with +."""
+    """Return removed lines with - and added lines with +."""
     old, new = before.splitlines(), after.splitlines()
     return [f"- {line}" for line in old if line not in set(new)] + [
         f"+ {line}" for line in new if line not in set(old)

@@ -1,11 +1,10 @@
-"""The tables of README and docs/ that follow from the code: `python tests/support/tables.py` writes
-them.
+"""Write the tables of README and docs/ that are generated from the code: `python
+tests/support/tables.py`. The script also writes examples/plugin, from the skeleton of `vlagents-ray
+init plugin`, and published.json.
 
-It also writes examples/plugin, by the skeleton of `vlagents-ray init plugin`, and published.json.
-
-They are made from the registry, from lists in the code and from what tests have verified, and lie
-between `<!-- table: NAME -->` and `<!-- /table -->`. So are the pages in the navigation of
-mkdocs.yml.
+The tables come from the registry, from lists in the code and from the recorded outcomes of tests,
+and are placed between `<!-- table: NAME -->` and `<!-- /table -->`. The pages in the navigation of
+mkdocs.yml are generated in the same way.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from vlagents_ray.registry import CORE, RegistryEntry, entries
 ROOT = Path(__file__).parents[2]
 PUBLISHED = ROOT / "vlagents_ray" / "published.json"
 PLUGIN, PLUGIN_NAME = ROOT / "examples" / "plugin", "homing"
-# Which the tests that it names find again.
+# Success rates, which the tests named in the file reproduce.
 RATES = json.loads((ROOT / "tests/rates.json").read_text())
-# Of the reference policy, by simulator.
+# Success rates of the reference policy by simulator.
 LEARNT = json.loads((ROOT / "examples/reference/checkpoint/rates.json").read_text())
-# Of serving it, by `benchmarks.success`.
+# Results of serving the reference policy, from `benchmarks.success`.
 SERVING_RESULTS = json.loads((ROOT / "examples/reference/success.json").read_text())["ways"]
 
 
-# Of learners that improve it, by `benchmarks.learners`.
+# Results of learners that improve the reference policy, from `benchmarks.learners`.
 LEARNERS = json.loads((ROOT / "examples/reference/learners.json").read_text())
 
 
@@ -55,9 +54,7 @@ def _code(words: Iterable[str]) -> str:
 
 
 def folder_of(entry: RegistryEntry) -> str:
-    """Return the folder that pip installs in a checkout, of the distribution that registers an
-    entry.
-    """
+    """Return the folder in the checkout of the distribution that registers an entry."""
     return "." if entry.distribution == CORE else f"plugins/{entry.distribution.replace('-', '_')}"
 
 
@@ -75,8 +72,8 @@ def published() -> str:
 
 
 def example_plugin() -> dict[Path, str]:
-    """Return the text of each file of examples/plugin, which is what `vlagents-ray init plugin
-    homing` writes.
+    """Return the text of each file of examples/plugin, as `vlagents-ray init plugin homing` writes
+    it.
     """
     return {
         PLUGIN / path.relative_to(PLUGIN_NAME): text
@@ -85,7 +82,7 @@ def example_plugin() -> dict[Path, str]:
 
 
 def page_of(name: str, entry: RegistryEntry) -> str:
-    """Return the name of the page of a policy or an environment; empty if it has none."""
+    """Return the name of the page of a policy or an environment; empty if it has no page."""
     return name if entry.page is None else entry.page.partition("#")[0]
 
 
@@ -104,20 +101,22 @@ def section(folder: str, page: str) -> str:
 
 
 def share(solved: int, episodes: int, digits: int = 0) -> str:
-    """Return a rate of success in per cent, with its interval."""
+    """Return a success rate in per cent, with its confidence interval."""
     values = (solved / episodes, *wilson(solved, episodes))
     rate, low, high = (f"{100 * value:.{digits}f}" for value in values)
     return f"{rate} [{low}, {high}]"
 
 
 def total(simulator: str) -> tuple[int, int]:
-    """Return the episodes that the reference policy solved in a simulator, and all."""
+    """Return the number of episodes that the reference policy solved in a simulator, and the number
+    of all episodes.
+    """
     solved, episodes = map(sum, zip(*LEARNT[simulator].values(), strict=True))
     return solved, episodes
 
 
 def verified(name: str, family: str = "") -> str:
-    """Return what tests have verified of a policy; `family` is its folder in tests/families."""
+    """Return the verified properties of a policy; `family` is its folder in tests/families."""
     rate = RATES.get(name, {})
     if name == "reference":
         rate = dict(zip(("successes", "episodes"), total("tabletop"), strict=True))
@@ -133,7 +132,7 @@ def verified(name: str, family: str = "") -> str:
 
 
 def policies(folder: str = "") -> Iterator[str]:
-    """Yield the rows of the policies; `folder` leads to docs/policies."""
+    """Yield the rows of the policies; `folder` is the relative path to docs/policies."""
     yield from ("| policy | models | source | verified |", "|---|---|---|---|")
     for name, one in _listed(entries("policies")):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
@@ -145,7 +144,7 @@ def policies(folder: str = "") -> Iterator[str]:
 
 
 def simulated(name: str) -> str:
-    """Return what was verified of an environment."""
+    """Return the verified properties of an environment."""
     if name in LEARNT:
         solved, episodes = total(name)
         return f"✓ {share(solved, episodes)} % of {episodes}"
@@ -154,7 +153,7 @@ def simulated(name: str) -> str:
 
 
 def environments(folder: str = "") -> Iterator[str]:
-    """Yield the rows of the environments; `folder` leads to docs/benchmarks."""
+    """Yield the rows of the environments; `folder` is the relative path to docs/benchmarks."""
     yield from ("| environment | tasks | needs | verified |", "|---|---|---|---|")
     for name, one in _listed(entries("envs")):
         packages = [f"`'{folder_of(one)}[{one.extra}]'`"] if one.extra else []
@@ -167,7 +166,7 @@ def environments(folder: str = "") -> Iterator[str]:
 
 
 def rates() -> Iterator[str]:
-    """Yield the rows of the success of the reference policy by task."""
+    """Yield the success rates of the reference policy by task, one row each."""
     yield from ("| task | success, % | episodes |", "|---|---|---|")
     for tasks in LEARNT.values():
         for env, (solved, episodes) in tasks.items():
@@ -188,14 +187,14 @@ def ways() -> Iterator[str]:
 
 def learners(*names: str) -> list[str]:
     """Return the rows of learners that improve the reference policy."""
-    sys.path.append(str(ROOT))  # run as a program, this file has no path to benchmarks/
+    sys.path.append(str(ROOT))  # when it runs as a script, this file cannot import benchmarks/
     from benchmarks.learners_page import table_rows
 
     return list(table_rows(LEARNERS, names))
 
 
 def columns() -> Iterator[str]:
-    """Yield the rows of the columns of an exported table."""
+    """Yield the rows of the table of an export's columns."""
     yield from ("| column | type | meaning |", "|---|---|---|")
     for column in exports.COLUMNS:
         yield f"| `{column.name}` | {column.type} | {column.meaning} |"
@@ -231,7 +230,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
 
 
 def with_tables(file: str, text: str) -> str:
-    """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the
+    """Return the text of a page with its tables, or the text of mkdocs.yml with the pages of the
     policies and the environments.
     """
     if file == "mkdocs.yml":

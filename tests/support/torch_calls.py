@@ -1,11 +1,10 @@
-"""What an act asks of a GPU, counted without one: the device "meta" takes its place, which computes
-nothing.
+"""Count the GPU operations of an act without a GPU, on the device "meta", which computes nothing.
 
-An eager act launches about one kernel for each ATen call that is no view, and each of them is some
-microseconds of Python. On the device meta, some functions consist of several calls that are a
-single kernel on a GPU, such as attention: `launches` counts each of them once. A copy to the CPU,
-or a value that Python reads, waits until the GPU has done all of its work so far; so does a copy of
-memory that is not pinned, such as that of `torch.tensor(numbers, device=…)`.
+In eager mode, an act launches about one kernel for each ATen call that is not a view, and each call
+takes some microseconds in Python. Some functions, such as attention, are a single kernel on a GPU,
+but several calls on the device meta: `launches` counts each function once. A copy to the CPU, or a
+value that Python reads, waits until the GPU has done all of its work so far; so does a copy of
+memory that is not pinned, as in `torch.tensor(numbers, device=…)`.
 """
 
 from __future__ import annotations
@@ -29,27 +28,26 @@ _READ = {
     "unique_dim",
     "_unique2",
 }
-_ANY_DEVICE = {"aten.lift_fresh.default", "aten.detach.default"}  # calls that run nothing
-# Functions with a kernel for CUDA, according to torch's native_functions.yaml.
+_ANY_DEVICE = {"aten.lift_fresh.default", "aten.detach.default"}  # calls that launch no kernel
+# Functions with a single CUDA kernel, according to torch's native_functions.yaml.
 _ONE_KERNEL = {"scaled_dot_product_attention", "_fused_rms_norm"}
 
 
 class TorchCalls(TorchDispatchMode):
-    """Counts the calls on the device meta within its context; a copy to the CPU has zeros."""
+    """Counts the calls on the device meta within its context. A copy to the CPU returns zeros."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.calls = 0  # other than views
-        self.launches = (
-            0  # the same, where the parts of a function of `_ONE_KERNEL` are not counted
-        )
-        self.uploads = 0  # copies from the CPU of memory that may be pinned
-        self.waits: Counter[str] = Counter()  # waits of Python for the GPU, by their functions
+        self.calls = 0  # calls except views
+        self.launches = 0  # the same, but a function of `_ONE_KERNEL` counts once
+        self.uploads = 0  # asynchronous copies from pinned memory of the CPU
+        # number of times that Python waits for the GPU, by function
+        self.waits: Counter[str] = Counter()
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, name = kwargs or {}, op.overloadpacket.__name__
         launches_before = self.launches
-        with self:  # of a tensor of inference mode, some calls arrive whole
+        with self:  # for tensors of inference mode, some calls arrive undecomposed
             parts = op.decompose(*args, **kwargs)
         if parts is not NotImplemented:
             if name in _ONE_KERNEL:
@@ -99,7 +97,9 @@ class TorchCalls(TorchDispatchMode):
 
 
 def calls_of_an_act(policy: Any, sessions: Sequence[Any], views: Sequence[Any]) -> TorchCalls:
-    """Act once with all sessions, on what they see and have prepared, and count."""
+    """Act once with all sessions, on their observations and prepared inputs, and return the
+    counts.
+    """
     for session, obs in zip(sessions, views, strict=True):
         obs.prepared = session.prepare(obs)
     with TorchCalls() as counted:
@@ -113,8 +113,8 @@ def calls_of_an_act(policy: Any, sessions: Sequence[Any], views: Sequence[Any]) 
 
 
 def _copied(indices: Any) -> str:
-    """Return why an index waits: its truth values are counted, or it is a list, or a tensor on
-    the CPU.
+    """Return why indexing waits for the GPU: Python counts true values, or the index is a list or a
+    tensor on the CPU.
     """
     given = [one for one in tree_leaves(indices) if isinstance(one, torch.Tensor)]
     if any(one.dtype in (torch.bool, torch.uint8) for one in given):

@@ -1,4 +1,4 @@
-"""The client of clients/typescript, built once for each state of its sources."""
+"""The client of clients/typescript, built once for each version of its sources."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 CLIENT = Path(__file__).parents[2] / "clients" / "typescript"
 NODE, NPM = shutil.which("node"), shutil.which("npm")
-_INSTALLED = CLIENT / "node_modules" / ".package-lock.json"  # npm writes it last
+_INSTALLED = CLIENT / "node_modules" / ".package-lock.json"  # npm writes this file last
 _BUILT = CLIENT / "dist" / "index.js"
 
 
 def build() -> Path:
-    """Install what it needs and compile it, unless both are done; returns its folder."""
+    """Install the dependencies and compile the client unless both are done; return its folder."""
     if (
         not _INSTALLED.exists()
         or _INSTALLED.stat().st_mtime < (CLIENT / "package-lock.json").stat().st_mtime
@@ -24,12 +24,12 @@ def build() -> Path:
         file.stat().st_mtime for file in sources
     ):
         _npm("run", "build")
-        _BUILT.touch()  # the compiler leaves files alone that would be the same
+        _BUILT.touch()  # the compiler does not rewrite unchanged files
     return CLIENT
 
 
 def node_version() -> int:
-    """The major version of Node.js; 0 where it, or npm, is missing."""
+    """Return the major version of Node.js; 0 if Node.js or npm is missing."""
     if NODE is None or NPM is None:
         return 0
     said = subprocess.run([NODE, "--version"], check=True, capture_output=True, text=True).stdout

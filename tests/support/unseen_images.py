@@ -1,4 +1,6 @@
-"""An env's episode with all images, and once more with those alone that the policy gets."""
+"""Compare an episode with all images with an episode with only the images that the policy
+receives.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,10 @@ _CHUNK = 3
 
 
 def require_same_without_unseen_images(env: EvalEnv) -> None:
-    """Require that an env leaves out the images that no policy looks at, and that nothing else
-    depends on them.
+    """Check that an environment omits the images that no policy uses, and that nothing else depends
+    on these images.
 
-    Everything but the images of every step, and the images that are looked at, are equal to the
-    bit.
+    All other data of each step, and the images in use, must be bit-identical.
     """
     told, images = _played(env, every=1)
     sparing, few = _played(env, every=_CHUNK)
@@ -27,7 +28,7 @@ def require_same_without_unseen_images(env: EvalEnv) -> None:
 
 
 def _played(env: EvalEnv, *, every: int) -> tuple[list[Any], list[Any]]:
-    """What an episode of random actions gave, and its images, as bytes."""
+    """Return the data of an episode with random actions, and its images, as bytes."""
     rng = np.random.default_rng(5)
     told, images = [], []
 

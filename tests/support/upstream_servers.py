@@ -1,9 +1,10 @@
-"""Servers of other systems, in the bytes of their own packers; none of our codecs is used.
+"""Servers of other systems, whose bytes come from the systems' own packers, not from codecs of this
+package.
 
-`python upstream_servers.py KIND PORT [KIND PORT …]` serves all of them. A kind is a protocol, and
-for GR00T also `gr00t sim`: with `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest
-servers' arrays. What they answer depends on each bit of the observation, so that an action that
-equals `answer` was computed from the very observation. The formats are those of
+`python upstream_servers.py KIND PORT [KIND PORT …]` serves all of them. A kind is the name of a
+protocol. GR00T has two more kinds: `gr00t sim`, with `Gr00tSimPolicyWrapper`, and `gr00t packed`,
+with the newest servers' arrays. Their answers depend on each bit of the observation, so that an
+action that equals `answer` was computed from exactly this observation. The formats follow
 openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
 """
 
@@ -32,7 +33,7 @@ CLOSED, BROKEN, SLOW = "close the connection", "raise an error", "take long"  # 
 
 
 def answer(theirs: Mapping[str, Any], step: int = 0) -> np.ndarray:
-    """The actions for an observation, (4, 7) float64, of which float32 keeps each number apart."""
+    """Return the actions for an observation, (4, 7) float64, which stay distinct in float32."""
     return np.random.default_rng([_digest(theirs), step]).standard_normal((ROWS, COLUMNS))
 
 
@@ -214,7 +215,7 @@ def gr00t(port: int, *variants: str) -> None:
 
 
 def gr00t_nested(observation: dict[str, Any]) -> dict[str, Any]:
-    """As `Gr00tSimPolicyWrapper` reads flat keys."""
+    """Nest flat keys like `Gr00tSimPolicyWrapper` reads them."""
     key = "annotation.human.task_description"
     named = {
         kind: {name: observation[f"{kind}.{name}"] for name in names}
@@ -275,14 +276,14 @@ class OpenVLA(BaseHTTPRequestHandler):
 
 @contextlib.contextmanager
 def upstream(kind: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A server of a kind in a separate process, which is killed at the end."""
+    """Run a server of a kind in a separate process, which is killed at the end."""
     with upstreams({port: kind}) as process:
         yield process
 
 
 @contextlib.contextmanager
 def upstreams(kinds: Mapping[int, str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Servers by their ports in one process, which is killed at the end."""
+    """Run several servers in one process, which is killed at the end; yield their ports."""
     words = [word for port, kind in kinds.items() for word in (kind, str(port))]
     process = subprocess.Popen([sys.executable, __file__, *words])
     try:

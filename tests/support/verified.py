@@ -1,10 +1,10 @@
-"""What the tests of the model families verify, for docs/policies/verification.md: `python
-tests/support/verified.py` writes its table.
+"""Write the table of docs/policies/verification.md, with the properties that the tests of the model
+families verify: `python tests/support/verified.py`.
 
-A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified
-tests/families/FAMILY` notes what became of these tests in `verified.json` of that folder, and `make
-verified` does both. Why a test was skipped is in its report; why a file was left out is in
-`LEFT_OUT` of the folder's conftest.py, {file: reason}.
+A test declares with `@pytest.mark.verifies("parity")` which property it verifies. `pytest
+--verified tests/families/FAMILY` records the outcomes of these tests in `verified.json` of that
+folder, and `make verified` does both. The reason for a skipped test comes from its report; the
+reason for an excluded file from `LEFT_OUT` of the folder's conftest.py, {file: reason}.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ FOLDERS = tuple(
 )
 PAGES = ROOT / "docs" / "policies"
 PAGE = PAGES / "verification.md"
-PYTHON = "3.11"  # python of this project's own environment
+PYTHON = "3.11"  # Python of this project's own environment
 BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
-WHAT = ("parity", "batches", "isolation", "loading", "size")  # the columns that the page explains
-PLUGINS = ("arro",)  # wrappers of packages in plugins/, with a page among those of the policies
-FURTHER_PAGES = (*PLUGINS, PAGE.stem)  # of no policy
-# Of each family: the names of its requirements, and the packages and checkouts whose versions
-# matter.
+# the properties, which the page explains and which are its columns
+WHAT = ("parity", "batches", "isolation", "loading", "size")
+PLUGINS = ("arro",)  # wrappers of packages in plugins/ that have a page among the policies' pages
+FURTHER_PAGES = (*PLUGINS, PAGE.stem)  # pages that belong to no policy
+# For each family, the names of its requirements files, and the packages and checkouts whose
+# versions matter.
 RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
     for name, one in entries("policies").items()
@@ -48,15 +49,15 @@ RUN_WITH = {
 
 
 class VerifyingTests:
-    """A pytest plugin that notes the outcomes of the tests marked `verifies`, by family."""
+    """A pytest plugin that records the outcomes of the tests marked `verifies`, by family."""
 
     def __init__(self) -> None:
         self._outcomes: dict[str, dict[str, Counter[str]]] = {}
-        self._skipped: dict[str, dict[str, str]] = {}  # why, by family and test
-        self._left_out: dict[str, dict[str, str]] = {}  # why, by family and file
+        self._skipped: dict[str, dict[str, str]] = {}  # reasons by family and test
+        self._left_out: dict[str, dict[str, str]] = {}  # reasons by family and file
 
     def pytest_plugin_registered(self, plugin: Any) -> None:
-        if left_out := getattr(plugin, "LEFT_OUT", None):  # a conftest.py
+        if left_out := getattr(plugin, "LEFT_OUT", None):  # the plugin is a conftest.py
             self._left_out[Path(plugin.__file__).parent.name] = left_out
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -89,20 +90,20 @@ class VerifyingTests:
 
 
 def folder_of(family: str) -> Path:
-    """The folder of a family's tests, among those of the core or of a plug-in."""
+    """Return the folder of a family's tests, in the core or in a plug-in."""
     folders = [ROOT / folder / family for folder in FOLDERS]
     return next((folder for folder in folders if _verifies(folder)), folders[0])
 
 
 def _verifies(folder: Path) -> bool:
-    """Return whether tests of the folder state what they verify; others of a family are of other
-    distributions.
+    """Return whether the folder has tests marked `verifies`; other distributions may have tests of
+    the same family.
     """
     return any("pytest.mark.verifies(" in file.read_text() for file in folder.glob("test_*.py"))
 
 
 def noted_in(family: str) -> Path:
-    """The file with the outcomes of a family's tests in this Python."""
+    """Return the file with the outcomes of a family's tests for this Python version."""
     python = _python()
     return folder_of(family) / (
         "verified.json" if python == PYTHON else f"verified.python{python}.json"
@@ -110,15 +111,15 @@ def noted_in(family: str) -> Path:
 
 
 def notes(family: str) -> list[dict[str, Any]]:
-    """What is noted of a family, for each Python in which it was tested."""
+    """Return the recorded outcomes of a family for each Python version in which it was tested."""
     return [
         json.loads(file.read_text()) for file in sorted(folder_of(family).glob("verified*.json"))
     ]
 
 
 def marked(family: str) -> Iterator[tuple[str, str]]:
-    """Yield each test of a family that is marked `verifies`, as `file::test`, and what it
-    verifies.
+    """Yield each test of a family that is marked `verifies`, as `file::test`, and the property that
+    it verifies.
     """
     for file in sorted(folder_of(family).glob("test_*.py")):
         for node in ast.parse(file.read_text()).body:
@@ -168,7 +169,9 @@ def main() -> None:
 
 
 def _row(family: str, results: dict[str, Any] | None) -> str:
-    """Return the row of a family in one Python; without results, its tests have not run."""
+    """Return the row of a family for one Python version; without results, its tests have
+    not run.
+    """
     file, hash_sign, section = page_of(family).partition("#")
     link = f"[`{family}`]({file}.md{hash_sign}{section})"
     if results is None:

@@ -1,7 +1,8 @@
-"""Serve, act, evaluate and collect rollouts once, with the Python and the Ray of an environment.
+"""Serve, act, evaluate and collect rollouts once, with an environment's versions of Python and Ray.
 
-`python tests/support/version_check.py FOLDER` runs there with the packages of a server, and prints
-one line of JSON. FOLDER has `model.onnx`, and gets the results. `versions.py` makes the environments.
+`python tests/support/version_check.py FOLDER` runs in an environment with the packages of a server,
+and prints one line of JSON. FOLDER contains `model.onnx`; the results are written there.
+`versions.py` creates the environments.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from vlagents_ray.serve.launch.server import running_server
 
 OUTSIDE: tuple[TransportName, ...] = ("http", "websocket", "shm")
 INSIDE: tuple[TransportName, ...] = ("handle", "plasma")
-TABLETOP_DIM = 4  # tabletop dim of an action of `tabletop`
+TABLETOP_DIM = 4  # number of values in an action of `tabletop`
 EPISODES = 2
 STEPS = 20
 
 
 def deployment(model: Path) -> Deployment:
-    """The policies `noop` and `onnx`, on one server."""
+    """Return a deployment of the policies `noop` and `onnx` on one server."""
     onnx = {"checkpoint": str(model), "state": ["joints"]}
     apps = {
         "noop": {"policy": "noop", "config": {"action_dim": TABLETOP_DIM}},
@@ -55,7 +56,7 @@ def observation() -> Obs:
 
 
 def act(url: str, transport: TransportName) -> list[float]:
-    """The action after a reset and one observation."""
+    """Return the action after a reset and one observation."""
     with RemoteAgent(url, transport=transport) as agent:
         agent.reset(observation(), "lift")
         action = agent.act(observation()).action
@@ -65,12 +66,14 @@ def act(url: str, transport: TransportName) -> list[float]:
 
 @ray.remote(num_cpus=0)
 def act_in_task(url: str, transport: TransportName) -> list[float]:
-    """`act`, in a worker on the node of the replica."""
+    """Call `act` in a worker on the node of the replica."""
     return act(url, transport)
 
 
 def rollouts(url: str) -> int:
-    """The number of steps of two episodes that a learner collects; 0 without what that needs."""
+    """Return the number of steps of two episodes that a learner collects; 0 if the packages of
+    rollouts are missing.
+    """
     if importlib.util.find_spec("pyarrow") is None:
         return 0
     from vlagents_ray_learn import RolloutPlan, Rollouts
@@ -83,7 +86,7 @@ def rollouts(url: str) -> int:
 
 
 def evaluation(url: str, out: Path) -> int:
-    """The number of episodes with a result, of one worker."""
+    """Return the number of episodes with a result in an evaluation with one worker."""
     config = {
         "policies": [{"name": "noop", "url": url}],
         "suites": [
@@ -98,7 +101,7 @@ def evaluation(url: str, out: Path) -> int:
 
 
 def main(folder: Path) -> dict[str, Any]:
-    """What was run, and what came of it."""
+    """Run all parts, and return their results."""
     actions: dict[str, dict[str, list[float]]] = {}
     with running_server(deployment(folder / "model.onnx"), num_cpus=4) as server:
         for name, url in server.apps.items():

@@ -1,7 +1,7 @@
 """Environments with other versions of Python and of Ray, in which `version_check.py` runs.
 
 A warning of Python about the code of this repository is an error there, in every process: a module
-that each interpreter imports at its start sees to that.
+that each interpreter imports at its start enables this.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vlagents_ray.serve.python_env.create import install
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("version_check.py")
 RUN_S = 300
-DIM = 3  # dim of an action of the model
+DIM = 3  # number of values in an action of the model
 _MODEL = """<ir_version: 8, opset_import: ["": 17]>
     reach (float[batch, 4] state) => (float[batch, 3] action) {
         weights = Constant <value = float[4, 3] {1, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1, 1}> ()
@@ -41,13 +41,13 @@ for category in (DeprecationWarning, PendingDeprecationWarning, SyntaxWarning):
 
 
 def check(python: str, folder: Path, ray: str | None = None) -> dict[str, Any]:
-    """Run `version_check.py` in an environment, and return what it printed.
+    """Run `version_check.py` in an environment, and return its output.
 
     Args:
         python: The minor version of Python, such as "3.12".
         folder: A folder for its files.
-        ray: The version of Ray, such as "2.56.1"; None for the newest that is allowed. With one,
-            the environment also has the packages of rollouts.
+        ray: The version of Ray, such as "2.56.1"; None for the newest allowed version. If a version
+            is given, the environment also has the packages of rollouts.
     """
     extras = ("serve", "onnx") if ray is None else ("serve", "onnx", "rollouts")
     plugins = (
@@ -61,7 +61,8 @@ def check(python: str, folder: Path, ray: str | None = None) -> dict[str, Any]:
     interpreter = environment(name, sorted(packages), python)
     for source in (ROOT, *(ROOT / "plugins" / plugin for plugin in plugins)):
         install(interpreter, ["--no-deps", "--editable", str(source)])
-    # Ray waits at most 15 s for its agents, which is too short for modules that were never compiled.
+    # Ray waits at most 15 s for its agents, which is too short if their modules have never been
+    # compiled.
     subprocess.run([str(interpreter), "-c", _AGENTS], check=True, capture_output=True)
 
     onnx.save(parse_model(_MODEL), str(folder / "model.onnx"))
@@ -81,12 +82,14 @@ def check(python: str, folder: Path, ray: str | None = None) -> dict[str, Any]:
 
 
 def require_everything(printed: dict[str, Any], *, rollouts: bool) -> None:
-    """Require of what `version_check.py` printed that all ways had equal actions, and results."""
+    """Check that all transports in the output of `version_check.py` returned equal actions, and
+    that there are results.
+    """
     for actions in printed["actions"].values():
         assert sorted(actions) == ["handle", "http", "plasma", "shm", "websocket"]
         [first, *others] = actions.values()
         assert all(action == first for action in others), actions
-    # state (0, 1, 2, 3) times the weights
+    # the state (0, 1, 2, 3) times the weights
     assert printed["actions"]["onnx"]["http"] == [3.0, 4.0, 5.0]
     assert printed["evaluated"] == 2
     assert (printed["collected"] > 0) == rollouts

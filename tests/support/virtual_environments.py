@@ -1,5 +1,5 @@
-"""Virtual environments for tests, made in seconds: after their own packages, they see those of
-this environment.
+"""Virtual environments for tests, created in seconds: after their own packages, they use the
+packages of this environment.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import vlagents_ray
 from vlagents_ray.serve.python_env.create import create, install
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
-NEEDS_NUMPY_2 = "pyarrow"  # which Ray imports where it is installed; a server does without
+NEEDS_NUMPY_2 = "pyarrow"  # Ray imports pyarrow if it is installed; a server does not need it
 
 
 def ended(pid: int) -> bool:
-    """Has the process ended, be it that nobody has asked yet how?"""
+    """Return whether the process has ended, even if its parent has not yet read the exit status."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -24,8 +24,8 @@ def ended(pid: int) -> bool:
 
 
 def layered(folder: Path, *requirements: str) -> Path:
-    """The Python of an environment in `folder` with `requirements`, without what those need,
-    over this one's.
+    """Create an environment in `folder` with `requirements`, but without their dependencies, on top
+    of this environment; return its Python.
     """
     python = create(folder)
     install(python, ["--no-deps", *requirements])

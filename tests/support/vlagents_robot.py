@@ -1,7 +1,8 @@
-"""A robot with the real client of vlagents; run by the peers' Python, it imports nothing of ours.
+"""A robot with the real client of vlagents. The Python of the peers' environment runs it, and it
+imports nothing of this package.
 
-`vlagents_robot.py HOST PORT MODEL MODE`, MODE "raw", "jpeg" or "shm". Each line of its standard
-input is a JSON object, which it answers with one: {"pixel", "joints", "gripper", "instruction",
+`vlagents_robot.py HOST PORT MODEL MODE`, MODE "raw", "jpeg" or "shm". For each line of standard
+input, a JSON object, it prints a JSON object: {"pixel", "joints", "gripper", "instruction",
 "robots"?, "calls"?, "kwargs"?}, or {"say": "name" | "git_status" | "is_initialized" | "segments" |
 "close"}.
 """
@@ -17,7 +18,7 @@ import vlagents.client
 
 try:
     from vlagents.policies.interface import Obs, SingleObs
-except ImportError:  # 0.2
+except ImportError:  # vlagents 0.2
     from vlagents.policies import Obs
 
     SingleObs = None  # type: ignore[assignment,misc]
@@ -39,7 +40,7 @@ def observation(wish: dict) -> Obs:
 
 
 def plain(act: object) -> list:
-    """[[robot, action, gripper, done, info]] of each step."""
+    """Return [[robot, action, gripper, done, info]] for each step."""
     if SingleObs is None:
         return [["", act.action.tolist(), None, act.done, act.info]]
     return [
@@ -70,7 +71,7 @@ def main() -> None:
                 answer = agent.reset(observation(wish), wish["reset"], **wish.get("kwargs", {}))
             else:
                 answer = [plain(agent.act(observation(wish))) for _ in range(wish.get("calls", 1))]
-        except Exception as error:  # noqa: BLE001 - told to the test
+        except Exception as error:  # noqa: BLE001 - sent to the test
             answer = {"error": str(error)}
         print(json.dumps(answer), file=out, flush=True)
 

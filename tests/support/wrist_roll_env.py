@@ -1,5 +1,5 @@
-"""Envs whose state has an angle that wraps from pi to -pi, and a policy that solves them and
-then stops.
+"""Environments whose state has an angle that wraps from pi to -pi, and a policy that solves them
+and then stops.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ ROLLER, TILTED_ROLLER = "wrist_roll_env:Roller", "wrist_roll_env:TiltedRoller"
 
 
 class Roller(EvalEnv):
-    """A wrist is turned over pi. If the seed is even, the task is solved at the sixth of twelve
-    steps.
+    """An environment in which a wrist turns past pi. With an even seed, the task is solved at the
+    sixth of twelve steps.
     """
 
     max_steps = 12
-    TURN = 0.3  # rad a step
+    TURN = 0.3  # rad per step
 
     @property
     def contract(self) -> Contract:
@@ -94,7 +94,7 @@ class TiltedRoller(Roller):
 
 
 class Turner(Agent):
-    """Turns for six steps, and then rests."""
+    """A policy that turns for six steps, and then stands still."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.steps = 0

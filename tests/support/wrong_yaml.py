@@ -1,8 +1,8 @@
-"""Files that no reader of YAML accepts, for tests here and of plug-ins."""
+"""Files that are invalid YAML, for tests of this package and of plug-ins."""
 
 from __future__ import annotations
 
-# By mistake: the file's bytes, and a word that its error contains.
+# For each mistake, the file's bytes and a word in the error message.
 WRONG = {
     "a key twice": (b'{"keys": [], "keys": []}', "twice"),
     "not closed": (b"{a: [1, 2", ""),

@@ -1,4 +1,4 @@
-"""Sessions of Zenoh that are clients of a port on loopback."""
+"""Zenoh sessions that connect as clients to a local port."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 
 def open_zenoh(port: int) -> Any:
-    """Return a session that knows only the peer at a port: it finds no others, and shares no
-    memory.
+    """Return a session that connects only to the peer at `port`: it does not scout, and does not
+    use shared memory.
     """
-    import zenoh  # the light tests do without it
+    import zenoh  # the tests without extras lack zenoh
 
     config = zenoh.Config()
     settings = {

@@ -1,8 +1,6 @@
-"""An environment as LeRobot finds it, `--env.discover_packages_path=lerobot_env_mirror
---env.type=mirror`.
-
-It knows which actions `mirror_policy.MirrorPolicy` returns to a separate session, and rewards
-each of them by 1.
+"""An environment that LeRobot finds with `--env.discover_packages_path=lerobot_env_mirror
+--env.type=mirror`. It gives a reward of 1 for each action that `mirror_policy.MirrorPolicy` returns
+to a session that belongs to this environment alone.
 """
 
 from dataclasses import dataclass, field
@@ -19,7 +17,7 @@ _ID = "gym_mirror/Mirror-v0"
 
 
 class Mirror(gym.Env):
-    """The state is the last action, and each image has another colour."""
+    """An environment whose state is the last action, and whose images all differ in colour."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - Gymnasium's
     observation_space = gym.spaces.Dict(
