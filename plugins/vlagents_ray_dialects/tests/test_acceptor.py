@@ -1,4 +1,4 @@
-"""The acceptor of the dialects with their own ports."""
+"""Tests of the acceptor of the dialects with their own ports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vlagents_ray_dialects import acceptor
 def test_connections_that_their_clients_have_ended_neither_count_nor_delay_the_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By the rate below, the last client would wait for days."""
+    """If ended connections counted, the last client would wait for days at the rate set below."""
     monkeypatch.setattr(acceptor, "_ACCEPTED_PER_S", 1e-3)
     listener = socket.create_server(("127.0.0.1", 0))
     address = listener.getsockname()

@@ -19,7 +19,8 @@ from vlagents_ray.errors import MessageTooLarge, Overloaded
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray_dialects.client_reader import ClientReader, share_of
 
-Pair = tuple[socket.socket, socket.socket]  # the client's end and the gateway's
+# The socket of the client, and the socket of the gateway.
+Pair = tuple[socket.socket, socket.socket]
 
 
 @contextlib.contextmanager
@@ -107,7 +108,7 @@ def test_a_client_that_sends_nothing_or_too_slowly_ends(pair: Pair) -> None:
 def test_a_client_of_each_kind_of_socket_has_a_share(
     family: socket.AddressFamily, address: tuple[str, int] | str, share: str
 ) -> None:
-    """Also one that has left."""
+    """A client that has disconnected also has a share."""
     with socket.socket(family) as listener, socket.socket(family) as client:
         try:
             listener.bind(address)

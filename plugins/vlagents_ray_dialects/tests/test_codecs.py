@@ -1,5 +1,5 @@
-"""The codecs of other systems' messages: what goes in comes out, and what is wrong is rejected by
-name.
+"""Tests of the codecs of other systems' messages: round trips are exact, and errors name the
+invalid field.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ messages = st.dictionaries(
     st.recursive(
         plain | arrays,
         lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
-        max_leaves=16,  # no deeper than the limits allow
+        max_leaves=16,  # The nesting stays within the limits.
     ),
     max_size=4,
 )
@@ -195,7 +195,7 @@ def test_limits_hold(dialect: str) -> None:
 
 
 def test_few_bytes_do_not_become_much_memory() -> None:
-    """Each byte an empty list, or a list that says it is long."""
+    """In these messages each byte is an empty list, or each list declares a large length."""
     lists = b"\xdd" + (10_000).to_bytes(4, "big") + (b"\xdc\x27\x0f" + b"\x90" * 9_999) * 2_000
     open_ended = b"\xdd\x00\x00\x27\x0f" * 400
     for data in (lists, open_ended):

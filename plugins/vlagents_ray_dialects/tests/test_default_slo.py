@@ -1,4 +1,4 @@
-"""Robots of other systems state no SLO: each of their sessions has that of the deployment."""
+"""Robots of other systems send no SLO: each of their sessions has the SLO of the deployment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def one_replica_with_an_slo() -> Iterator[Replicas]:
 
 
 def plans(engine: Engine) -> list[tuple[float, float | None, float] | None]:
-    """The rate, the largest age and the share of the robot of each session; None without a need."""
+    """Return the rate, the maximum age and the share of each session's robot; None for a session
+    without an SLO.
+    """
     needs = [(session.plan.need, session.plan.share) for session in engine.sessions.all()]
     return [None if need is None else (need.hz, need.age_s, share) for need, share in needs]
 

@@ -1,5 +1,5 @@
-"""The gateway as Ray Serve uses it, the sessions of its clients, and the policy `upstream` in
-front of it.
+"""Tests of the gateway as Ray Serve uses it, of its clients' sessions, and of the policy `upstream`
+in front of it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vlagents_ray_dialects.upstream import Upstream
 def test_with_keys_on_a_protocol_without_them_must_accept_whoever_reaches_it(
     open_dialect: Any, dialect: str
 ) -> None:
-    """That clients are served then is in tests/serve/test_access_matrix.py."""
+    """tests/serve/test_access_matrix.py tests that clients are served after this is accepted."""
     with pytest.raises(ConfigError, match="without_key: true"):
         open_dialect(dialect, check=lambda _: NoKey.OPEN)
     open_dialect(dialect, check=lambda _: NoKey.OPEN, without_key=True)
@@ -79,7 +79,8 @@ def test_an_episode_begins_with_the_first_observation_and_with_each_new_instruct
     assert [episode.begins(text) for text in ("lift", None, "push")] == [False, False, True]
     episode.end()
     assert episode.begins(None)
-    assert episode.opening(None, None) == "lift"  # continues under the one before
+    # Without an instruction, the episode continues with the previous one.
+    assert episode.opening(None, None) == "lift"
 
 
 def test_a_policy_that_needs_an_instruction_gets_one() -> None:
@@ -104,7 +105,9 @@ def test_a_client_of_the_gateway_keeps_its_instruction_and_each_session_its_own(
     obs = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
 
     def acted(*texts: str | None) -> list[tuple[int, int]]:
-        """The length of each session's instruction, and which act of its episode it was."""
+        """Return the length of each session's instruction, and the number of the act in its
+        episode.
+        """
         acts = sessions.act_batch(sessions.account.charge(), [obs] * len(texts), texts)
         return [(int(act.action[0][3]), int(act.action[0][4])) for act in acts]
 

@@ -1,6 +1,6 @@
 """Each dialect answers with the recorded bytes in each situation.
 
-tests/golden/endpoints has the bytes, and `dialect_situations` the table of situations.
+The bytes are in tests/golden/endpoints, the table of situations in `dialect_situations`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""GR00T's clients, of N1.5 and newer, over ZMQ: their messages and sessions, and what a bad
-client can do.
+"""Tests of GR00T's clients, N1.5 and newer, over ZMQ: messages, sessions, and the effects of faulty
+clients.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ LIMITS = MessageLimits()
 def said(
     endpoint: str, data: Any = None, encode: Callable[[Any], Any] = gr00t_client.encode, **more: Any
 ) -> bytes:
-    """As the client packs it."""
+    """Return a request as the client packs it."""
     return msgpack.packb({"endpoint": endpoint, "data": data, **more}, default=encode)
 
 
 def nested(b: int = 1, t: int = 1, texts: Any = None) -> dict[str, Any]:
-    """N1.6 and newer."""
+    """Return an observation of N1.6 and newer."""
     video = np.arange(b * t, dtype=np.uint8).reshape(b, t, 1, 1, 1) * np.ones((4, 6, 3), np.uint8)
     state = np.arange(b * t, dtype=np.float32).reshape(b, t, 1) * np.ones(2, np.float32)
     return {
@@ -194,7 +194,8 @@ def test_a_header_made_to_be_searched_for_long_is_refused_at_once() -> None:
         gr00t_codec.read_request(
             said("get_action", {"a": {"__ndarray_class__": True, "as_npy": file}}), LIMITS
         )
-    assert time.process_time() - begun < 1.0  # each digit doubled it once, 28 take ten seconds
+    # With backtracking, each digit doubled the time: 28 digits took ten seconds.
+    assert time.process_time() - begun < 1.0
 
 
 def test_arrays_of_text_count_by_their_texts() -> None:
@@ -205,7 +206,7 @@ def test_arrays_of_text_count_by_their_texts() -> None:
 
 
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
-GROWTH = 64 * 2**20  # bytes, whatever the number of frames
+GROWTH = 64 * 2**20  # allowed growth of the memory, bytes, for any number of frames
 
 
 def sessions(replicas: Replicas) -> int:
@@ -222,8 +223,8 @@ def seen(pixel: int, text: str = "abc", batch: int = 1) -> dict[str, Any]:
 
 
 def so100(pixel: int, text: str) -> dict[str, Any]:
-    """As N1.5's SO-100 client builds it: examples/SO-100/eval_lerobot.py, two cameras, batched
-    by itself.
+    """Return an observation as N1.5's SO-100 client (examples/SO-100/eval_lerobot.py) builds it:
+    two cameras, and a batch of one.
     """
     return {
         "video.front": np.full((1, 8, 8, 3), pixel, np.uint8),
@@ -319,7 +320,7 @@ def test_each_preset_delivers_what_either_generation_sends(
                 "language": ["task"],
             },
         ),
-        # The policy states no contract.
+        # The policy declares no contract.
         (False, "gr00t", {"action": ["action"], "language": ["task"]}),
     ],
 )
@@ -347,7 +348,9 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(
 
 
 class Limited:
-    """Clients of a gateway with keys, whose replica knows of no key: as one on another machine."""
+    """Clients of a gateway with keys, whose replica has no keys, like a replica on another
+    machine.
+    """
 
     def __init__(self, open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
@@ -371,13 +374,14 @@ def test_a_keys_rate_holds_wherever_the_replica_is(limited: Limited, replicas: R
                 ask()
         assert sessions(replicas) == 0
         assert rows(other.get_action(seen(7))[0])[-1] == 1
-    with limited.client("lone", rate=1) as client:  # what begins an episode counts once
+    with limited.client("lone", rate=1) as client:  # the message that begins an episode counts once
         assert rows(client.get_action(seen(1))[0])[-1] == 1
     with limited.client("some", rate=3) as client:
         assert rows(client.get_action(seen(1))[0])[-1] == 1
         with pytest.raises(RuntimeError, match="too_many_requests"):
             client.get_action(seen(1, batch=9))
-        wait_for(lambda: _went_on(client))  # the refusal began no other episode
+        # The rejected message began no episode of other sessions.
+        wait_for(lambda: _went_on(client))
 
 
 def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limited) -> None:
@@ -387,7 +391,8 @@ def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limite
         for _ in range(2):
             with pytest.raises(RuntimeError, match="too_many_requests"):
                 client.ping()
-        # A second after each refusal, of which the last one's is to come.
+        # The reader pauses for a second after each refusal; the pause after the last refusal is
+        # still to come.
         assert time.monotonic() - begun >= 1.0
         assert other.ping()["status"] == "ok"
 
@@ -461,8 +466,8 @@ def _raw(port: int, message: bytes) -> bytes:
     "greeting", [b"\x04\x00one\x02\x00x", b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"]
 )
 def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_dialect, greeting: bytes) -> None:
-    """ZMQ kept the dead connections of some of them for ever: about one in 6,000 of the
-    fuzzer's.
+    """ZMQ's library kept some of their dead connections forever: about one in 6,000 of the fuzzer's
+    connections.
     """
     port = open_dialect("gr00t")
     with (
@@ -490,7 +495,7 @@ def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session
     with PolicyClient(port) as one, PolicyClient(port) as two, PolicyClient(port) as three:
         one.get_action(seen(1))
         two.ping()
-        three.get_action(seen(3))  # takes the place of the one that only pinged
+        three.get_action(seen(3))  # takes the place of the client that only sent a ping
         with pytest.raises(RuntimeError, match="unavailable: 2 clients"):
             two.ping()
         assert rows(one.get_action(seen(1))[0])[-1] == 2
@@ -512,7 +517,7 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_dialect) -> None:
                 deaf.send_multipart([b"", message])
             except zmq.Again:
                 break
-        # One that never greets.
+        # This peer never sends a greeting.
         with socket.create_connection(("127.0.0.1", port)), PolicyClient(port) as good:
             for step in range(1, 6):
                 assert rows(good.get_action(seen(5))[0]) == [5, 0.5, -1, 3, step]
@@ -523,7 +528,7 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_dialect) -> None:
 
 @pytest.mark.own_process
 def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Replicas) -> None:
-    """A good client acts all the while; memory and threads stay what they were."""
+    """A valid client acts all the time; memory and the number of threads do not grow."""
     port = open_dialect("gr00t", sessions=16)
     choose = random.Random(3)
     request = {"endpoint": "get_action", "data": {"observation": seen(9), "options": None}}
@@ -584,7 +589,8 @@ def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
         def ask(name: str, client: PolicyClient) -> None:
             try:
                 answers[name] = str(client.get_action(seen(5)))
-            except Exception as error:  # noqa: BLE001 - the client's own, with the server's text
+            # The client's own error contains the server's text.
+            except Exception as error:  # noqa: BLE001
                 answers[name] = str(error)
 
         threads = [threading.Thread(target=ask, args=("waiting", waiting))]
@@ -602,14 +608,17 @@ def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
     replicas.frozen.clear()
 
 
-PAUSES_S = (0.0, 0.001, 0.002, 0.01, 0.03, 0.1)  # of clients, between an answer and a request
+# The pauses of clients between an answer and the next request, s.
+PAUSES_S = (0.0, 0.001, 0.002, 0.01, 0.03, 0.1)
 RESTARTS = 3
 
 
 def test_no_client_waits_for_ever_when_the_gateway_restarts_however_often_it_asks(
     replicas: Replicas,
 ) -> None:
-    """ZeroMQ sends a request once, so one that an ended gateway never reads has no answer."""
+    """ZeroMQ sends a request only once, so a request that an ended gateway does not read is never
+    answered.
+    """
     port = free_port()
 
     def begin() -> GR00TDialect:

@@ -1,5 +1,5 @@
-"""What peers without a key choose in the framing of GR00T's gateway costs it no memory, no
-threads and no places.
+"""Tests that peers without a key cost GR00T's gateway no memory, threads or places, whatever frames
+they send.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from vlagents_ray_dialects import gateway_sessions, gr00t
 
 pytestmark = pytest.mark.own_process
 
-PLACES = 8  # places of clients
-MEMORY = 32 * 2**20  # bytes that may be left, of 96 MiB and more that are sent
+PLACES = 8  # maximum number of clients
+MEMORY = 32 * 2**20  # maximum growth of the memory, bytes; the peers send 96 MiB and more
 LARGE = bytes(8 * 2**20)
 PING = msgpack.packb({"endpoint": "ping"})
 WRONG = msgpack.packb({"endpoint": "ping", "api_token": "vlr_wrong"})
@@ -102,7 +102,8 @@ def _parts(*parts: bytes) -> Callable[[], tuple[bytes, list[bytes]]]:
     return lambda: (b"", list(parts))
 
 
-# A message of a connection of its own: the identity that the connection asks for, and its parts.
+# A message of a new connection: the identity that the connection requests, and the parts of the
+# message.
 MESSAGES: dict[str, Callable[[], tuple[bytes, list[bytes]]]] = {
     "large first part": _parts(LARGE, PING),
     "large parts": _parts(*[LARGE] * 5, PING),
@@ -133,7 +134,8 @@ def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: s
                 peer.poll(100)
                 assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
                 assert gateway.clients == 1
-                assert threads() <= 2 + number  # one for each connection, whatever it sends
+                # One thread for each connection, whatever the connection sends.
+                assert threads() <= 2 + number
         wait_for(lambda: threads() == 1)
         assert gateway.admission.held == gateway.dialect.of_strangers.held == 0
         wait_for(lambda: resident() - before < MEMORY)
@@ -141,8 +143,8 @@ def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: s
 
 @pytest.mark.parametrize("chooses", ["one part each", "one identity each", "nothing"])
 def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, chooses: str) -> None:
-    """Of which there are eight; a client with a key comes in beside it, and is answered about as
-    fast as alone.
+    """There are eight places. During the flood a client with a key can connect, and is answered
+    about as fast as without the flood.
     """
     stopped = threading.Event()
 
@@ -154,7 +156,8 @@ def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, cho
                     added = [b"%d" % number] if chooses == "one part each" else []
                     peer.send_multipart([*added, b"", WRONG])
                     if number % 20 == 0:
-                        # As much as s15b of the proofs sends, so that the sender takes no core.
+                        # The pause limits the rate to that of s15b in the proofs, so that the
+                        # sender does not use a whole core.
                         time.sleep(0.005)
                 peer.poll(20)
 
@@ -183,7 +186,8 @@ def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, cho
         finally:
             stopped.set()
             thread.join()
-    assert min(beside) < 20 * alone  # 130 times with a thread for each envelope
+    # With a thread for each envelope, the median was 130 times as long.
+    assert min(beside) < 20 * alone
 
 
 def test_a_stranger_with_the_identity_of_a_client_stays_a_stranger(gateway: Gateway) -> None:
@@ -199,7 +203,7 @@ def test_a_stranger_with_the_identity_of_a_client_stays_a_stranger(gateway: Gate
 def test_a_connection_whose_messages_have_no_key_is_closed_after_some(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of which each is a pause of all that the connection may send."""
+    """After each such message the connection is not read for `_REFUSAL_S`."""
     monkeypatch.setattr(gr00t, "_REFUSAL_S", 0.02)
     with gateway.connect() as peer:
         monitor = peer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
@@ -236,8 +240,8 @@ def test_a_client_with_a_revoked_key_is_a_stranger_again(gateway: Gateway) -> No
 def test_a_client_that_loses_its_place_keeps_its_connection(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch, cause: str
 ) -> None:
-    """A request that crosses the end of a connection is lost, and ZeroMQ's clients wait for its
-    answer for ever.
+    """A request that is sent while its connection is being closed is lost, and ZeroMQ's clients
+    wait forever for the answer.
     """
     with contextlib.ExitStack() as stack:
         robot = stack.enter_context(gateway.connect(zmq.REQ))

@@ -1,5 +1,5 @@
-"""Dialects of the server's own port: all of them, OpenVLA, vla-eval; tests/golden has the
-answers to each request.
+"""Tests of the dialects on the server's own port: all of them, then OpenVLA and vla-eval. The
+recorded answers are in tests/golden.
 """
 
 from __future__ import annotations
@@ -241,8 +241,8 @@ def test_the_settings_of_dialects_survive_the_way_to_the_replicas_and_to_the_gat
 def test_cameras_that_the_mapping_does_not_read_are_logged_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """openpi's simple_client in ALOHA mode, of whose four cameras pi0 takes three, was answered
-    without a word.
+    """The server answered openpi's simple_client in ALOHA mode without a warning, though pi0 reads
+    only three of its four cameras.
     """
     keyed = {
         "cameras": {"front": "images/front"},
@@ -301,7 +301,8 @@ def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> N
             assert act("a", 5, **named) == [5, 0, step]
         assert act("b", 6, **named) == [6, 0, 1]
         assert act("a", 7, **named) == [7, 0, 4]
-        # A reset and an act, of the one request that its rate holds.
+        # A reset and an act count as one request, which is all that the rate of this key allows at
+        # once.
         assert act("slow", 8) == [8, 0, 1]
         assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
 
@@ -372,15 +373,15 @@ def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
         assert begun.wait(10)
         for seq in range(2, 50):
             send(socket, "observation", seen(seq), seq)
-        # Its answer says that all before it are there.
+        # The answer to this message shows that all earlier messages have arrived.
         send(socket, "hello", {"protocol_version": 1}, 50)
         gate.set()
         assert [receive(socket).seq for _ in range(3)] == [1, 49, 50]
 
 
 def test_observations_between_two_chunks_need_no_images() -> None:
-    """A benchmark that renders every third observation, as the chunk's other rows are executed
-    in the open.
+    """A benchmark renders only every third observation, since it executes the other rows of a chunk
+    without observing.
     """
     rendered = {name: value for name, value in seen(3).items() if name != "state"} | {
         "joint_state": np.ones(3)
@@ -398,8 +399,7 @@ def test_observations_between_two_chunks_need_no_images() -> None:
         rows = [answer(rendered if seq % 3 == 0 else bare, seq) for seq in range(6)]
         assert [message.kind for message in rows] == ["action"] * 6
         assert [float(message.payload["actions"][4]) for message in rows] == [0, 1, 2, 0, 1, 2]
-        # Where a chunk ends or another task begins, an observation without images is an error
-        # again.
+        # When a chunk ends or another task begins, an observation without images is an error again.
         assert answer(bare, 6).kind == "error"
         assert answer(rendered, 7).kind == "action"
         assert answer({"task_description": "task 2"}, 8).kind == "error"

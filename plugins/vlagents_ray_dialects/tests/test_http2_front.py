@@ -1,4 +1,6 @@
-"""The front of gRPC's server: what it counts, whom it ends, and that a robot does not notice it."""
+"""Tests of the front of gRPC's server: it counts frames, ends connections with too many, and does
+not disturb robots.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +96,7 @@ def test_half_a_preface_ends_after_the_time_of_a_handshake(
 def test_more_frames_at_once_than_a_robot_sends_end_the_connection(connect: Connect) -> None:
     with connect() as connection:
         connection.sendall(PREFACE + SETTINGS)
-        assert connection.recv(9)[3] == 4  # the server's own settings
+        assert connection.recv(9)[3] == 4  # the settings frame of the server
         with contextlib.suppress(ConnectionError):
             connection.sendall(SETTINGS * 2000)
         answers = read_to_the_end(connection)
@@ -151,11 +153,11 @@ def test_strangers_end_the_oldest_stranger_and_no_client(
 def test_a_robot_is_not_slowed_by_the_bound_of_frames(
     open_dialect: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without tokens for more frames than those of 150 requests, they are answered."""
+    """The limit has tokens for the frames of just 150 requests, and all 150 are answered."""
     monkeypatch.setattr(http2_front, "_FRAMES_PER_S", 1e-6)
     monkeypatch.setattr(http2_front, "_FRAMES_AT_ONCE", 150 * 6)
     with AsyncClient(open_dialect("lerobot")).begin() as robot:
-        for step in range(75):  # an observation and its actions each
+        for step in range(75):  # each step sends an observation and requests its actions
             assert robot.act(robot_saw(step, pixel=step))
 
 
@@ -190,12 +192,12 @@ def test_clients_of_one_server_are_told_apart_and_nothing_is_left() -> None:
     assert not Path(front.path).parent.exists()
 
 
-ANSWER = bytes(range(256)) * 32 * 1024  # more than the kernel's buffers hold
+ANSWER = bytes(range(256)) * 32 * 1024  # larger than the kernel's buffers
 
 
 class StoppedServer:
-    """A front whose server has written an answer of 8 MiB and ended, which the client has not
-    read; and a stranger.
+    """A front with a stranger and a client. Its server has ended after writing an answer of 8 MiB,
+    which the client has not read.
     """
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
@@ -233,7 +235,7 @@ class StoppedServer:
 
     @staticmethod
     def _answer(connection: socket.socket) -> None:
-        with connection, contextlib.suppress(OSError):  # the client does not read it
+        with connection, contextlib.suppress(OSError):  # the client does not read the answer
             connection.sendall(ANSWER)
 
     def join(self) -> None:
@@ -253,8 +255,9 @@ def stopped() -> Iterator[StoppedServer]:
 def test_the_last_answer_reaches_a_client_that_reads_it_after_the_front_closes(
     stopped: StoppedServer, frames: int
 ) -> None:
-    """A client of HTTP/2 sends more, such as WINDOW_UPDATE, while it reads."""
-    read_to_the_end(stopped.stranger)  # which ends when the front begins to close
+    """A client of HTTP/2 also sends frames, such as WINDOW_UPDATE, while it reads."""
+    # The stranger's connection ends when the front begins to close.
+    read_to_the_end(stopped.stranger)
     received = bytearray()
     with contextlib.suppress(ConnectionError):
         while data := stopped.client.recv(2**20):
@@ -267,11 +270,13 @@ def test_the_last_answer_reaches_a_client_that_reads_it_after_the_front_closes(
 
 
 def test_no_stranger_and_no_client_that_does_not_read_delays_a_stop(stopped: StoppedServer) -> None:
-    """The stranger's connection ends at once, that of the client after the time for its answers."""
+    """The stranger's connection ends immediately, the client's connection after the time for its
+    answers.
+    """
     begun = time.monotonic()
     assert read_to_the_end(stopped.stranger) == b""
     stranger_s = time.monotonic() - begun
     stopped.join()
     assert stranger_s < (time.monotonic() - begun) / 2
-    # After which a stranger is disconnected anyway.
+    # Without the stop, a stranger would be disconnected after this time.
     assert time.monotonic() - begun < http2_front._HANDSHAKE_S

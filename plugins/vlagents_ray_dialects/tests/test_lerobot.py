@@ -1,5 +1,5 @@
-"""Clients of LeRobot's asynchronous inference over real gRPC: their sessions, and what a bad
-client can do.
+"""Tests of clients of LeRobot's asynchronous inference over real gRPC: their sessions, and the
+effects of faulty clients.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def test_each_client_has_a_session_and_gets_its_chunks(open_lerobot, replicas: R
     with AsyncClient(port) as red, AsyncClient(port) as blue:
         red.begin(), blue.begin(actions_per_chunk=1)
         answer = red.act(robot_saw(4, pixel=10))
-        # a pixel, the first number of the state, no gripper, the length of the task, and the number
-        # of the act
+        # A row contains a pixel, the first number of the state, -1 for no gripper, the length of
+        # the task, and the number of the act.
         assert rows(answer) == [[10, 0.5, -1, 3, 1], [10, 0.5, -1, 3, 2]]
         assert [(action.timestep, round(action.timestamp, 4)) for action in answer] == [
             (4, 1004),
@@ -67,7 +67,7 @@ def test_each_client_has_a_session_and_gets_its_chunks(open_lerobot, replicas: R
         ]
         assert rows(blue.act(robot_saw(0, pixel=20, task="ab"))) == [[20, 0.5, -1, 2, 1]]
         assert rows(red.act(robot_saw(5, pixel=11)))[0] == [11, 0.5, -1, 3, 2]
-        # Begins an episode.
+        # A new task begins an episode.
         assert rows(red.act(robot_saw(6, pixel=11, task="another")))[0] == [11, 0.5, -1, 7, 1]
         assert sessions(replicas) == 2
 
@@ -77,7 +77,8 @@ def test_the_newest_observation_is_acted_on_and_a_time_step_once(open_lerobot) -
         robot.send(robot_saw(0, pixel=1))
         robot.send(robot_saw(0, pixel=2))
         assert rows(robot.actions())[0][0] == 2
-        robot.send(robot_saw(0, pixel=3))  # is left out
+        # Ignored, as the policy has received an observation of this time step.
+        robot.send(robot_saw(0, pixel=3))
         robot.send(robot_saw(1, pixel=4))
         assert rows(robot.actions())[0][0] == 4
         robot.send(robot_saw(1, pixel=5, must_go=True))  # the robot has no action left
@@ -121,7 +122,7 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
         "state": {"q": {"key": "observation.state", "start": 1}},
     }
     with AsyncClient(open_lerobot(mapping=mapping)).begin() as robot:
-        # The mapping has no instruction.
+        # This mapping has no instruction.
         assert rows(robot.act(robot_saw(0, pixel=6)))[0][:4] == [6, 0.25, -1, 0]
     mapping["cameras"] = {"top": "observation.images.side"}
     with (

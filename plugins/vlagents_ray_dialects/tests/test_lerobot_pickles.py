@@ -1,5 +1,5 @@
-"""Pickles as LeRobot's messages have them are read as data; everything else is rejected, and
-nothing is executed.
+"""Tests that the pickles in LeRobot's messages are read as data, that all others are rejected, and
+that nothing is executed.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from vlagents_ray_dialects.messages import lerobot
 
 
 class Watch:
-    """Notes what Python's interpreter says of calls, imports, files and the like, while it is
-    on.
+    """Records the audit events of Python's interpreter (calls, imports, files and others) while it
+    is on.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Watch:
             self.on = False
 
 
-WATCH = Watch()  # a hook cannot be removed
+WATCH = Watch()  # one object for all tests, as an audit hook cannot be removed
 
 
 class Command:
@@ -78,8 +78,8 @@ TUPLES = b")" + b"\x85" * 9
 
 
 def mutations(seeds: Sequence[bytes]) -> Callable[[random.Random], bytes]:
-    """Draw a pickle that was changed in a few places, with parts of other programs among its
-    own.
+    """Return a function that draws a pickle with a few random changes, some of which insert parts
+    of other pickles.
     """
     seeds = [*seeds, pickled({"x": [Command(), (1, 2.0), {"y": None}]})]
     opcodes = [opcode.code.encode("latin-1") for opcode in pickletools.opcodes]
@@ -124,15 +124,15 @@ def mutations(seeds: Sequence[bytes]) -> Callable[[random.Random], bytes]:
 
 
 def _places(data: bytes) -> list[int]:
-    """Where the opcodes begin."""
+    """Return the offsets of the opcodes."""
     return [at for _, _, at in pickletools.genops(data) if at is not None]
 
 
 LIMITS = MessageLimits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
-GROWTH = 64 * 2**20  # bytes, whatever the number of pickles
+GROWTH = 64 * 2**20  # allowed growth of the memory, bytes, for any number of pickles
 
-# What LeRobot 0.4.4's own classes pickle to, with Python 3.11: by the version of numpy, and by the
+# Pickles of LeRobot 0.4.4's own classes, written with Python 3.11, by the version of numpy and the
 # protocol.
 SETUP = (
     "gASVqwEAAAAAAACMH2xlcm9ib3QuYXN5bmNfaW5mZXJlbmNlLmhlbHBlcnOUjBJSZW1vdGVQb2xpY3lDb25maWeUk5QpgZR9lCiMC3BvbGljeV"
@@ -186,7 +186,7 @@ def read(data: bytes, limits: MessageLimits = LIMITS) -> lerobot.RobotObservatio
 
 
 def value_of(value: Any, protocol: int = 4) -> Any:
-    """The value `x` of an observation that has only that."""
+    """Return the value `x` that is read from an observation with no other values."""
     return read(pickled(TimedObservation(0.0, 0, {"x": value}), protocol)).values["x"]
 
 
@@ -194,7 +194,7 @@ MAPPING = read_mapping("lerobot")
 
 
 def attempt(data: bytes) -> str:
-    """Read what may be either of the messages, as the dialect does; returns the error's code, or
+    """Read a pickle as each of the two messages, as the dialect does; return the error's code, or
     "read".
     """
     said = []
@@ -347,8 +347,8 @@ ODD = [
 
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: type(odd).__name__)
 def test_any_value_at_any_place_is_read_or_refused(odd: Any) -> None:
-    """Where a text, a number or a dict is expected, an array or a class has no truth value and
-    no equal.
+    """The reader must not compare an unexpected array or class, or use it as a truth value: both
+    would raise other errors.
     """
     for field in vars(setup()):
         attempt(
@@ -381,7 +381,7 @@ def test_a_class_of_a_listed_module_is_not_listed() -> None:
     [
         (b"cos\nsystem\n(S'exit 3'\ntR", "opcode 0x63"),  # GLOBAL, of protocol 0
         (b"(S'exit 3'\nios\nsystem\n", "opcode 0x53"),
-        (b"\x82\x01", "opcode 0x82"),  # an extension of copyreg
+        (b"\x82\x01", "opcode 0x82"),  # an extension code of copyreg
         (b"Pname\n", "opcode 0x50"),  # persistent ids
         (b"\x97", "opcode 0x97"),  # a buffer out of band
         (named("os", "system") + short("exit 3") + b"\x85R", "names 'os' 'system'"),
@@ -395,7 +395,7 @@ def test_a_class_of_a_listed_module_is_not_listed() -> None:
         ),
         (named("numpy", "dtype") + short("f4") + b"\x85R", "expected the type of plain numbers"),
         (ARRAY + named("numpy", "dtype") + b"K\0\x85C\x01b\x87R", "expected a plain array"),
-        # A text is no type.
+        # A text is not a type.
         (SCALAR + short("<f8") + b"C\x08" + bytes(8) + b"\x86R", "expected a plain number"),
         (OBJECT + b"}b}b", "got the fields"),
         (OBJECT + OBJECT, "more than one object"),
@@ -413,7 +413,7 @@ def test_a_class_of_a_listed_module_is_not_listed() -> None:
         (b"K\x01K\x02\x93", "a name that is no text"),
         (b"h\x00", "a reference to nothing"),
         (b"j\xff\xff\xff\xff", "a reference to nothing"),
-        (b"]\x94h\x00a", "a second reference to list"),  # a list in itself
+        (b"]\x94h\x00a", "a second reference to list"),  # a list that contains itself
         (b"}\x94" + short("a") + b"h\x00s", "a second reference to dict"),
         (OBJECT + b"\x94h\x00b", "a second reference to TimedObservation"),
         (b"X\xff\xff\xff\x7f", "expected a text of at most .*, got 2147483647"),
@@ -446,10 +446,12 @@ def test_other_protocols_are_refused(head: bytes) -> None:
 
 
 def test_the_watch_sees_what_pickle_would_do() -> None:
-    """If it saw nothing of a pickle that is executed, the tests here would prove nothing."""
+    """The other tests depend on this: the watch must record the events of a pickle that is
+    executed.
+    """
     data = pickle.dumps(Command())
     with WATCH.watching():
-        assert pickle.loads(data) != 0  # noqa: S301 - our own
+        assert pickle.loads(data) != 0  # noqa: S301 - our own pickle
     assert {"pickle.find_class", "os.system"} <= set(WATCH.seen)
     WATCH.seen.clear()
 
@@ -460,7 +462,7 @@ def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
         pickled(message, protocol) for message in (robot_saw(3), setup()) for protocol in (4, 5)
     ]
     draw, choose = mutations(seeds), random.Random(0)
-    # What is loaded once.
+    # The first pickles load what is loaded only once, such as modules.
     said: Counter[str] = Counter(attempt(draw(choose)) for _ in range(MUTATED // 10))
     gc.collect()
     before, slowest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0.0
@@ -474,7 +476,7 @@ def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
     print(f"\n{MUTATED} pickles, the last nine tenths in {took_s:.1f} s, the slowest in "
           f"{1e3 * slowest:.1f} ms, "
-          f"{grown / 2**20:.1f} MiB more: {dict(said)}")  # fmt: skip
+          f"{grown / 2**20:.1f} MiB grown: {dict(said)}")  # fmt: skip
     assert said["read"] > 0
     assert said["malformed"] > MUTATED // 4
     assert grown < GROWTH

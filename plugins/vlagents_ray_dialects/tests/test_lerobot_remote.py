@@ -1,5 +1,5 @@
-"""Robots of LeRobot's remote inference over Zenoh: many at one instance, their sessions, and what
-the deployment rejects.
+"""Tests of LeRobot's remote inference over Zenoh: many robots at one instance, their sessions, and
+rejected requests.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def test_two_robots_act_at_one_instance_each_in_its_own_session(
     with RemoteRobot(port) as red, RemoteRobot(port) as blue:
         assert red.instance_id == blue.instance_id
         red.begin(), blue.begin()
-        # a pixel, the first number of the state, no gripper, the length of the task, and the number
-        # of the act
+        # A row contains a pixel, the first number of the state, -1 for no gripper, the length of
+        # the task, and the number of the act.
         assert first_row(red.act(10)) == [10, 0.5, -1, 3, 1]
         assert first_row(blue.act(20, "abcd")) == [20, 0.5, -1, 4, 1]
         assert first_row(red.act(11)) == [11, 0.5, -1, 3, 2]
@@ -239,7 +239,7 @@ def test_a_robot_that_does_not_fit_is_told_what_differs(
 
 
 def changed(feature: str, value: Any) -> dict[str, Any]:
-    """The features of an observation, of which one is changed."""
+    """Return the features of an observation, with one feature replaced."""
     features = {
         FRONT["name"]: rgb(np.zeros((8, 8, 3), np.uint8)),
         STATE["name"]: np.array([0.5, 1, 2], np.float32),
@@ -301,7 +301,7 @@ def test_a_faulty_observation_is_answered_and_the_session_goes_on(open_remote: O
             assert (got, expected in message) == (code, True), (name, got, message)
         robot.publish("obs", b"\xc1 rubbish")
         assert error_of(robot.answers.get(timeout=20))[0] == "malformed"
-        # An observation of a generation that was not acknowledged.
+        # This observation has a generation that the server has not acknowledged.
         robot.generation = 7
         assert error_of(robot.act(1))[0] == "stale"
         robot.generation = 0

@@ -1,4 +1,6 @@
-"""Robots of LeRobot's remote inference that continue their plans (real-time chunking), over Zenoh."""
+"""Tests of LeRobot's remote inference over Zenoh with robots that continue their plans (real-time
+chunking).
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,11 @@ Open = Callable[..., int]
 
 
 class Counting(Agent):
-    """A policy whose first joint counts on from the plan, or from the number of the act times 100;
-    the others stay at 0.5.
+    """A policy whose first joint continues the count of the plan, or begins at 100 times the number
+    of the act. The other columns are 0.5.
     """
 
-    given: ClassVar[list[dict[str, Any]]] = []  # the plans of all acts
+    given: ClassVar[list[dict[str, Any]]] = []  # the plan in each act
 
     def __init__(self, width: int) -> None:
         self.width = width
@@ -76,7 +78,7 @@ def begin(port: int, mode: str, **changes: Any) -> RemoteRobot:
 
 
 def continue_plan(robot: RemoteRobot, plan: Any, canonical: Any, delay: int) -> Envelope:
-    """The answer to a robot that has these rows left."""
+    """Send an observation of a robot that has these rows left, and return the answer."""
     return robot.act(7, model_continuation=plan, canonical_continuation=canonical, delay=delay)
 
 
@@ -113,7 +115,7 @@ def test_a_robot_continues_its_plan(open_arm: Open, mode: str, policy: dict[str,
     with begin(open_arm(policy=policy), mode) as robot:
         answer = robot.act(7)
         model, canonical = answer.body["model_actions"], answer.body["canonical_actions"]
-        # The whole chunk comes in both spaces: the policy's, and the robot's.
+        # The whole chunk is sent in both spaces, the policy's and the robot's.
         assert answer.body["execution_steps"] == ROWS
         assert model[:, 0].tolist() == [100, 101, 102, 103, 104, 105]
         assert (model[0, 1], canonical[0, 1]) == (0.5, 50)
@@ -175,7 +177,7 @@ def test_lerobots_own_client_of_both_versions_is_served(open_dialect: Any, versi
     try:
         line.send(b"open", [sent[version]])
         answers.append(messages.decode(line.receive()[1]))
-        # It has acted before it has reset its session.
+        # The robot sends an observation before it resets its session.
         for end, message in ((b"obs", sent[name]), (b"control", sent["reset aligned"])):
             line.send(end, [message])
             answers.append(messages.decode(line.receive()[1]))
@@ -226,7 +228,7 @@ def test_a_wrong_plan_is_refused_and_the_session_goes_on(
 
 
 def test_a_delay_beyond_the_plan_holds_all_of_it_if_the_policy_is_guided(open_arm: Open) -> None:
-    """LeRobot's client states the time that an answer takes, however short its plan is."""
+    """LeRobot's client sends the delay of an answer, even if its plan is shorter."""
     with begin(open_arm(policy=GUIDED), "rtc_guided") as robot:
         assert continue_plan(robot, rows(3), rows(3), 5).message_type == "action"
         assert Counting.given[0][DELAY] == 3

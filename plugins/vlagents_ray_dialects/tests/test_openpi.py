@@ -1,5 +1,5 @@
-"""openpi's and RoboArena's clients: sessions, `infer_batch` of openpi's pull request 941, and
-`reset`.
+"""Tests of openpi's and RoboArena's clients: sessions, `infer_batch` of openpi's pull request 941,
+and `reset`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def test_each_observation_of_a_batch_gets_its_own_answer(served_batches: Any) ->
         asked = batch((7, "task 1"), (8, "task 2"), (9, "task 3"))
         for acts in (1, 2):
             said = call(socket, asked)
-            # pixel, sum of the state, acts of the session, number of its instruction
+            # A row contains a pixel, the sum of the state, the session's number of acts, and the
+            # number of its instruction.
             assert said["actions"].shape == (3, 2, 7)
             assert said["actions"][:, 0, :4].tolist() == [
                 [7, 1, acts, 1],
@@ -97,7 +98,7 @@ def test_a_batch_of_another_size_ends_the_episodes_of_all_its_places(served_batc
 
 def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) -> None:
     client, _, sizes = served_batches
-    # One observation alone that is wrong is in tests/golden.
+    # The recorded bytes in tests/golden cover a single observation that is wrong.
     wrong = openpi.encode(
         {"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]}
     )
@@ -127,7 +128,8 @@ def test_a_key_called_batch_beside_others_is_one_of_an_observation(served_batche
 
 def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on() -> None:
     keys, agent = ChangingKeys(), BatchedMirror()
-    header = {"authorization": f"Bearer {keys.add('slow', rate=4)}"}  # and so many at once
+    # The rate also allows four requests at once.
+    header = {"authorization": f"Bearer {keys.add('slow', rate=4)}"}
     ask = batch(*[(1, "task 1")] * 3)
     with (
         serving(agent, ALL, keys.keys) as (client, _),

@@ -1,4 +1,6 @@
-"""A mapping read backwards: what the dialect reads of it is our observation again."""
+"""Tests of mappings in reverse: a dialect reads our observation back from what a reversed mapping
+writes.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ def outgoing(**mapping: Any) -> Outgoing:
 
 
 def fitting(mapping: KeyMapping) -> Obs:
-    """An observation with all that a preset reads."""
+    """Return an observation with all values that a preset reads."""
     rng = np.random.default_rng(0)
     state = {}
     for name, parts in mapping.state.items():
@@ -44,7 +46,7 @@ def test_parts_whose_lengths_nothing_says_are_refused_before_anything_is_sent() 
         outgoing(state={"pose": ["a", "b"]})
 
 
-# Its client makes N1.5's keys.
+# The preset gr00t-n1.5 is left out: its keys are made by GR00T's client.
 @pytest.mark.parametrize("name", sorted(set(presets()) - {"gr00t-n1.5"}))
 def test_what_is_written_by_a_preset_is_read_by_it(name: str) -> None:
     mapping = read_mapping(name)
@@ -159,7 +161,7 @@ def test_the_contract_says_what_the_mapping_reads() -> None:
         "xyz_axis_angle": 6,
         "gripper_qpos": 2,
     }
-    assert contract.gripper is None  # its number is one of gripper_qpos
+    assert contract.gripper is None  # the gripper's number is one of gripper_qpos
     assert contract.instruction
     assert (contract.action.gripper_open, contract.action.gripper_closed) == (-1, 1)
     assert Outgoing(read_mapping("openpi-droid")).contract().gripper

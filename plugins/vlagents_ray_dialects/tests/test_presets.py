@@ -1,5 +1,5 @@
-"""Each preset with what its client sends, as its own code builds it: all of it arrives, or the
-client is told.
+"""Tests of each preset with an observation as the client's own code builds it: all of it arrives,
+or the client gets an error.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Sent:
     preset: str
     source: str
     observation: dict[str, Any]
-    cameras: tuple[str, ...]  # that arrive
-    state: dict[str, int]  # that arrive, and their sizes
-    gripper: bool = False  # does it arrive?
+    cameras: tuple[str, ...]  # the cameras that arrive
+    state: dict[str, int]  # the states that arrive, with their sizes
+    gripper: bool = False  # whether the gripper arrives
 
 
 def image(size: int = 32) -> np.ndarray:
@@ -335,8 +335,8 @@ each = pytest.mark.parametrize("sent", SENT, ids=lambda sent: f"{sent.preset}: {
 
 
 def arrive(sent: Sent, change: Callable[[str], str] = str) -> tuple[Obs, str | None]:
-    """What the mapping makes of it, GR00T's on the way that its gateway goes; `change` renames
-    the client's keys.
+    """Return the observation and instruction that the mapping reads, for GR00T after the gateway's
+    conversion; `change` renames the client's keys.
     """
     mapping = presets()[sent.preset]
     if not sent.preset.startswith("gr00t"):
@@ -363,14 +363,14 @@ def test_cameras_state_gripper_and_instruction_arrive(sent: Sent) -> None:
     assert all(camera.shape == (32, 32, 3) and camera.max() > 0 for camera in obs.cameras.values())
     assert {name: part.size for name, part in obs.state.items()} == sent.state
     assert (obs.gripper is not None) == sent.gripper
-    # The gateway of vlagents takes the instruction from beside the observation.
+    # The gateway of vlagents reads the instruction next to the observation, without the mapping.
     if sent.preset != "vlagents":
         assert instruction == ("smoke test" if "smoke" in sent.source else TASK)
 
 
 @each
 def test_an_observation_under_other_names_is_refused_and_never_empty(sent: Sent) -> None:
-    """All of it, its cameras alone, or its state alone."""
+    """The test renames all keys, only the cameras, or only the state."""
     mapping = presets()[sent.preset]
     states = [one for entries in mapping.state.values() for one in entries]
     for entries in (
@@ -394,7 +394,7 @@ def test_of_two_names_of_one_state_the_first_counts() -> None:
 
 
 def test_a_state_is_taken_from_a_key_that_holds_numbers_and_not_a_map_of_them() -> None:
-    """vla-eval's RoboCasa365 sends a map, which wants a mapping of its own."""
+    """vla-eval's RoboCasa365 sends a map, for which a deployment needs another mapping."""
     theirs = {
         "images": {"front": np.zeros((8, 8, 3), np.uint8)},
         "state": {"state.gripper_qpos": np.zeros(2)},
@@ -404,7 +404,7 @@ def test_a_state_is_taken_from_a_key_that_holds_numbers_and_not_a_map_of_them() 
 
 
 def test_arrays_that_cannot_be_a_state_and_those_that_are_read_as_info_are_not_missed() -> None:
-    """A camera's matrix, a picture that the mapping does not want, a number."""
+    """Examples are a camera's matrix, an image that the mapping does not read, and a number."""
     theirs = {
         "image": np.zeros((8, 8, 3), np.uint8),
         "other": np.zeros((8, 8, 3), np.uint8),
@@ -437,8 +437,8 @@ OPENPI = [
 def test_openpis_images_come_as_its_own_server_takes_them(
     sent: Sent, dtype: type, first: bool
 ) -> None:
-    """`_parse_image` of openpi's policies: floats in [0, 1] times 255, rounded down; three
-    channels first turned.
+    """`_parse_image` of openpi's policies multiplies floats in [0, 1] by 255 and rounds down, and
+    moves a first axis of three channels to the end.
     """
 
     def theirs(value: Any) -> Any:

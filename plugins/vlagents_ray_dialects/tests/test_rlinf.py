@@ -1,4 +1,4 @@
-"""The adapter by which RLinf's rollout worker is a client of this server."""
+"""Tests of the adapter with which RLinf's rollout worker is a client of this server."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ CONFIG: Any = SimpleNamespace(
 
 
 def observed(pixels: list[int], *, begins: bool) -> dict[str, Any]:
-    """What RLinf's worker passes on: tensors with a row for each environment, and its own keys."""
+    """Return the observations that RLinf's worker passes to an adapter: tensors with a row for each
+    environment, and the worker's own keys.
+    """
     states = np.tile(np.float32([0, 0, 0, 0, 0, 1, 0.04, -0.04]), (len(pixels), 1))
     return {
         "main_images": torch.from_numpy(np.stack([image(pixel) for pixel in pixels])),
@@ -52,15 +54,16 @@ def test_each_environment_is_a_session_and_gets_the_rows_that_are_executed() -> 
             actions = predict([7, 8])
             assert actions.dtype == torch.float32
             assert actions.shape == (2, 2, 7)
-            # pixel, sum of the state, acts of the session, number of its instruction
+            # A row contains a pixel, the sum of the state, the session's number of acts, and the
+            # number of its instruction.
             assert actions[:, 0, :4].tolist() == [[7, 1, acts, 1], [8, 1, acts, 2]]
-            # The gripper, which is open, by LIBERO's convention.
+            # The gripper is open, which is -1 in LIBERO's convention.
             assert actions[:, 0, 6].tolist() == [-1, -1]
         assert len(engine.sessions) == 2
 
         assert predict([7, 8], begins=True)[:, 0, 2].tolist() == [1, 1]
 
-        # Another run has sessions of its own.
+        # Another run has new sessions.
         adapter = PolicyServerAdapter(CONFIG, rank=2)
         assert predict([7, 8])[:, 0, 2].tolist() == [1, 1]
         assert len(engine.sessions) == 4

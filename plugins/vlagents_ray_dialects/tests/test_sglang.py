@@ -1,5 +1,5 @@
-"""SGLang's `/v1/actions`: one observation or several, in JSON and msgpack, with sessions or
-without, by HTTP and by WebSocket.
+"""Tests of SGLang's `/v1/actions`: one or several observations, in JSON and msgpack, with and
+without sessions, over HTTP and WebSocket.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def asking(prompt: Any = "task 1", observation: Any = None, **more: Any) -> dict
 
 
 def batch(pixels: list[int], names: list[str] | None, **parameters: Any) -> dict[str, Any]:
-    """The request of RLinf's worker for several environments."""
+    """Return the request of RLinf's worker for several environments."""
     images = {"front": np.stack([image(pixel) for pixel in pixels])}
     observation = {"images": images, "state": np.tile(np.float32(STATE), (len(pixels), 1))}
     prompts = [f"task {index + 1}" for index in range(len(pixels))]
@@ -56,7 +56,7 @@ def post_msgpack(client: TestClient, payload: dict[str, Any], **headers: str) ->
 
 
 def as_json(value: Any) -> Any:
-    """An observation with lists in place of arrays."""
+    """Return an observation with lists in place of arrays."""
     if isinstance(value, dict):
         return {key: as_json(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray) else value
@@ -166,14 +166,14 @@ def test_each_session_of_a_batch_keeps_its_episode(context: Context) -> None:
     names = ["rlinf-r0-slot0", "rlinf-r0-slot1"]
     for acts in (1, 2):
         answer = post_msgpack(client, batch([7, 8], names, reset_mask=[False, False]))
-        # RLinf reads one entry, (B, H, D).
+        # RLinf reads only one entry, (B, H, D).
         assert answer["data"][0]["action"]["shape"] == [2, 2, 7]
         assert values_of(answer)[:, 0, :4].tolist() == [[7, 2, acts, 1], [8, 2, acts, 2]]
 
     answer = post_msgpack(client, batch([7, 8], names, reset_mask=[True, False]))
     assert values_of(answer)[:, 0, 2].tolist() == [1, 3]
 
-    # In another order, and with a robot that is new.
+    # The robots are in another order, and one robot is new.
     answer = post_msgpack(client, batch([8, 9], [names[1], "rlinf-r0-slot2"]))
     assert values_of(answer)[:, 0, :4].tolist() == [[8, 2, 1, 1], [9, 2, 1, 2]]
 
@@ -203,7 +203,8 @@ def test_one_observation_belongs_to_the_session_that_it_names(context: Context) 
         by_parameter = post_msgpack(client, asking(parameters={"session_ids": ["by-parameter"]}))
         assert values_of(by_header).shape == values_of(by_parameter).shape == (2, 7)
         assert values_of(by_header)[0, 2] == values_of(by_parameter)[0, 2] == acts
-        assert values_of(post_msgpack(client, asking()))[0, 2] == 1  # an episode of its own
+        # Each such request is a new episode.
+        assert values_of(post_msgpack(client, asking()))[0, 2] == 1
 
 
 def test_fewer_rows_are_sent_if_the_client_wants_fewer(context: Context) -> None:
@@ -290,7 +291,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 class Counted(Mirror):
-    """`Mirror`, which counts its acts."""
+    """A `Mirror` that counts its acts."""
 
     def __init__(self) -> None:
         super().__init__(chunk=2)

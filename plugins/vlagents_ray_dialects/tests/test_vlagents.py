@@ -1,5 +1,5 @@
-"""Clients of vlagents 0.2 and 0.3 over RPyC: their messages, memory and sessions, and what a bad
-client can do.
+"""Tests of clients of vlagents 0.2 and 0.3 over RPyC: messages, shared memory, sessions, and the
+effects of faulty clients.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ JPEG = encode_jpeg(np.full((32, 24, 3), 200, np.uint8))
 
 
 class Memory:
-    """Segments by name."""
+    """Shared-memory segments by name."""
 
     def __init__(self, **segments: bytes) -> None:
         self.segments = segments
@@ -266,9 +266,11 @@ def test_a_call_of_the_root_is_read_and_long_ones_are_compressed() -> None:
 @pytest.mark.parametrize(
     "boxed",
     [
-        (REMOTE, ("builtins.function", 1, 2)),  # an object of the client's, to be called back
+        # A reference to an object of the client, for a callback.
+        (REMOTE, ("builtins.function", 1, 2)),
         (TUPLE, ((REMOTE, ("builtins.list", 1, 2)),)),
-        (LOCAL, ("builtins.type", 5, 0)),  # an object of ours that was never handed out
+        # A reference to an object of the server that was never sent.
+        (LOCAL, ("builtins.type", 5, 0)),
         (LOCAL, (*ROOT[:2], 2)),
         (LOCAL, ("builtins.method", 2, 10**9)),
         (9, ()),
@@ -282,7 +284,7 @@ def test_no_object_but_the_root_can_be_named(boxed: tuple) -> None:
 
 @pytest.mark.parametrize("handler", sorted(set(range(22)) - {int(one) for one in Handler}))
 def test_what_reaches_into_objects_is_not_offered(handler: int) -> None:
-    """Setting attributes, listing them, pickling, comparing, formatting and the like."""
+    """These operations set or list attributes, pickle, compare, format objects and the like."""
     with pytest.raises(rpyc.Refused, match="not offered"):
         read(request(1, handler, (TUPLE, ((LOCAL, ROOT),))))
 
@@ -407,9 +409,10 @@ def test_nothing_but_the_methods_can_be_reached_and_the_client_goes_on(open_dial
             Handler.CALLATTR,
             (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, ()), (VALUE, (("a", 1),)))),
         ),
-        request(1, 14, (TUPLE, ((LOCAL, ROOT), (VALUE, 5)))),  # pickle
-        request(1, 6, (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, "x")))),  # setattr
-        request(1, 13, (TUPLE, ((LOCAL, ROOT),))),  # dir
+        request(1, 14, (TUPLE, ((LOCAL, ROOT), (VALUE, 5)))),  # the operation pickle
+        # The operation setattr.
+        request(1, 6, (TUPLE, ((LOCAL, ROOT), (VALUE, "name"), (VALUE, "x")))),
+        request(1, 13, (TUPLE, ((LOCAL, ROOT),))),  # the operation dir
         request(1, Handler.PING, (TUPLE, ((LOCAL, ROOT),))),
         request(1, Handler.PING, (TUPLE, ((TUPLE, ((LOCAL, ROOT),)),))),
         request(1, Handler.PING, (TUPLE, ((VALUE, 1.5),))),
@@ -440,7 +443,7 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
         port = open_dialect("vlagents")
         with Client(port) as one:
             assert one.act(text)[0] == 77
-        with Client(port) as two:  # after another's end
+        with Client(port) as two:  # This client begins after the first one has ended.
             assert two.act(text)[0] == 77
         with (
             Client(open_dialect("vlagents", shared_memory=False)) as off,
@@ -453,17 +456,17 @@ def test_the_clients_memory_is_read_in_place(open_dialect) -> None:
 
 
 def test_a_slow_a_dead_and_a_silent_client_hold_up_nobody(open_dialect, replicas: Replicas) -> None:
-    # The good one is silent for less, on a busy machine.
+    # The good client is silent for a shorter time, even on a busy machine.
     port = open_dialect("vlagents", idle_s=4.0)
     with Client(port) as half, Client(port) as silent, Client(port) as deaf:
-        half.send(call("act", document())[:20])  # and no more
-        deaf.send(call("act", document()) * 3)  # and does not read
+        half.send(call("act", document())[:20])  # the message stays incomplete
+        deaf.send(call("act", document()) * 3)  # the client does not read the answers
         with Client(port) as good:
             for i in range(1, 6):
                 assert good.act(document(3, "x"))[-1] == i
             for slow in (silent, deaf):
                 while slow.socket.recv(4096):
-                    pass  # until the server hangs up
+                    pass  # until the server disconnects the client
         wait_for(lambda: sessions(replicas) == 0)
 
 
@@ -521,7 +524,9 @@ def test_what_the_client_wrote_is_read_each_time_anew(segment: Segment) -> None:
 
 
 def test_a_readers_end_leaves_the_segment_to_its_client(segment: Segment) -> None:
-    """Also that of its whole process, whose resource tracker must not have heard of it."""
+    """This also holds if the reader's whole process ends: its resource tracker must not have
+    registered the segment.
+    """
     code = (
         "import sys\nfrom vlagents_ray_dialects.vlagents import SharedMemory\n"
         "print(SharedMemory(same_machine=True).read(sys.argv[1], 5).decode())"

@@ -1,5 +1,5 @@
-"""XPolicyLab's clients: `infer`, `call`, batches, messages that are repeated, images, and what they
-get for errors.
+"""Tests of XPolicyLab's clients: `infer`, `call`, batches, repeated messages, images, and the
+answers to errors.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _served() -> Iterator[Served]:
 
 
 class Messages:
-    """Numbers of messages, which have different ids."""
+    """Sends messages, each with a new id."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -94,7 +94,9 @@ def _messages() -> Messages:
 
 
 def first_row(chunk: list[dict[str, np.ndarray]]) -> list[float]:
-    """The pixel, the sum of the state, the acts of the episode and the number of the task."""
+    """Return the pixel, the sum of the state, the number of acts in the episode, and the number of
+    the task.
+    """
     return chunk[0]["actions"][:4].tolist()
 
 
@@ -137,7 +139,7 @@ def test_a_client_is_served_at_the_root_where_no_other_dialect_has_it(
     with served[0].websocket_connect("/") as socket:
         assert messages.ask(socket, "hello").payload["ok"] is True
     with serving(Mirror(), ALL) as (client, _), client.websocket_connect("/") as socket:
-        assert b"needs_wrist_camera" in socket.receive_bytes()  # RoboArena's
+        assert b"needs_wrist_camera" in socket.receive_bytes()  # a message of RoboArena's client
 
 
 def test_close_ends_the_connection_and_its_sessions(served: Served, messages: Messages) -> None:
@@ -170,7 +172,8 @@ def test_an_observation_after_each_row_is_no_act(served: Served, messages: Messa
             chunk = messages.call(socket, "get_action")
             assert len(chunk) == 2
             assert first_row(chunk) == [pixel, 3, acts, 1]
-            messages.call(socket, "update_obs", xpolicylab_observation(99))  # after its first row
+            # The observation after the first row of the chunk.
+            messages.call(socket, "update_obs", xpolicylab_observation(99))
         assert sizes == [1, 1]
         assert len(engine.sessions) == 1
 
@@ -193,7 +196,7 @@ def test_the_actions_have_the_names_and_sizes_of_the_robot(messages: Messages) -
     for row in chunk:
         assert {name: values.tolist() for name, values in row.items()} == {
             "left_arm_joint_state": [0, 1, 2, 3, 4, 5],
-            "left_ee_joint_state": [1],  # open
+            "left_ee_joint_state": [1],  # the value of an open gripper
             "right_arm_joint_state": [7, 8, 9, 10, 11, 12],
             "right_ee_joint_state": [0],
         }
@@ -228,12 +231,12 @@ def test_a_batch_is_queued_together_and_each_environment_is_a_session(
         ]
         assert sizes == [3]
 
-        # One environment has ended; the others go on, in the order of the client.
+        # One environment has ended; the others continue, in the order of the client.
         messages.call(socket, "update_obs_batch", observations(2, 0))
         chunks = messages.call(socket, "get_action_batch", [0, 2])
         assert [first_row(chunk) for chunk in chunks] == [[10, 3, 2, 0], [12, 3, 2, 2]]
 
-        # Without indices, the environments of the last update.
+        # Without indices, the call is for the environments of the last update.
         messages.call(socket, "update_obs_batch", observations(2, 1))
         chunks = messages.call(socket, "get_action_batch")
         assert [first_row(chunk) for chunk in chunks] == [[12, 3, 3, 2], [11, 3, 2, 1]]
@@ -279,7 +282,9 @@ def test_two_clients_get_their_own_actions(served: Served, messages: Messages) -
 def test_the_recorded_messages_of_a_client_get_their_answers(
     served: Served, generation: str
 ) -> None:
-    """Its own WsModelClient sent them: two acts with a row between, and a batch of two."""
+    """XPolicyLab's own WsModelClient sent these messages: two acts with an executed row between
+    them, and a batch of two.
+    """
     client, _, sizes = served
     rows, answered = [], []
     with client.websocket_connect("/xpolicylab") as socket:
@@ -303,7 +308,7 @@ def test_the_recorded_messages_of_a_client_get_their_answers(
     assert sum(sizes) == 4
 
 
-# Messages that are repeated.
+# Repeated messages
 
 
 def test_a_repeated_act_is_answered_as_the_first_time(served: Served, messages: Messages) -> None:
@@ -316,7 +321,7 @@ def test_a_repeated_act_is_answered_as_the_first_time(served: Served, messages: 
         messages.call(socket, "update_obs", xpolicylab_observation(5))
         called = messages.call(socket, "get_action", message_id="called")
     with client.websocket_connect("/xpolicylab") as socket:
-        # There is no observation over this connection, and none is needed.
+        # This connection has no observation, and the repeated message needs none.
         again = messages.call(socket, "get_action", message_id="called")
         assert first_row(again) == first_row(called)
     assert sizes == [1, 1]
@@ -381,7 +386,7 @@ def test_old_answers_are_forgotten(
     assert sizes == [1] * 4
 
 
-# Errors.
+# Errors
 
 
 def test_errors_have_their_code_and_the_connection_stays(
@@ -525,7 +530,7 @@ def test_an_observation_counts_as_in_flight_until_its_act(
         both = [large | {"env_idx": index} for index in range(2)]
         messages.call(socket, "update_obs_batch", both)
         messages.call(socket, "get_action_batch", [0])
-        assert in_flight.held >= 200_000  # one of the message's observations still waits
+        assert in_flight.held >= 200_000  # one of the message's observations is still waiting
         messages.call(socket, "get_action_batch", [1])
         wait_for(lambda: in_flight.held == 0)
         messages.call(socket, "update_obs", large)
@@ -544,7 +549,7 @@ def test_a_connection_has_a_limit_of_environments(messages: Messages) -> None:
         assert len(engine.sessions) == 0
 
 
-# Images and observations.
+# Images and observations
 
 
 def observed(camera: Any, **more: Any) -> dict[str, Any]:
@@ -552,7 +557,7 @@ def observed(camera: Any, **more: Any) -> dict[str, Any]:
 
 
 def colours() -> np.ndarray:
-    """A picture whose channels differ."""
+    """Return an image whose channels differ."""
     pixels = np.zeros((16, 16, 3), np.uint8)
     pixels[:] = (200, 100, 20)
     return pixels
@@ -606,7 +611,7 @@ def test_maps_with_indices_as_keys_are_read() -> None:
     }
 
 
-# The id of the server.
+# The id of the server
 
 
 def test_all_replicas_have_one_id_which_changes_with_the_policy_and_the_cluster() -> None:

@@ -1,5 +1,5 @@
-"""ZeroMQ's protocol: garbage raises only `MalformedMessage`, messages survive a round trip
-through libzmq.
+"""Tests of ZeroMQ's protocol: garbage raises only `MalformedMessage`, and messages survive a round
+trip through libzmq.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MESSAGES = st.lists(st.binary(max_size=600), min_size=1, max_size=5)
 
 
 def read_frames(data: bytes) -> Iterator[tuple[zmtp.FrameFlags, bytes]]:
-    """Each frame's flags and body, read as the gateway reads them."""
+    """Yield each frame's flags and body, read as the gateway reads them."""
     start = 0
     while start < len(data):
         flags = zmtp.read_flags(data[start])
@@ -75,7 +75,7 @@ def test_a_part_of_a_greeting_is_accepted(length: int) -> None:
 @given(st.binary(max_size=80))
 @example(READY[:-1])
 def test_garbage_in_commands_is_malformed(content: bytes) -> None:
-    """Or it is valid; nothing else is raised."""
+    """Random bytes may also be valid; no other error is raised."""
     for read in (zmtp.read_command, zmtp.check_ready):
         with contextlib.suppress(MalformedMessage):
             read(content)
@@ -91,7 +91,7 @@ def test_each_part_of_the_properties_of_ready_is_malformed(length: int) -> None:
 def serve_one(
     listener: socket.socket, received: list[list[bytes]], number: int, answer_in: int
 ) -> None:
-    """Greet one client as the gateway does, and echo its messages, in pieces of `answer_in`
+    """Greet one client as the gateway does, and send its messages back in pieces of `answer_in`
     bytes.
     """
     connection, _ = listener.accept()
@@ -119,7 +119,7 @@ def serve_one(
                 received.append(parts)
                 send(zmtp.write_message(parts))
                 parts = []
-        data.read(1)  # the client has its last answer, and disconnects
+        data.read(1)  # returns when the client has its last answer, and disconnects
 
 
 @pytest.mark.parametrize("answer_in", [1, 7, 10**6])

@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 TICK_S = 0.5  # the period at which a dialect checks its clients
 # Maximum number of connections in a second; each takes a thread and about a millisecond.
 _ACCEPTED_PER_S = 50.0
-_END_S = 3.0  # the time limit for the end of the thread
+_END_S = 3.0  # the time limit for joining the thread, s
 
 
 class Acceptor:
@@ -29,7 +29,8 @@ class Acceptor:
     Args:
         name: The name of the dialect.
         listener: A bound socket, which the acceptor closes.
-        add: Serves a connection, or closes it; it must not block.
+        add: Called with each connection; serves it on another thread, or closes it. It must not
+            block.
         check_clients: Called on the acceptor's thread every `TICK_S`.
     """
 
@@ -86,7 +87,8 @@ class Acceptor:
                     rate.give_back()
                     if not self._closing.is_set():
                         logger.warning("%s: cannot accept a client: %s", self._name, error)
-                        # Other connections must end first if descriptors are exhausted.
+                        # If no descriptors are left, other connections must end before the next
+                        # attempt.
                         time.sleep(0.1)
                     continue
 

@@ -13,9 +13,10 @@ import time
 from vlagents_ray.errors import MessageTooLarge, Overloaded
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes
 
-_READ_BYTES = 256 * 1024  # maximum size of a read
-# Above this size a message is in an anonymous mapping, whose pages are allocated when they are
-# written, and returned when it is freed. The heaps of the clients' threads would keep them.
+_READ_BYTES = 256 * 1024  # maximum number of bytes of one read
+# The memory of a message above this size is an anonymous mapping: its pages are allocated when they
+# are written, and returned to the system when the message is freed. The heaps of the clients'
+# threads would keep such memory.
 _MAPPED_BYTES = 256 * 1024
 # Options of TCP: probes begin after 20 s of silence, and a connection ends after 35 s.
 _KEEP_ALIVE = (
@@ -27,8 +28,8 @@ _KEEP_ALIVE = (
 
 
 def share_of(connection: socket.socket) -> str:
-    """Return the name under which a client without a key has a share of the bytes in flight: the
-    name of its address.
+    """Return the name of the address of a client without a key, under which its bytes in flight are
+    counted.
     """
     try:
         peer = connection.getpeername()
@@ -66,12 +67,13 @@ class ClientReader:
         self._lock = threading.Lock()
         self._data = memoryview(b"")
         self._received = 0  # the number of bytes of `_data` that have been received
-        # Whether the remaining bytes of the message are discarded, as there is no memory for them.
+        # Whether the remaining bytes of the message are discarded, since no memory is left for
+        # them.
         self._is_given_up = False
         self._arriving = ArrivingBytes(admission, share_of(connection), robot, self._give_up)
 
     def set_sender(self, admission: Admission, key: str, *, robot: bool) -> None:
-        """Count later messages for another share of the bytes in flight.
+        """Count the bytes of later messages in another share of the bytes in flight.
 
         Args:
             admission: Counts the bytes in flight.
@@ -146,9 +148,7 @@ class ClientReader:
                 self._received = end
 
     def _give_up(self) -> None:
-        """Free the memory of the incomplete message, as a complete one needs it; called on any
-        thread.
-        """
+        """Free the memory of the incomplete message for complete messages; called on any thread."""
         with self._lock:
             self._discard()
 

@@ -1,4 +1,4 @@
-"""The gateway's clients and their sessions, whose episodes begin as in `ImplicitEpisode`.
+"""The clients of a gateway and their sessions, whose episodes begin as in `ImplicitEpisode`.
 
 The gateway enforces the permissions of the client's key, since not every transport to a replica
 contains a key: each message is charged to the key (`vlagents_ray.serve.access.charges`), each
@@ -32,7 +32,7 @@ _QUIET_S = 30.0  # the time without a request after which a client without a ses
 class GatewaySessions:
     """The sessions of one client, all over one connection; not thread-safe.
 
-    `show` must be called before any other method, with the client.
+    `show` sets the client, and must be called before any other method.
 
     Args:
         connect: Opens a connection to the policy.
@@ -42,11 +42,11 @@ class GatewaySessions:
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
         self._connect = connect
         self._contract = contract
-        self.account = Account()  # has no caller until the client is shown
+        self.account = Account()  # has no caller until `show` is called
         self._key: str | None = None
         self._priority: PriorityName | None = None
 
-        self._counted_sessions = 0  # the number of sessions that are counted for the key
+        self._counted_sessions = 0  # the number of sessions that count towards the limit of the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
 
@@ -66,7 +66,8 @@ class GatewaySessions:
         """Begin the next episode of the client's only session.
 
         Args:
-            charge: The charge of the client's message, which `account` made when it arrived.
+            charge: The charge of the client's message; `account` created it when the message
+                arrived.
             obs: The observation.
             instruction: The task in words.
             kwargs: Further options of the reset.
@@ -88,10 +89,10 @@ class GatewaySessions:
         return self.act_batch(charge, [obs], [instruction])[0]
 
     def act_on(self, charge: Charge, obs: Obs) -> Act:
-        """Return the next action of the client's only session, without a reset.
+        """Return the next action of the client's only session, without resetting it.
 
         Raises:
-            NotReset: The session was not reset before.
+            NotReset: The session has not been reset.
         """
         agent = self._sessions(1)[0]
         charge.cover(1)
@@ -100,10 +101,11 @@ class GatewaySessions:
     def act_batch(
         self, charge: Charge, obs: Sequence[Obs], instructions: Sequence[str | None]
     ) -> list[Act]:
-        """Return the next action of each session, and reset sessions with a new instruction first.
+        """Reset the sessions with a new instruction, and return the next action of each session.
 
         Args:
-            charge: The charge of the client's message, which `account` made when it arrived.
+            charge: The charge of the client's message; `account` created it when the message
+                arrived.
             obs: The observation of each session.
             instructions: The task of each session in words.
 
@@ -124,7 +126,7 @@ class GatewaySessions:
                 beginning.append(i)
                 texts[i] = self._episodes[i].opening(instruction, self._contract)
 
-        self.restart()  # undone below, when all sessions have replied
+        self.restart()  # The change is undone below when all sessions have replied.
         if beginning:
             caller = self.account.caller
             if isinstance(caller, Caller):
@@ -181,7 +183,7 @@ class GatewaySessions:
         """Return this number of sessions; begin missing ones, and end surplus ones."""
         if not self.known:
             raise TypeError("a session without a client: call show() first")
-        # Sessions are counted before they exist, and until they have ended.
+        # Sessions are counted before they are created, and until they have ended.
         self._hold(max(number, self._counted_sessions))
         if not self._agents:
             self._agents = [self._connect(self._key, self._priority)]
@@ -219,7 +221,7 @@ def internal_error(dialect: str) -> str:
     return f"internal error; the server's log has the details under {error_id}"
 
 
-# Clients of a dialect whose protocol has no message for their end.
+# Clients of a dialect whose protocol has no message that ends a session.
 
 
 class GatewayClient(abc.ABC):
@@ -249,8 +251,8 @@ Client = TypeVar("Client", bound=GatewayClient)
 
 
 class GatewayClients(Generic[Key, Client]):
-    """The clients by their identity in the protocol, at most as many as the context has sessions.
-    Thread-safe.
+    """The clients by their identity in the protocol, at most as many as the context allows
+    sessions. Thread-safe.
 
     Args:
         context: The context of the gateway.
@@ -266,14 +268,14 @@ class GatewayClients(Generic[Key, Client]):
         return self._clients.get(key)
 
     def add(self, key: Key, make: Callable[[], Client]) -> Client:
-        """Add a client, in place of one with the same key.
+        """Add a client, or replace the client with the same key.
 
         If there are too many clients, the client without a session that has been idle for the
         longest time is removed.
 
         Args:
             key: The identity of the client.
-            make: Makes the client.
+            make: Creates the client.
 
         Returns:
             The new client.

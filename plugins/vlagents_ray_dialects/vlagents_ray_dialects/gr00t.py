@@ -1,4 +1,6 @@
-"""GR00T's `PolicyClient`s over ZeroMQ's protocol: a session and a thread for each connection."""
+"""Serves GR00T's `PolicyClient`s over ZeroMQ's protocol: a session and a thread for each
+connection.
+"""
 
 from __future__ import annotations
 
@@ -40,21 +42,23 @@ from vlagents_ray_dialects.messages.gr00t import PRESETS, GR00TRequest, Observat
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-# The frames of a message before its payload. A REQ socket adds an empty frame, and a DEALER socket
-# adds the frames of its program.
+# The frames of a message before its payload. A REQ socket adds an empty frame; a program with a
+# DEALER socket chooses the frames.
 Envelope = tuple[bytes, ...]
 _ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # the envelopes of directly connected clients
-# An envelope up to these sizes is answered with an error; a larger one ends the connection.
+# An envelope within these limits, but with other frames, is answered with an error; a larger
+# envelope ends the connection.
 _MOST_PARTS, _MOST_PART_BYTES = 4, 256
 _HANDSHAKE_S = 5.0  # maximum time of the handshake
 _MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
 _SEND_S = 10.0  # maximum time for a client to accept an answer
 _END_S = 3.0  # maximum time for the answers to requests when the dialect ends
-_LINGER_S = 1.0  # maximum time for rejecting the requests that have arrived by then
-_STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
+_LINGER_S = 1.0  # maximum time for rejecting the requests that have arrived when the dialect ends
+_STRANGERS = 64  # maximum number of connections without a valid key; one more ends the oldest
 _STRANGER_S = 30.0  # the time within which a connection must send a valid key
 _REFUSALS = 64  # the number of messages without a valid key after which a connection is closed
-# The time for which a connection is not read after such a message, as reading a key takes time.
+# The time for which a connection is not read after a message without a valid key, since reading a
+# key takes time.
 _REFUSAL_S = 0.1
 
 
@@ -62,10 +66,10 @@ class GR00TConnection(GatewayClient):
     """One connection of a client, from its first byte to its last; a thread processes its requests
     in order.
 
-    It is a stranger until one of its messages has a valid key, or needs none; then it is one of the
-    dialect's clients. An idle client becomes a stranger again and has no session, but its
-    connection stays open: a client that sends a request while its connection is being closed would
-    wait for an answer forever.
+    The connection is a stranger until it sends a valid key, or any message if no key is needed;
+    then it is one of the dialect's clients. An idle client becomes a stranger again and has no
+    session, but its connection stays open: a client that sends a request while its connection is
+    being closed would wait for an answer forever.
 
     Args:
         dialect: The dialect.
@@ -76,17 +80,17 @@ class GR00TConnection(GatewayClient):
         super().__init__(dialect.context)
         self._dialect = dialect
         self._connection = connection
-        # `_flat` is whether the last keys of the client had the form of N1.5.
+        # Whether the keys of the client's last observation were flat, as in N1.5.
         self._mapping, self._flat = nested_mapping(dialect.mapping)
 
         self._is_robot = dialect.config.priority == "robot"
-        self._share = share_of(connection)  # the name of its share of the bytes in flight
+        self._share = share_of(connection)  # the name of the client's share of the bytes in flight
         self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
         # The time at which a stranger is disconnected, s.
         self._valid_until = time.monotonic() + _STRANGER_S
         self._refused = 0  # the number of messages without a valid key
 
-        self._sending = threading.Lock()  # guards sending, and the next field
+        self._sending = threading.Lock()  # guards sending and the next field
         self._waiting: Envelope | None = None  # the envelope of the request without an answer
         self._is_last_answer_sent = False  # whether the connection ends with the last answer
         self._answered = threading.Condition()
@@ -104,7 +108,7 @@ class GR00TConnection(GatewayClient):
         shut_down(self._connection, socket.SHUT_RD)
 
     def cut_off(self, reason: str) -> None:
-        """End the connection at once; may be called on any thread."""
+        """End the connection immediately; may be called on any thread."""
         logger.info("gr00t: a connection is closed: %s", reason)
         shut_down(self._connection)
 
@@ -122,8 +126,9 @@ class GR00TConnection(GatewayClient):
         """Answer a request that is still unanswered with an error, and end the connection; called
         on any thread.
 
-        The connection's thread waits for the policy and would not read the client's next request.
-        If the connection has ended, ZeroMQ keeps that request for the server's successor.
+        The connection's thread is waiting for the policy and would not read the client's next
+        request. Once the connection has ended, ZeroMQ keeps the next request for the server's
+        successor.
         """
         if self._unanswered and self._send(_error(error)):
             self.cut_off("the server is stopping")
@@ -150,7 +155,7 @@ class GR00TConnection(GatewayClient):
             self._connection.close()
             self.sessions.close()
 
-    # ZeroMQ's protocol.
+    # ZeroMQ's protocol
 
     def _greet(self) -> None:
         """Exchange the greeting and the command READY with the client."""
@@ -159,7 +164,8 @@ class GR00TConnection(GatewayClient):
         self._connection.sendall(zmtp.GREETING)
 
         greeting = bytearray()
-        for size in (1, 10, zmtp.GREETING_BYTES - 11):  # old peers send less, and then wait
+        # Old peers send less, and then wait for the server.
+        for size in (1, 10, zmtp.GREETING_BYTES - 11):
             greeting += self._read(size, _HANDSHAKE_S, deadline)
             zmtp.check_greeting(greeting)
 
@@ -190,8 +196,8 @@ class GR00TConnection(GatewayClient):
         """Receive a message up to its payload.
 
         Returns:
-            Its envelope, the size of its payload in bytes, and the time at which the payload must
-            have arrived, s; None if the client has disconnected.
+            The envelope of the message, the size of its payload in bytes, and the time by which the
+            payload must have arrived, s; None if the client has disconnected.
         """
         envelope: list[bytes] = []
         deadline = float("inf")
@@ -270,7 +276,8 @@ class GR00TConnection(GatewayClient):
                 answer = _error(error)
             else:
                 answer = self._answer(envelope, payload)
-        finally:  # before the answer is sent, as the client may be replaced afterwards
+        # The client counts as idle before its answer is sent, as it may be replaced afterwards.
+        finally:
             with self._answered:
                 self._unanswered = 0
                 self._used = time.monotonic()
@@ -279,7 +286,9 @@ class GR00TConnection(GatewayClient):
         time.sleep(self.sessions.account.throttled_s())
 
     def _send(self, answer: bytes) -> bool:
-        """Send the answer to the current request, and return True; False if it already has one."""
+        """Send the answer to the current request, and return True; return False if the request was
+        answered before.
+        """
         with self._sending:
             envelope, self._waiting = self._waiting, None
             if envelope is None:
@@ -289,15 +298,15 @@ class GR00TConnection(GatewayClient):
             if not self._dialect.is_stopping:
                 self._connection.sendall(data)
                 return True
-            # The end of the connection arrives with the answer, so that ZeroMQ keeps the client's
-            # next request for the server's successor; a request that is sent before it arrives
-            # would be lost, and its client would wait forever.
+            # The end of the connection arrives together with the answer, so that ZeroMQ keeps the
+            # client's next request for the server's successor. If the connection ended later, a
+            # request that was sent in between would be lost, and its client would wait forever.
             self._is_last_answer_sent = True
             self._connection.sendall(data, socket.MSG_MORE)
             self._connection.shutdown(socket.SHUT_WR)
             return True
 
-    # The messages.
+    # GR00T's messages
 
     def _answer(self, envelope: Envelope, payload: memoryview) -> bytes:
         """Return the answer to a message, which may be an error."""
@@ -328,7 +337,7 @@ class GR00TConnection(GatewayClient):
 
     def _identify(self, payload: memoryview) -> None:
         """Set the caller of the sessions from the key of a message; raise an error if a key is
-        needed and the message has no valid one.
+        needed and the message has no valid key.
         """
         check = self._context.check
         if isinstance(check, NoKey):
@@ -420,7 +429,7 @@ def _stopping() -> PolicyUnavailable:
 
 
 def _client_names(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
-    """Return the client's names of the policy's cameras or states.
+    """Return the names that the client uses for the policy's cameras or states.
 
     Args:
         entries: The names and keys in the mapping; `*` in a key keeps the policy's names.
@@ -438,7 +447,7 @@ def _client_names(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> 
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
-    """Convert a mapping to the keys of `gr00t.newest`.
+    """Convert the keys of a mapping to the nested keys that `gr00t.newest` returns.
 
     Args:
         mapping: The mapping, whose keys may be flat as in N1.5, such as `video.front`.
@@ -493,8 +502,8 @@ class GR00TDialect(PortDialect):
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        # Limits the bytes of strangers' incomplete messages. One address may take half of them,
-        # which is the size of the largest message.
+        # Limits the bytes of strangers' incomplete messages. One address may have half of these
+        # bytes, which is the size of the largest message.
         self.of_strangers = Admission(2 * context.limits.body_bytes)
         self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
         self._lock = threading.Lock()  # guards the next two fields
@@ -520,9 +529,8 @@ class GR00TDialect(PortDialect):
     def close(self) -> None:
         """Answer the requests that have arrived, reject later ones, and end all connections.
 
-        Each request needs an answer, as a client of this protocol has no timeout. So a connection
-        ends with the answer to its next request; those of clients that send none for a second end
-        then.
+        A client of this protocol has no timeout, so each request needs an answer. A connection
+        therefore ends with the answer to its next request, or after a second without a request.
         """
         self._stopping.set()
         if self._acceptor is not None:
@@ -552,8 +560,8 @@ class GR00TDialect(PortDialect):
     def read_key(self, payload: memoryview, *, of_client: bool) -> str | None:
         """Return the API key in a message; None if it has none.
 
-        The keys of strangers are read on one thread, since each thread's heap would keep the memory
-        of the largest message.
+        The keys of strangers are all read on the same thread, since the heap of each reading thread
+        keeps the memory of the largest message.
 
         Args:
             payload: The message.
@@ -579,7 +587,7 @@ class GR00TDialect(PortDialect):
         return self._clients.is_gone(client)
 
     def remove_client(self, client: GR00TConnection) -> None:
-        """Remove a client, so that another one can be added."""
+        """Remove a client, so that another client can be added."""
         self._clients.remove(id(client))
 
     def remove(self, connection: GR00TConnection) -> None:

@@ -1,10 +1,10 @@
 """A proxy between the clients of a gRPC dialect and gRPC's server, which limits the connections and
 the frames.
 
-gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers
-that connect and send pings use both cores of a small machine. The front accepts at a bounded rate,
-forwards a connection only after its HTTP/2 preface, and stops reading from a connection that sends
-more small frames than a robot needs.
+gRPC's library accepts and answers on native threads, as fast as a client sends: eight clients
+without a session that connect and send pings use both cores of a small machine. The front accepts
+at a bounded rate, forwards a connection only after its HTTP/2 preface, and stops reading from a
+connection that sends more small frames than a robot needs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
 
 logger = logging.getLogger(__name__)
 
-# The path of a socket has at most 107 bytes. Only this user can read the folder that is made here.
+# The path of a socket has at most 107 bytes. Only the user of this process can read the folder that
+# is created here.
 _SHORT_FOLDER = "/tmp"  # noqa: S108
 _HANDSHAKE_S = 5.0  # maximum time until the preface of a client
 _SEND_S = 10.0  # maximum time for a client to accept a piece of an answer
@@ -37,10 +38,11 @@ _READ_BYTES = 64 * 1024
 # requests for each observation, it sends 270 in a second.
 _FRAMES_PER_S = 300.0
 _FRAMES_AT_ONCE = 150
-# A connection with more frames stays open for this time, unread, s. If it ended at once, its client
-# would connect again, which costs the server more than the frames.
+# The time for which a connection with more frames stays open without being read, s. If the
+# connection ended immediately, its client would connect again, which costs the server more than the
+# frames.
 _UNREAD_S = 1.0
-# Maximum number of connections that are not clients; a further one ends the oldest.
+# Maximum number of connections that are not clients; one more ends the oldest.
 _STRANGERS = 64
 
 
@@ -51,7 +53,7 @@ class Http2Front:
 
     Args:
         name: The name of the dialect.
-        is_client: Returns whether a peer is a client, by gRPC's name of it,
+        is_client: Returns whether a peer is a client, given gRPC's name of the peer,
             `ServicerContext.peer()`.
     """
 
@@ -61,7 +63,8 @@ class Http2Front:
         self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=_SHORT_FOLDER)
         self.path = str(Path(self._folder.name, "grpc"))
         self._lock = threading.Lock()  # guards the next two fields
-        self._connections: dict[ForwardedConnection, None] = {}  # the oldest first
+        # The open connections, the oldest first.
+        self._connections: dict[ForwardedConnection, None] = {}
         self._shares: dict[str, str] = {}  # names of shares by gRPC's name of the peer
 
     @property
@@ -86,7 +89,7 @@ class Http2Front:
         connection.thread.start()
 
     def share_of(self, peer: str) -> str:
-        """Return the name under which a peer has a share of the bytes in flight: the name of its
+        """Return the name of a peer's share of the bytes in flight, which is the name of its
         address.
         """
         with self._lock:
@@ -114,7 +117,8 @@ class Http2Front:
         deadline = time.monotonic() + _END_S
         clients = [connection for connection in connections if self._is_client(connection.peer)]
         for connection in connections:
-            if connection not in clients:  # a stranger must not delay the stop
+            # A connection that is not a client must not delay the stop.
+            if connection not in clients:
                 connection.end()
         for connection in clients:
             connection.wait_answered(deadline)
@@ -136,7 +140,8 @@ class ForwardedConnection:
         self._front = front
         self._client = client
         self._server = socket.socket(socket.AF_UNIX)
-        # The kernel chooses a unique name, by which gRPC's server identifies its peers.
+        # The kernel chooses a unique name for the connection, by which gRPC's server identifies the
+        # peer.
         self._server.bind("")
         self.peer = f"unix-abstract:{self._server.getsockname()[1:].decode()}"
         self._frames = FrameCounter()
@@ -149,17 +154,17 @@ class ForwardedConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection has not been ended."""
+        """Whether the connection is still open."""
         return not self._ended.is_set()
 
     def end(self) -> None:
-        """End both connections at once; may be called on any thread."""
+        """End both connections immediately; may be called on any thread."""
         self._ended.set()
         shut_down(self._client)
         shut_down(self._server)
 
     def wait_answered(self, deadline: float) -> None:
-        """Wait until the client has the answers of a gRPC server that has stopped.
+        """Wait until the client has received the last answers of a gRPC server that has stopped.
 
         Args:
             deadline: The time until which this method waits, s, of `time.monotonic()`.

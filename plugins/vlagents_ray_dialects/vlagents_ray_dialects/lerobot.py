@@ -1,4 +1,6 @@
-"""LeRobot's asynchronous inference over gRPC: a session for each connection of a robot client."""
+"""Serves LeRobot's asynchronous inference over gRPC: a session for each connection of a robot
+client.
+"""
 
 from __future__ import annotations
 
@@ -44,13 +46,14 @@ from vlagents_ray_dialects.messages.lerobot import (
 
 logger = logging.getLogger(__name__)
 
-# The time for which a request for actions waits for an observation, as at LeRobot's own server.
+# The time for which a request for actions waits for an observation, as in LeRobot's own server.
 _WAIT_S = 2.0
-# The rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server.
+# The rate of the actions' timestamps if the policy's contract has none, as in LeRobot's own server.
 _HZ = 30.0
 _UPLOAD_S = 30.0  # maximum time from the first piece of an observation to the last
 _END_S = 3.0  # maximum time for the answers to requests when the dialect ends
-_REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
+# Maximum number of concurrent requests of one client; LeRobot's client sends at most two.
+_REQUESTS = 4
 _HEARTBEAT_MS = 10_000  # the period of gRPC's pings, and their time limit
 # Maximum number of characters of an error, which gRPC sends in a header of at most 8 KiB.
 _DETAILS = 500
@@ -81,7 +84,7 @@ class _Waiting:
 
 
 class LeRobotConnection(GatewayClient):
-    """One client since its `Ready`. Its requests arrive on several threads, of which one at a
+    """One client since its `Ready`. Its requests arrive on several threads; only one thread at a
     time uses the session.
 
     Args:
@@ -122,7 +125,7 @@ class LeRobotConnection(GatewayClient):
         """Set the policy instructions of the client.
 
         Raises:
-            InvalidInput: They name another checkpoint than the deployment.
+            InvalidInput: The policy instructions name another checkpoint than the deployment.
         """
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
@@ -138,8 +141,8 @@ class LeRobotConnection(GatewayClient):
         """Store an observation for the next request of actions, in place of an earlier one that the
         policy has not received yet.
 
-        An observation of a time step that the policy has received is ignored, unless the client has
-        no action left.
+        An observation is ignored if the policy has already received one of the same time step,
+        unless the client has no action left.
 
         Args:
             data: The pickle with the observation.
@@ -191,8 +194,8 @@ class LeRobotConnection(GatewayClient):
                 self.end()
 
     def end(self) -> None:
-        """Drop the waiting observation, and end the session, if necessary after the current
-        action.
+        """Drop the waiting observation, and end the session, after the current action if there is
+        one.
         """
         with self._arrival:
             self._ended = True
@@ -215,7 +218,7 @@ class LeRobotConnection(GatewayClient):
         try:
             act = self.sessions.act(waiting.admission.charge, waiting.obs, waiting.instruction)
         except BaseException:
-            # The client's next observation of this time step must not be ignored.
+            # The client's next observation of this time step must reach the policy.
             self._acted = last_acted
             raise
         finally:
@@ -260,7 +263,7 @@ class LeRobotDialect(PortDialect):
     def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
         self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
-        # The time at which each observation that is being received began, by gRPC's context, s.
+        # The time at which the reception of each observation began, s, by gRPC's context.
         self._uploads: dict[Any, float] = {}
         self._server: Any = None
         self._front: Http2Front | None = None
@@ -291,7 +294,7 @@ class LeRobotDialect(PortDialect):
                 ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_time_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_timeout_ms", _HEARTBEAT_MS),
-                # A compressed message would be decompressed regardless of its size.
+                # gRPC would decompress a compressed message regardless of its size.
                 ("grpc.compression_enabled_algorithms_bitset", 1),
             ],
             maximum_concurrent_rpcs=max_requests,
@@ -377,7 +380,7 @@ class LeRobotDialect(PortDialect):
         return None if actions is None else lerobot.write_data(actions)
 
     def _share_of(self, context: Any) -> str:
-        """Return the name under which a client without a key has a share of the bytes in flight."""
+        """Return the name under which the bytes in flight of a client without a key are counted."""
         return "address unknown" if self._front is None else self._front.share_of(context.peer())
 
     def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
@@ -405,7 +408,7 @@ def _stopping() -> PolicyUnavailable:
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
-    """Return a pickle that arrives in several messages; each counts on arrival."""
+    """Return a pickle that arrives in several messages; each message is counted when it arrives."""
     pieces: list[memoryview] = []
     size = 0
     limit = admission.limits.body_bytes

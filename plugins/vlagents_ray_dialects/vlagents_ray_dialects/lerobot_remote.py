@@ -1,5 +1,5 @@
 """LeRobot's remote inference over Zenoh (`lerobot-rollout --inference.type=remote`): one instance
-serves many robots, each in a separate session, where LeRobot's own server is busy with one.
+serves many robots, each in a separate session; LeRobot's own server serves one robot at a time.
 
 The keys of a deployment D, an instance I and a session S:
 
@@ -11,8 +11,8 @@ The keys of a deployment D, an instance I and a session S:
     …/D/instances/I/sessions/S/language/request                 rejected: no policy answers text
     …/D/instances/I/sessions/S/alive                            liveliness of the robot
 
-Zenoh has no key of ours. Where others than trusted robots reach the network, let both sides be
-clients of a Zenoh router, which has TLS and access rules.
+Zenoh's messages have no field for an API key. If the network is open to anyone but trusted robots,
+connect both the server and the robots to a Zenoh router, which has TLS and access rules.
 """
 
 from __future__ import annotations
@@ -66,14 +66,15 @@ from vlagents_ray_dialects.messages.lerobot_remote import (
 logger = logging.getLogger(__name__)
 
 _PREFIX = f"lerobot/inference/v{messages.PROTOCOL_VERSION}/deployments"
-_WAITING = 8  # maximum number of messages of a robot that wait; further ones are dropped
+_WAITING = 8  # maximum number of waiting messages of a robot; further messages are dropped
 _OPENINGS = 32  # number of openings whose answers are repeated for a repeated query
-_CHECK_S = 0.5  # the period at which robots that have gone are looked for
+_CHECK_S = 0.5  # the period of the check for robots that have disconnected
 _END_S = 3.0  # the time limit for the end of a robot's thread
-# LeRobot's names of how a robot executes chunks: one after another, or by real-time chunking with a
-# policy that is guided to the plan, or was trained to begin with its first rows.
+# LeRobot's names for the modes in which a robot executes chunks: one chunk after another, or
+# real-time chunking with a policy that is either guided to the plan or trained to begin with the
+# first rows of the plan.
 _CHUNK, _GUIDED, _TRAINED = "chunk", "rtc_guided", "rtc_trained"
-# Deadlines that a client adds to its own, s; LeRobot's own defaults.
+# Deadlines that a client adds to its own time limits, s; the defaults of LeRobot.
 _ACTION_DEADLINE_S, _LANGUAGE_DEADLINE_S = 5.0, 60.0
 
 
@@ -100,8 +101,8 @@ class Feature(BaseModel, extra="forbid"):
 
 
 class LeRobotRemoteDialectConfig(KeylessPortConfig):
-    """The settings of LeRobot's remote inference. LeRobot compares each of them with what its robot
-    says, so they are those of its own deployment file.
+    """The settings of LeRobot's remote inference. LeRobot's client compares each of them with the
+    settings of its robot, so use the values of LeRobot's own deployment file.
     """
 
     mapping: MappingSetting = "lerobot"
@@ -154,7 +155,8 @@ class LeRobotRemoteDialect(PortDialect):
         self.offer = Offer(config, context)
         self.offer.require_fit(self.mapping)
         self._robots: GatewayClients[str, RobotSession] = GatewayClients(context)
-        self._openings: OrderedDict[str, bytes] = OrderedDict()  # answers by the id of the query
+        # The answer to each query, by the query's id.
+        self._openings: OrderedDict[str, bytes] = OrderedDict()
         self._opening = threading.Lock()
         self._zenoh: Any = None
         self._declared: list[Any] = []
@@ -211,12 +213,12 @@ class LeRobotRemoteDialect(PortDialect):
         return require("zenoh").handlers.Callback(function, indirect=False)
 
     def _check(self) -> None:
-        """End the sessions of robots that have gone, until the dialect is closed."""
+        """End the sessions of disconnected robots, until the dialect is closed."""
         while not self._closing.wait(_CHECK_S):
             self._robots.forget_quiet()
 
     def _describe(self, query: Any) -> None:
-        """Answer what the deployment offers."""
+        """Answer a query with the descriptor of the deployment."""
         request = self._read(query)
         if request is not None:
             answer = Envelope(
@@ -228,7 +230,9 @@ class LeRobotRemoteDialect(PortDialect):
             _reply(query, messages.encode(answer))
 
     def _open(self, query: Any) -> None:
-        """Begin a session on a separate thread, as its declarations must not block Zenoh's."""
+        """Begin a session on a separate thread, since declaring its keys must not block Zenoh's
+        thread.
+        """
         request = self._read(query)
         if request is not None:
             threading.Thread(
@@ -236,7 +240,9 @@ class LeRobotRemoteDialect(PortDialect):
             ).start()
 
     def _read(self, query: Any) -> Envelope | None:
-        """Return the message in a query; None if it cannot be read, and the query was answered."""
+        """Return the message in a query; None if the message was unreadable, in which case the
+        query has been answered with an error.
+        """
         data = b"" if query.payload is None else query.payload.to_bytes()
         try:
             return messages.decode(data, self.context.limits)
@@ -246,7 +252,7 @@ class LeRobotRemoteDialect(PortDialect):
             return None
 
     def _begin(self, query: Any, request: Envelope) -> None:
-        """Begin the session that a client has asked for, and answer with its id."""
+        """Begin the session that a client requests, and answer with its id."""
         with self._opening:
             answer = self._openings.get(request.request_id)
             if answer is None:
@@ -281,11 +287,11 @@ class LeRobotRemoteDialect(PortDialect):
 
 
 class Offer:
-    """What a deployment offers to each robot: LeRobot's descriptor.
+    """The descriptor of a deployment in LeRobot's format: what the deployment offers to each robot.
 
     Args:
         config: The settings of the dialect.
-        context: The gateway, with what it knows of the policy.
+        context: The context of the gateway, with the policy's contract.
 
     Raises:
         ConfigError: The settings and the contract lack a value, or contradict each other.
@@ -332,7 +338,8 @@ class Offer:
         self.instance_id = uuid.uuid4().hex
         self.key = f"{_PREFIX}/{config.deployment}"
         self.instance_key = f"{self.key}/instances/{self.instance_id}"
-        # LeRobot's clients end their rollout if it changes, so pushes of weights do not change it.
+        # LeRobot's clients end their rollout if this identity changes, so it stays the same when
+        # weights are pushed.
         self.artifact = config.deployment
 
     def require_fit(self, mapping: KeyMapping) -> None:
@@ -375,14 +382,16 @@ class Offer:
                 "action_feature": config.action.to_wire(),
                 "language": False,
                 "training_max_delay": self.longest_prefix if _TRAINED in self.modes else 0,
-                # The policy reads the whole plan, and itself decides how much of it matters.
+                # The policy reads the whole plan, and decides itself how strongly each row guides
+                # it.
                 "rtc_horizon": self.prediction_steps if len(self.modes) > 1 else 0,
                 "current_observation_only": True,
                 "retains_session_state": True,
                 "action_representation": "canonical",
             },
             "execution_contracts": list(MERGES),
-            # The robot blends, and its user chooses what: read by clients with `chunk_blending_v1`.
+            # The robot blends the rows of chunks, and its user chooses the components; clients with
+            # `chunk_blending_v1` read this list.
             "blendable_components": config.action.names,
             "ready": True,
             "available": True,
@@ -407,8 +416,8 @@ class Offer:
             body: The body of the request.
 
         Raises:
-            IncompatibleRequest: The client's robot is another one than the deployment's.
-            UnsupportedRequest: The client asks for what the deployment does not offer.
+            IncompatibleRequest: The client's robot differs from the robot of the deployment.
+            UnsupportedRequest: The client requests something that the deployment does not offer.
         """
         descriptor = self.descriptor()
         capabilities = descriptor["capabilities"]
@@ -439,7 +448,7 @@ class Offer:
         return {"mode": mode, **self._merging(body)}
 
     def _merging(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of merged chunks in a request for a session, as they are accepted."""
+        """Return the accepted settings for merging chunks in a request for a session."""
         required = body.get("required_capabilities", [])
         if not isinstance(required, list) or not set(map(str, required)) <= set(MERGES):
             raise UnsupportedRequest(
@@ -469,7 +478,7 @@ class RobotSession(GatewayClient):
         dialect: The dialect.
         session_id: The id of the session in the protocol.
         session: Zenoh's session.
-        terms: What the client and the deployment have agreed on, as `Offer.accept` returns it.
+        terms: The settings of the session, as `Offer.accept` returns them.
     """
 
     def __init__(
@@ -491,15 +500,16 @@ class RobotSession(GatewayClient):
         self._generation = 0
         self._last_sequence = -1
         self._is_ready = False  # whether the client has reset the session
-        self._is_present: bool | None = None  # whether the robot's token is there; None: not yet
+        # Whether the robot's liveliness token is present; None if this is not known yet.
+        self._is_present: bool | None = None
         self._absent_since = time.monotonic()
         self._inbox: queue.Queue[tuple[str, Any] | None] = queue.Queue(_WAITING)
         self._declared: list[Any] = []
         self._forget: Callable[[], None] = lambda: None
         self._ended = threading.Event()
-        self._sending = threading.Lock()  # of the two following values
+        self._sending = threading.Lock()  # guards the two following values
         self._asked: Envelope | None = None  # the observation that is being answered
-        self._is_silent = False  # whether nothing is sent any more
+        self._is_silent = False  # whether no more answers are sent
         self._thread = threading.Thread(target=self._run, name=f"{dialect.name}-robot", daemon=True)
 
     def declare(self, forget: Callable[[], None]) -> None:
@@ -526,7 +536,7 @@ class RobotSession(GatewayClient):
         self._thread.start()
 
     def quiet_s(self, now: float) -> float:
-        """Return the time since the robot was seen last, s: a robot that is connected may be
+        """Return the time for which the robot has been disconnected, s; a connected robot may be
         silent.
         """
         return 0.0 if self._is_present else now - self._absent_since
@@ -534,12 +544,12 @@ class RobotSession(GatewayClient):
     def end(self) -> None:
         """End the session after the current action."""
         self._ended.set()
-        with contextlib.suppress(queue.Full):  # the thread looks at `_ended` after each message
+        with contextlib.suppress(queue.Full):  # the thread checks `_ended` after each message
             self._inbox.put_nowait(None)
 
     def join(self) -> None:
-        """Wait until the session has ended; the robot of an act that takes too long gets an
-        error.
+        """Wait until the session has ended; if an action takes too long, send an error to the
+        robot.
         """
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(_END_S)
@@ -551,13 +561,15 @@ class RobotSession(GatewayClient):
             self._is_silent = True
 
     def _see(self, sample: Any) -> None:
-        """Note whether the robot is connected."""
+        """Record whether the robot is connected."""
         zenoh = require("zenoh")
         self._is_present = sample.kind == zenoh.SampleKind.PUT
         self._absent_since = time.monotonic()
 
     def _arrive(self, kind: str, message: Any) -> None:
-        """Take a message on Zenoh's thread; one too many is dropped, as Zenoh does under load."""
+        """Queue a message on Zenoh's thread; if the queue is full, drop it, as Zenoh does under
+        load.
+        """
         try:
             self._inbox.put_nowait((kind, message))
         except queue.Full:
@@ -721,8 +733,8 @@ class RobotSession(GatewayClient):
         answer = {name: body[name] for name in echoed if name in body}
         answer |= {
             "canonical_actions": self._dialect.mapping.rows(rows, spec),
-            # The client keeps these for the next request, and does not read them: they are the
-            # policy's own numbers, in which it reads a plan.
+            # The client keeps these rows for the next request without reading them. They are the
+            # numbers of the policy, in which the policy reads a plan.
             "model_actions": None if is_chunk else rows,
             "execution_steps": steps,
             "server_durations": {"act_s": time.perf_counter() - begun},
@@ -780,19 +792,19 @@ class RobotSession(GatewayClient):
 
     @staticmethod
     def _refuse_language(_request: Envelope, _admission: MessageAdmission) -> Envelope:
-        """Reject a question, which no policy here answers."""
+        """Reject a request for text, since no policy here answers in text."""
         raise UnsupportedRequest("language: this deployment answers with actions only")
 
 
 def _reply(query: Any, data: bytes) -> None:
-    """Answer a query, and end it: the client waits for further replies until then."""
+    """Answer a query, and end it; until the end, the client waits for further replies."""
     query.reply(str(query.key_expr), data)
     query.drop()
 
 
 def _continuation(body: Mapping[str, Any], name: str, offer: Offer) -> np.ndarray | None:
-    """Return a plan in an observation, (H, D) float32, of at most the rows of a chunk; None if the
-    robot has none.
+    """Return a plan in an observation, (H, D) float32, with at most as many rows as a chunk; None
+    if the robot has no plan.
     """
     plan = body.get(name)
     if plan is None:
@@ -812,7 +824,9 @@ def _continuation(body: Mapping[str, Any], name: str, offer: Offer) -> np.ndarra
 
 
 def _require_cursors(body: Mapping[str, Any]) -> None:
-    """Raise `MalformedMessage` if an observation does not say where its chunk is to be merged."""
+    """Raise `MalformedMessage` if an observation has no valid position at which its chunk is
+    merged.
+    """
     observed, requested = body.get("observation_cursor"), body.get("cursor")
     if (
         type(observed) is not int
@@ -826,7 +840,9 @@ def _require_cursors(body: Mapping[str, Any]) -> None:
 
 
 def _require_feature(feature: Feature, value: Any) -> None:
-    """Raise `IncompatibleRequest` if a feature has another shape or type than was agreed on."""
+    """Raise `IncompatibleRequest` if the shape or type of a feature differs from the
+    deployment's.
+    """
     shape: Sequence[int] | None = getattr(value, "shape", None)
     if shape is None or list(shape) != feature.shape or value.dtype.name != feature.dtype:
         raise IncompatibleRequest(

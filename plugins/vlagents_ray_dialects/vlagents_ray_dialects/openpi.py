@@ -1,5 +1,5 @@
-"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server
-sends first.
+"""Serves openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps, and
+the server sends the first message.
 
 RoboArena's clients use nearly the same protocol and also connect to the root. A server may have
 both dialects: RoboArena's requests contain an `endpoint`, openpi's do not. The first message is
@@ -60,11 +60,11 @@ class MapDialect(base.RouteDialect):
 
     @abc.abstractmethod
     def first(self) -> dict[str, Any]:
-        """Return the message that a client receives when it connects."""
+        """Return the first message to a client, which is sent when the client connects."""
 
     @abc.abstractmethod
     def speaks(self, message: dict[str, Any]) -> bool:
-        """Return whether a message is from a client of this dialect."""
+        """Return whether a client of this dialect sent a message."""
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         """Begin an episode if the message requires it.
@@ -74,7 +74,7 @@ class MapDialect(base.RouteDialect):
             connection: The connection of the client.
 
         Returns:
-            The reply if the message is not an observation; empty if the client expects no reply.
+            The reply if the message is not an observation; an empty reply is not sent.
         """
         return None
 
@@ -118,7 +118,7 @@ def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
 
 
 class OpenPiDialectConfig(DialectConfig):
-    """The settings of `openpi-client`, over WebSocket."""
+    """The settings of the dialect of `openpi-client` over WebSocket."""
 
     mapping: MappingSetting  # each of openpi's robots has different keys, so there is no default
     metadata: dict[str, Any] = Field(
@@ -135,8 +135,9 @@ class OpenPiDialectConfig(DialectConfig):
 class OpenPiDialect(MapDialect):
     """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
 
-    The observations of a batch belong to further sessions, in order. A batch of another size ends
-    all their episodes, as the owner of each observation is unknown.
+    Each observation of a batch belongs to the session at its index. A batch of another size ends
+    the episodes of all these sessions, as the server cannot tell which robot each observation is
+    from.
     """
 
     Config = OpenPiDialectConfig
@@ -180,8 +181,8 @@ class OpenPiDialect(MapDialect):
 
 
 class RoboArenaDialectConfig(DialectConfig):
-    """The settings of RoboArena's client; except for `bare`, its PolicyServerConfig has the same
-    fields.
+    """The settings of RoboArena's client. They are the fields of RoboArena's PolicyServerConfig,
+    and `bare`.
     """
 
     mapping: MappingSetting = "roboarena"
@@ -256,7 +257,7 @@ class RoboArenaDialect(MapDialect):
 
 
 class MapConnection:
-    """The state of one dialect on a connection, with its session.
+    """The state of one dialect on a connection, with the sessions of the client.
 
     Args:
         dialect: The dialect.
@@ -266,9 +267,9 @@ class MapConnection:
         self.dialect = dialect
         self.sender: Sender = dialect.sender()
         self.session: base.ImplicitSession = dialect.session(self.sender)
-        self.episode: str | None = None  # the client's name of the episode
-        self._batched: list[base.ImplicitSession] = []  # the sessions by index in a batch
-        self._before_ms: float | None = None  # the server's time for the previous message
+        self.episode: str | None = None  # the client's name for the current episode
+        self._batched: list[base.ImplicitSession] = []  # the sessions by their index in a batch
+        self._before_ms: float | None = None  # the server's time for the previous message, ms
 
     def end_episodes(self) -> None:
         """Make the next observation of each session begin an episode."""
@@ -282,7 +283,7 @@ class MapConnection:
 
         Args:
             message: The message.
-            incoming: The same message, for the metrics.
+            incoming: The undecoded message, for the metrics.
             charge: The charge of the message.
             request_id: The id of the request.
         """
@@ -332,9 +333,7 @@ class MapConnection:
 
 
 async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
-    """Serve one connection at a path of these dialects, of which the last one sends the first
-    message.
-    """
+    """Serve a connection at a path of these dialects; the last dialect sends the first message."""
     if not await base.accept_or_refuse(socket, dialects[0].context):
         return
 
@@ -407,7 +406,7 @@ async def _answer(
 
 
 def _dialect_of(message: dict[str, Any], dialects: Sequence[MapDialect]) -> MapDialect:
-    """Return the dialect of a message, by default the first one."""
+    """Return the dialect of a message, by default the first dialect."""
     for dialect in dialects:
         if dialect.speaks(message):
             return dialect

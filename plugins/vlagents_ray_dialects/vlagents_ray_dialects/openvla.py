@@ -1,6 +1,6 @@
 """OpenVLA's REST protocol: `POST /act` with an observation; the reply is an action.
 
-Errors have a status of their own, while OpenVLA's own server replies with 200 and "error".
+An error has its HTTP status; OpenVLA's own server replies to it with 200 and "error".
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vlagents_ray_dialects.messages.openvla import PRESETS
 
 
 class OpenVLADialectConfig(DialectConfig):
-    """The settings of the REST clients of OpenVLA, and of its forks that post whole
+    """The settings of the REST clients of OpenVLA, and of the forks of OpenVLA that post whole
     observations.
     """
 

@@ -1,4 +1,4 @@
-"""What this distribution registers: an entry for each dialect, and the policy `upstream`."""
+"""The entries that this distribution registers: one for each dialect, and the policy `upstream`."""
 
 from vlagents_ray.registry import RegistryEntry
 

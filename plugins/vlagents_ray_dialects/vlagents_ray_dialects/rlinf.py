@@ -1,10 +1,10 @@
 """RLinf's rollout worker as a client of this server: `SGLangEmbodiedWorker` sends the observations
 of its environments to `/v1/actions/generations`, as this adapter writes them.
 
-RLinf's own adapter, that of DreamZero, sends observations that are normalised for that model; this
-one sends what the environments observe. RLinf loads it in each of its processes if
-`RLINF_EXT_MODULE` is `vlagents_ray_dialects.rlinf`. It was written for RLinf's commit a3816b59
-(`rlinf/workers/rollout/sglang/sglang_embodied_worker.py`).
+RLinf's own adapter, for DreamZero, sends observations that are normalised for that model; this
+adapter sends the observations of the environments unchanged. RLinf loads this module in each of its
+processes if `RLINF_EXT_MODULE` is `vlagents_ray_dialects.rlinf`. The module was written for RLinf's
+commit a3816b59 (`rlinf/workers/rollout/sglang/sglang_embodied_worker.py`).
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 
 MODEL_TYPE = "vlagents_ray"  # `rollout.model.model_type` in RLinf's configuration
 
-# What an environment of RLinf observes, with one row for each of its parallel environments; an
-# environment has some of these (rlinf/envs/*).
+# Observations of RLinf's environments, with one row for each parallel environment; each kind of
+# environment has some of these names (rlinf/envs/*).
 _OBSERVED = ("main_images", "wrist_images", "extra_view_images", "states")
 
 
 class PolicyServerAdapter:
     """Converts the observations of RLinf's environments to a request, and the answer to actions.
 
-    Each of the parallel environments is a session. Their names differ from run to run, so that a
-    run does not continue the sessions of the one before.
+    Each of the parallel environments is a session. The names of the sessions differ from run to
+    run, so that a run does not continue the sessions of an earlier run.
 
     Args:
         cfg: RLinf's configuration; `rollout.model.num_action_chunks` is the number of rows that are
@@ -43,15 +43,15 @@ class PolicyServerAdapter:
     def build_request(
         self, env_obs: Mapping[str, Any], mode: str = "eval"
     ) -> tuple[dict[str, Any], None]:
-        """Return the request for the observations of B environments, and no state.
+        """Return the request for the observations of B environments, and None as the state.
 
         Args:
-            env_obs: `main_images`, (B, H, W, 3) uint8, `states`, (B, D), and others of the same
-                length; `task_descriptions`, a list of texts; and what the worker adds.
+            env_obs: `main_images`, (B, H, W, 3) uint8, `states`, (B, D), and other observations of
+                the same length; `task_descriptions`, a list of texts; and the worker's own keys.
             mode: RLinf's mode; the worker evaluates only.
 
         Raises:
-            NotImplementedError: The mode is another one than "eval".
+            NotImplementedError: The mode is not "eval".
         """
         if mode != "eval":
             raise NotImplementedError(f"mode: expected 'eval', got {mode!r}")
@@ -78,7 +78,8 @@ class PolicyServerAdapter:
     def parse_response(
         self, response: Mapping[str, Any], _state: None
     ) -> tuple[Any, dict[str, Any]]:
-        """Return the actions of an answer, a tensor (B, rows, D) float32, and no further values.
+        """Return the actions of an answer, a tensor (B, rows, D) float32, and an empty dict of
+        further values.
 
         Args:
             response: The answer, SGLang's envelope.

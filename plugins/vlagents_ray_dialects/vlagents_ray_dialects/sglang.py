@@ -1,6 +1,6 @@
 """SGLang's `/v1/actions`: actions for one or several observations, by HTTP and by WebSocket.
 
-An error over HTTP has its status and a document whose `detail` SGLang's clients read.
+An error over HTTP has its status and a JSON document, whose `detail` SGLang's clients read.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SGLangDialect(base.HttpDialect):
         return [*super().routes(), metadata, Route("/health", self.health)]
 
     async def metadata(self, _http: HttpRequest) -> Response:
-        """Answer with what the policy reads and returns, as SGLang states it."""
+        """Answer with the inputs and outputs of the policy in SGLang's format."""
         return Response(sglang.encode(self._describe(), JSON), media_type=JSON)
 
     async def generate(self, http: HttpRequest) -> Response:
@@ -116,16 +116,17 @@ class SGLangDialect(base.HttpDialect):
 
         Args:
             request: The request.
-            message: The message that it came in.
+            message: The message that contains the request.
             sender: The sender of the message.
-            own: The session of an observation alone whose session is not named; None if it has one
-                for this request only.
+            own: The session of a single observation without a session name; None if such an
+                observation gets a session for this request only.
             name: The id of the request.
         """
         if message.charge is not None:
             message.charge.cover(len(request.observations))
         contract = self.context.contract
-        if contract is not None:  # before the policy acts, where it is known
+        # The sizes are checked before the policy acts, if the contract is known.
+        if contract is not None:
             sglang.require_sizes(request, contract.chunk, contract.action.dim)
         inputs = [self.read(observation) for observation in request.observations]
         message.decoded_alike(len(inputs))
@@ -157,7 +158,7 @@ class SGLangDialect(base.HttpDialect):
     ) -> dict[str, Any]:
         """Return the answer to a request, given the policy's replies to its observations."""
         chunks = [sglang.trimmed(self.rows(reply), request) for reply in replies]
-        # All robots get as many rows as the shortest chunk has.
+        # The chunk of each robot is cut to the length of the shortest chunk.
         fewest_rows = min(len(chunk) for chunk in chunks)
         chunks = [chunk[:fewest_rows] for chunk in chunks]
         timings = {
@@ -171,7 +172,7 @@ class SGLangDialect(base.HttpDialect):
         return str(self.context.metadata().get("policy"))
 
     def _describe(self) -> dict[str, Any]:
-        """Return the metadata of the policy as SGLang states them."""
+        """Return the metadata of the policy in SGLang's format."""
         contract = self.context.contract
         camera_keys = [camera.key.rpartition("/")[2] for camera in self.mapping.cameras.values()]
         described: dict[str, Any] = {"action_type": "continuous", "dtype": "float32"}
@@ -212,7 +213,7 @@ class _Connection:
         self.sender: Sender = dialect.sender()
         self._dialect = dialect
         self._session = dialect.session(self.sender)
-        self._before_ms: float | None = None  # the server's time for the previous message
+        self._before_ms: float | None = None  # the server's time for the previous message, ms
 
     async def answer(
         self, socket: WebSocket, data: bytes | None, admission: MessageAdmission
@@ -259,8 +260,8 @@ class _Connection:
         message: IncomingMessage,
         name: str,
     ) -> bytes:
-        """Return the answer to a request, with the server's times as SGLang's WebSocket has
-        them.
+        """Return the answer to a request, with the server's times in the format of SGLang's
+        WebSocket.
         """
         body = self._dialect._answer(request, replies, name)
         body["server_timing"] = {"infer_ms": (time.perf_counter() - message.arrived) * 1e3}

@@ -1,5 +1,5 @@
-"""vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an
-observation per step.
+"""Serves vla-eval's benchmarks over WebSocket: they send "hello", the beginning and the end of each
+episode, and an observation per step.
 
 A benchmark executes one action per step, so each reply contains one row of a chunk. A benchmark
 that sends observations without waiting (its live mode) receives a reply to the newest one; older
@@ -37,7 +37,8 @@ from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray_dialects.messages import vla_eval
 from vlagents_ray_dialects.messages.vla_eval import PRESETS
 
-_WAITING = 16  # maximum number of waiting messages of a client that does not wait for replies
+# Maximum number of waiting messages of a client that sends without waiting for replies.
+_WAITING = 16
 
 
 class VlaEvalDialectConfig(DialectConfig):
@@ -81,7 +82,7 @@ class VlaEvalDialect(base.RouteDialect):
 
         sender = self.sender()
         session = self.session(sender)
-        chunk = ChunkBuffer()  # the rows that are not sent yet
+        chunk = ChunkBuffer()  # the rows of the chunk that are not sent yet
         inbox = _Inbox()
         messages = self.messages(socket)
         reading = asyncio.ensure_future(inbox.fill(messages, self))
@@ -153,8 +154,8 @@ class VlaEvalDialect(base.RouteDialect):
         incoming = self.arrived(admission.charge)
         request_id = uuid.uuid4().hex
         try:
-            # Some benchmarks render only the observations that begin a chunk, so the observations
-            # of its other rows are not read.
+            # Some benchmarks render only the observations for which a chunk is computed, so the
+            # observations for its other rows are not read.
             text = self.mapping.read_instruction(
                 message.payload, self.context.limits, self.context.contract
             )
@@ -195,7 +196,9 @@ class _Received:
 
 
 class _Inbox:
-    """The unprocessed messages of a client; an observation replaces one directly before it."""
+    """The unprocessed messages of a client; an observation replaces an observation directly before
+    it.
+    """
 
     def __init__(self) -> None:
         self._messages: deque[_Received | None] = deque()
@@ -240,7 +243,9 @@ class _Inbox:
             return _Received(problem, admission)
 
     def _put(self, received: _Received | None) -> None:
-        """Add a message, in place of the last one if both are observations; None ends the inbox."""
+        """Add a message; if it and the last message are observations, it replaces that message.
+        None ends the inbox.
+        """
         is_observation = received is not None and received.is_observation
         last = self._messages[-1] if self._messages else None
         if is_observation and last is not None and last.is_observation:

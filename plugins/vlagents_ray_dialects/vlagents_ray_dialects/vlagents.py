@@ -1,4 +1,6 @@
-"""Clients of the package `vlagents` over RPyC, with one thread and one session per client."""
+"""Serves clients of the package `vlagents` over RPyC, with one thread and one session per
+client.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,7 @@ class VlagentsConnection:
         self._session.show(NoKey.OPEN, None)
 
         robot = dialect.config.priority == "robot"
-        self._share = share_of(connection)  # the name of its share of the bytes in flight
+        self._share = share_of(connection)  # the name of the client's share of the bytes in flight
         self._reader = ClientReader(connection, context.admission, robot=robot)
         self._segments = SharedMemory(
             same_machine=dialect.config.shared_memory and _is_same_machine(connection)
@@ -279,7 +281,7 @@ def _echo(call: RpycCall) -> str | bytes | None:
 
 
 def _number(args: tuple[Any, ...]) -> int:
-    """Return the number of the method that a client looks up."""
+    """Return the number of the method whose name a client looks up."""
     match args:
         case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
             return _METHODS.index(name) + 1
@@ -395,9 +397,9 @@ class SharedMemory:
             ) from error
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
-            raise InvalidObservation(f"shared memory {name[:40]!r}: is none")
+            raise InvalidObservation(f"shared memory {name[:40]!r}: not a regular file")
 
-        if len(self._open) >= _KEPT:  # a client creates another segment when its images grow
+        if len(self._open) >= _KEPT:  # A client creates another segment when its images grow.
             oldest = next(iter(self._open))
             os.close(self._open.pop(oldest))
         self._open[file_name] = descriptor
@@ -496,7 +498,7 @@ class VlagentsDialect(PortDialect):
 
     def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self.stated_mapping = config.keys()  # None if clients use this project's names
+        self.stated_mapping = config.keys()  # None if clients use the names of this project
         spec = ActionSpec() if context.contract is None else context.contract.action
         # The columns of each robot, or of a single one.
         self.columns: Mapping[str, vlagents.RobotColumns] | vlagents.RobotColumns

@@ -1,13 +1,13 @@
-"""XPolicyLab's clients over WebSocket, such as RoboDojo: they send `reset` before an episode, and
-observations of one environment or of several.
+"""Serves XPolicyLab's clients over WebSocket, such as RoboDojo: they send `reset` before an
+episode, and observations of one environment or of several.
 
-A client of the first generation sends an observation with `infer`, and gets a chunk. One of the
-second generation sends `call`: `update_obs` with an observation, which waits until `get_action`
-asks for its chunk, and another `update_obs` after each row that it has executed. Only the newest
-observation is decoded, and only `get_action` is an act.
+A client of the first generation sends an observation with `infer`, and receives a chunk. A client
+of the second generation sends `call`: `update_obs` with an observation, which waits until
+`get_action` requests its chunk, and another `update_obs` after each executed row. Only the newest
+observation is decoded, and only `get_action` calls the policy.
 
 A client that has lost its connection connects again, and repeats its last message with the same
-`message_id`. An act that was answered is not executed again: its answer is kept for a while.
+`message_id`. An answered request for actions is not executed again: its answer is kept for a while.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ from vlagents_ray.serve.requests import IncomingMessage
 from vlagents_ray_dialects.messages import xpolicylab
 from vlagents_ray_dialects.messages.xpolicylab import NO_FRAME, PRESETS, Frame
 
-# Kept answers, for clients that repeat a message at once: their number, and their bytes.
+# Kept answers, for clients that repeat a message soon: their maximum number, and their maximum size
+# in bytes.
 _KEPT_ANSWERS, _KEPT_BYTES = 256, 16 * 2**20
-# What identifies the policy of a deployment in the metadata of its replicas.
+# The keys in the metadata of replicas that identify the policy of a deployment.
 _IDENTITY = ("cluster", "policy", "checkpoint", "config", "program", "version")
 _MessageKey = tuple[Identity, str]  # the sender of a message, and the message's id
 _METHODS = ("update_obs", "get_action", "update_obs_batch", "get_action_batch")
@@ -96,8 +97,8 @@ class XPolicyLabDialect(base.RouteDialect):
     def server_instance_id(self) -> str:
         """Return the id of the deployment, which is equal at all its replicas.
 
-        A client whose evaluation began with another id ends the evaluation, so the id changes with
-        the policy and with a restart of the server, and not with a replica.
+        A client ends its evaluation if the id changes, so the id changes with the policy and when
+        the server restarts, but not with the replica.
         """
         metadata = self.context.metadata()
         identity = {name: metadata.get(name) for name in _IDENTITY}
@@ -106,9 +107,10 @@ class XPolicyLabDialect(base.RouteDialect):
 
 
 class _AnswersOfActs:
-    """The newest answers to acts, for clients that repeat a message after a lost connection.
+    """The newest answers to requests for actions, for clients that repeat a message after a lost
+    connection.
 
-    A key reaches its own answers alone.
+    The sender of a message can only read the answers to its own messages.
     """
 
     def __init__(self) -> None:
@@ -117,10 +119,12 @@ class _AnswersOfActs:
         self._in_flight: dict[_MessageKey, asyncio.Future[None]] = {}
 
     async def answer_once(self, message_id: str, act: Callable[[], Awaitable[bytes]]) -> bytes:
-        """Return the answer to a message: that of `act`, or the kept one if it was sent before.
+        """Return the answer to a message: the answer of `act`, or the kept answer if the message
+        was answered before.
 
-        A message that is repeated while it is being answered waits for that answer. If there was
-        none, as its client had left before the act began, it is executed now.
+        A message that is repeated while it is being answered waits for that answer. If the first
+        message was not answered, as its client had disconnected before the act began, the act is
+        executed now.
         """
         key = (current_caller(), message_id)
         while key in self._in_flight:
@@ -139,7 +143,7 @@ class _AnswersOfActs:
         return answer
 
     def _keep(self, key: _MessageKey, answer: bytes) -> None:
-        """Keep an answer, in place of the oldest ones if there are too many."""
+        """Keep an answer, and drop the oldest answers if there are too many."""
         self._answers[key] = answer
         self._bytes += len(answer)
         while len(self._answers) > _KEPT_ANSWERS or self._bytes > _KEPT_BYTES:
@@ -150,11 +154,11 @@ class _AnswersOfActs:
 class _UpdateMessage:
     """A message with the newest observations of environments.
 
-    It counts as in flight until none of them waits any more.
+    The message counts as in flight until none of its observations waits for an act any more.
 
     Args:
         admission: The admission of the message.
-        waiting: The number of its observations.
+        waiting: The number of observations in the message.
     """
 
     def __init__(self, admission: MessageAdmission, waiting: int) -> None:
@@ -170,7 +174,7 @@ class _UpdateMessage:
 
 @dataclass(frozen=True, slots=True)
 class _Observation:
-    """An observation whose images are not decoded yet, and the message that it came in."""
+    """An observation whose images are not decoded yet, and the message that contained it."""
 
     content: dict[str, Any]
     message: _UpdateMessage
@@ -244,7 +248,7 @@ class _Connection:
     async def _report(
         self, socket: WebSocket, frame: Frame, problem: VLAgentsError, request_id: str
     ) -> bool:
-        """Send an error, or end the connection so that the client repeats its message; return
+        """Send an error, or end the connection so that the client repeats its message. Return
         whether the connection stays open.
         """
         # A client repeats an unanswered message once, over a new connection.
@@ -312,7 +316,7 @@ class _Connection:
     ) -> bytes:
         """Answer the call of a method."""
         method, value = frame.payload.get("func_name"), frame.payload.get("obs")
-        if not isinstance(method, str) or method not in _METHODS:  # it may be an array
+        if not isinstance(method, str) or method not in _METHODS:  # the argument may be an array
             raise MalformedMessage(
                 f"func_name: expected one of {list(_METHODS)}, got {shown(method)}; this server "
                 "has no other methods of a policy"
@@ -333,8 +337,8 @@ class _Connection:
         return xpolicylab.answer(frame, {"ok": True, "latency_ms": 0.0})
 
     def _indices(self, value: Any) -> list[int]:
-        """Return the environments that `get_action_batch` names, by default those of the last
-        update.
+        """Return the environments that `get_action_batch` names, by default the environments of the
+        last update.
         """
         if value is None:
             return self._updated
@@ -352,7 +356,7 @@ class _Connection:
         """Keep the newest observations of environments until their acts.
 
         Raises:
-            MalformedMessage: An environment has two.
+            MalformedMessage: An environment has two observations.
             MessageTooLarge: The connection has too many environments.
         """
         if len(set(indices)) != len(indices):
@@ -389,7 +393,7 @@ class _Connection:
     async def _act_together(
         self, indices: list[int], frame: Frame, message: IncomingMessage, request_id: str
     ) -> bytes:
-        """Return the answer with the chunks of environments, whose acts are queued together."""
+        """Return the answer with the chunks of environments, whose requests are queued together."""
         dialect = self._dialect
         environments = self._waiting(indices)
         if message.charge is not None:
@@ -411,8 +415,8 @@ class _Connection:
         """Return the sessions of environments, with the observations that wait for an act.
 
         Raises:
-            InvalidObservation: There are none, or one has no observation.
-            MalformedMessage: One is named twice.
+            InvalidObservation: No environment is named, or a named environment has no observation.
+            MalformedMessage: An environment is named twice.
         """
         if len(set(indices)) != len(indices):
             raise MalformedMessage(f"env_idx: expected each index only once, got {shown(indices)}")
@@ -451,7 +455,7 @@ class _Connection:
 
 
 async def _decoded(observations: Sequence[_Observation]) -> list[dict[str, Any]]:
-    """Decode the images of observations: those of a message together, within its budget."""
+    """Decode the images of observations; the images of one message share its budget."""
     by_message: dict[_UpdateMessage, list[int]] = {}
     for position, observation in enumerate(observations):
         by_message.setdefault(observation.message, []).append(position)

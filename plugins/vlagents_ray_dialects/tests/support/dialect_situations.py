@@ -1,7 +1,7 @@
 """The endpoints of the dialects, for the table of `endpoint_situations`.
 
-Each connection is recorded from its first byte, but for LeRobot's: the bytes around its messages
-are those of the libraries of gRPC and Zenoh.
+Each connection is recorded from its first byte. Of LeRobot's connections only the messages are
+recorded, as the libraries of gRPC and Zenoh choose the bytes around them.
 """
 
 from __future__ import annotations
@@ -50,12 +50,14 @@ NOT_APPLICABLE: dict[str, dict[str, str]] = {
         "expired deadline": _NO_DEADLINE,
     },
     "sglang": {
-        "reset": "the protocol has none: an act begins an episode, with `reset_mask` or a prompt",
+        "reset": "the protocol has none: a request with `reset_mask` or a new prompt begins an "
+        "episode",
         "unknown session": "a session begins with its first request",
         "expired deadline": _NO_DEADLINE,
     },
     "sglang_realtime": {
-        "reset": "the protocol has none: an act begins an episode, with `reset_mask` or a prompt",
+        "reset": "the protocol has none: a request with `reset_mask` or a new prompt begins an "
+        "episode",
         "unknown session": "a session begins with its first request",
         "expired deadline": _NO_DEADLINE,
     },
@@ -79,17 +81,18 @@ NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "lerobot": {
         "metadata": "the protocol has none",
         "wrong key": _NO_KEY,
-        "expired deadline": "the deadline of a call is known to gRPC's library alone",
+        "expired deadline": "only gRPC's library knows the deadline of a call",
     },
     "lerobot_remote": {
         "wrong key": _NO_KEY,
-        "expired deadline": "the client alone knows its deadline",
-        "half a message, then close": "Zenoh's library reads the bytes, and hands on whole messages",
+        "expired deadline": "only the client knows its deadline",
+        "half a message, then close": "Zenoh's library reads the bytes, and passes on only "
+        "complete messages",
     },
 }
 
 
-# Dialects of WebSockets.
+# Dialects over WebSockets
 
 
 def _websocket(
@@ -110,15 +113,15 @@ def _websocket(
     """Describe a dialect.
 
     Args:
-        metadata: The messages that ask for it, if the server does not send it unasked.
+        metadata: The messages that request the metadata, if the server does not send them unasked.
         reset: The steps of a client that is connected; None if the protocol has no reset.
-        reset_requests: What these steps cost.
-        acts: Two messages.
-        several: The messages of a client with two observations, if they can come together.
-        several_requests: What these messages cost.
+        reset_requests: The number of requests that the reset counts as.
+        acts: Two messages with an observation.
+        several: The messages of a client with two observations, if a message can contain both.
+        several_requests: The number of requests that these messages count as.
         wrong: A message whose picture has a wrong shape.
         greets: Whether the server sends the first message, and ends the connection after an error.
-        dialect: The dialect of the endpoint, if it has another name.
+        dialect: The dialect of the endpoint, if its name differs from the endpoint's.
     """
 
     def says(*messages: bytes, who: str = "a") -> list[Steps]:
@@ -168,7 +171,7 @@ def _websocket(
         reset_cost = costs_with(reset_requests, reset)
     costs: dict[str, Cost | str] = {
         "reset": reset_cost,
-        "act": costs_with(2, says(*acts)),  # with the reset that the server adds
+        "act": costs_with(2, says(*acts)),  # The server adds a reset to the first act.
         "close": _SESSION_IS_CONNECTION,
         "several requests": several_cost,
         "malformed message": costs_with(1, says(RUBBISH)),
@@ -214,7 +217,7 @@ def _roboarena() -> Endpoint:
 
 def _vla_eval() -> Endpoint:
     def message(kind: Any, seq: int, **payload: Any) -> bytes:
-        # Without the time at which it is sent.
+        # The message without the time at which it is sent.
         return masked(vla_eval.encode(vla_eval.VlaEvalMessage(kind, payload, seq)))
 
     def observation(seq: int, picture: Any = PIXELS) -> bytes:
@@ -226,7 +229,7 @@ def _vla_eval() -> Endpoint:
             state=JOINTS,
         )
 
-    # The begin of an episode is not answered; the action after it belongs to the new episode.
+    # The beginning of an episode is not answered; the action after it belongs to the new episode.
     begin = Send("a", (websocket_frame(message("episode_start", 2)),))
     reset = [begin, asks((websocket_frame(observation(3)),))]
     return _websocket(
@@ -244,7 +247,7 @@ def _vla_eval() -> Endpoint:
 def _xpolicylab() -> Endpoint:
     def message(kind: str, message_id: str, **payload: Any) -> bytes:
         labels = {"evaluation_id": "e"}
-        # Without the time at which it is sent.
+        # The message without the time at which it is sent.
         return masked(xpolicylab.encode(xpolicylab.Frame(kind, message_id, labels, payload)))
 
     def observation(picture: Any = PIXELS, **more: Any) -> dict[str, Any]:
@@ -280,7 +283,7 @@ def _xpolicylab() -> Endpoint:
     )
 
 
-# Dialects of HTTP.
+# Dialects over HTTP
 
 
 def _openvla() -> Endpoint:
@@ -413,7 +416,7 @@ def _sglang_realtime() -> Endpoint:
     )
 
 
-# Dialects with a port of their own.
+# Dialects with their own port
 
 _GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\0" + b"NULL".ljust(20, b"\0") + bytes(32)
 _READY = (
@@ -426,7 +429,7 @@ _PING = b"\x04\x09\x04PING\0\0hi"
 
 
 def _zmtp_message(payload: bytes) -> bytes:
-    """A message of a REQ socket: an empty frame, and that of the payload."""
+    """Return a message of a REQ socket: an empty frame, and the frame of the payload."""
     if len(payload) < 256:
         return b"\x01\0" + bytes([0, len(payload)]) + payload
     return b"\x01\0" + b"\x02" + len(payload).to_bytes(8, "big") + payload
@@ -594,7 +597,9 @@ def _lerobot_remote() -> Endpoint:
     sent = remote_messages()
 
     def says(*names: str) -> list[Steps]:
-        """Messages of the client, each at the key where it sends them, with the answers."""
+        """Return the steps that send these messages, each at its Zenoh key, and expect the
+        answers.
+        """
         ends = {"describe": b"describe", "open": b"open", "observation": b"obs"}
         return asks(*((ends.get(name.split()[0], b"control"), sent[name]) for name in names))
 

@@ -1,11 +1,11 @@
-"""Recordings of the message code of SGLang, vLLM-Omni and FlashRT, for `upstream/test_engines.py`
-of the dialects.
+"""Records the messages of SGLang, vLLM-Omni and FlashRT, for `upstream/test_engines.py` of the
+dialects.
 
-`python tests/support/engine_frames.py SGLANG_WHEEL VLLM_OMNI_WHEEL FLASHRT_SERVER` runs the modules
-of two wheels that read and write messages, and FlashRT's `examples/server.py`, on a CPU and without
-a network. The model is replaced by a sum of all that it is given, and the other modules that they
-import by placeholders. SGLang's and vLLM-Omni's requests are packed by their packers. It needs
-`msgspec`, `fastapi` and `httpx`.
+`python tests/support/engine_frames.py SGLANG_WHEEL VLLM_OMNI_WHEEL FLASHRT_SERVER` runs the message
+modules of two wheels, and FlashRT's `examples/server.py`, on a CPU and without a network. A sum of
+all inputs replaces the model, and placeholders replace the other modules that are imported. The
+requests to SGLang and vLLM-Omni are packed with their own code. The script needs `msgspec`,
+`fastapi` and `httpx`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,16 @@ OWN = (
 
 
 def observed() -> tuple[dict[str, np.ndarray], np.ndarray, str]:
-    """Images by camera, the state and the prompt of each recorded request."""
+    """Return the images by camera, the state and the prompt of each recorded request."""
     rng = np.random.default_rng(7)
     images = {name: rng.integers(0, 256, (2, 2, 3), np.uint8) for name in CAMERAS}
     return images, rng.standard_normal(COLUMNS).astype(np.float32), "pick up the block"
 
 
 def answered(images: dict[str, Any], state: Any, prompt: str) -> np.ndarray:
-    """The actions for an observation, (ROWS, COLUMNS) float32, which depend on each part of it."""
+    """Return the actions for an observation, (ROWS, COLUMNS) float32, which depend on each part of
+    it.
+    """
     total = sum(
         (place + 1) * float(np.sum(images[name])) for place, name in enumerate(CAMERAS)
     ) + len(prompt)
@@ -95,7 +97,7 @@ class _Wheels(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class _Socket:
-    """The server's end of a WebSocket whose client sends some requests and then leaves."""
+    """The server's end of a WebSocket whose client sends some requests and then disconnects."""
 
     def __init__(self, requests: list[bytes], args: Any) -> None:
         self.requests, self.sent = list(requests), []

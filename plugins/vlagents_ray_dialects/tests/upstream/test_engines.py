@@ -1,8 +1,8 @@
-"""Inference engines behind `upstream`, replayed from what their own message code reads and writes
+"""Tests of inference engines behind `upstream`, replayed from recordings of their own message code
 (engines/*.json).
 
-Each recording is made by `tests/support/engine_frames.py`. A server here answers a request only if
-it is, to the byte, one that the engine's code has answered.
+`tests/support/engine_frames.py` makes the recordings. A server here answers a request only if it is
+bit-identical to a recorded one, which the engine's code has answered.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ PATHS = {
     "sglang_http": ("/v1/actions/metadata", "/v1/actions/generations"),
     "flashrt_http": ("/health", "/predict"),
 }
-STATES = {"flashrt_http": np.zeros_like(STATE)}  # FlashRT's server reads none
-# The 500 of SGLang's HTTP is not made by its own code.
+STATES = {"flashrt_http": np.zeros_like(STATE)}  # FlashRT's server reads no state
+# SGLang's own code does not produce its HTTP error 500, so it is not recorded.
 FAILING = [name for name in SETTINGS if name != "sglang_http"]
 SEEN = Obs(dict(zip(("front", "wrist"), IMAGES.values(), strict=True)), state={"joints": STATE})
 
 
 def recorded(name: str) -> tuple[bytes, dict[bytes, bytes]]:
-    """The metadata of an engine, and its answers by request."""
+    """Return the metadata of an engine, and its answers by request."""
     document = json.loads((engine_frames.FOLDER / f"{name}.json").read_text())
     requests, replies = (
         [base64.b64decode(one) for one in document[key]] for key in ("requests", "replies")
@@ -81,7 +81,7 @@ def recorded(name: str) -> tuple[bytes, dict[bytes, bytes]]:
 
 @pytest.fixture
 def replayed() -> Iterator[Callable[[str], Upstream]]:
-    """A policy whose upstream is the recording of a name."""
+    """Yield a function that returns a policy whose upstream replays the recording with a name."""
     with ExitStack() as stack:
 
         def make(name: str, *, closing: bool = False, prefix: str = "", **changes: Any) -> Upstream:
@@ -231,7 +231,7 @@ def test_a_camera_that_sglang_would_ignore_does_not_start(
 ) -> None:
     mapping = SETTINGS[name]["mapping"]
     only_front = mapping | {"cameras": {"front": mapping["cameras"]["front"]}}
-    replayed(name, mapping=only_front).initialize()  # a robot without a camera at its wrist
+    replayed(name, mapping=only_front).initialize()  # the robot has no camera at its wrist
     misspelt = mapping | {"cameras": {"front": mapping["cameras"]["front"].replace("rgb", "bgr")}}
     with pytest.raises(
         ContractMismatch,

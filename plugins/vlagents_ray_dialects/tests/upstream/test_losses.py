@@ -1,4 +1,6 @@
-"""A lost upstream, its return, a silent one: handled as a replica that is lost."""
+"""Tests of an upstream that is lost, returns, or does not answer: it is handled like a lost
+replica.
+"""
 
 from __future__ import annotations
 
@@ -144,7 +146,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
     def connect(*args: Any, **options: Any) -> Any:
         if len(refused) < 2:
             refused.append(port)
-            # As when the upstream is killed in the meantime.
+            # This is the error if the upstream is killed while the client connects.
             raise ConnectionClosedError(None, None)
         return real(*args, **options)
 
@@ -166,7 +168,7 @@ def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(
     for error in agent.act_batch([seen(0), seen(1)], acting):
         assert isinstance(error, NoReplica)
         assert f"ws://127.0.0.1:{port}" in str(error)
-    assert ability(agent, ChecksHealth) is None  # another replica would not help
+    assert ability(agent, ChecksHealth) is None  # restarting the replica would not help
 
 
 @pytest.mark.parametrize(
@@ -221,7 +223,7 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
     over = threading.Event()
 
     def kill() -> None:
-        """Twice, each when the last server has answered some more."""
+        """Kill and restart the server twice, each time after some more answers."""
         while len(servers) < 3 and not over.is_set():
             enough = len(replicas.frames) + 10
             wait_for(
@@ -258,8 +260,8 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(
 
 
 LARGE = np.zeros((2304, 3000, 3), np.uint8)
-# What a server of each protocol sends first, and the observation that it does not take; None for a
-# protocol without WebSockets.
+# The first message of a server of each protocol, and the observation that it does not read; None
+# for a protocol without WebSockets.
 DEAF: dict[str, tuple[bytes | None, dict[str, Any]]] = {
     "openpi": (openpi.encode({}), {"observation/image": LARGE, "prompt": "x"}),
     "openpi-batch": (openpi.encode({}), {"observation/image": LARGE, "prompt": "x"}),
@@ -279,7 +281,9 @@ DEAF: dict[str, tuple[bytes | None, dict[str, Any]]] = {
 def test_an_upstream_that_hardly_reads_keeps_no_act_beyond_its_time(
     protocol: str, read_bytes: int
 ) -> None:
-    """It hangs with its sockets open; a policy's thread waits for it, and with it all robots."""
+    """The upstream hangs with its sockets open. The policy's thread waits for it, and so do all
+    robots.
+    """
     greeting, observation = DEAF[protocol]
     with deaf_server(read_bytes, greeting=greeting) as port:
         url = f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}"
@@ -289,4 +293,4 @@ def test_an_upstream_that_hardly_reads_keeps_no_act_beyond_its_time(
         with pytest.raises(ConnectionLost):
             client.ask([observation])
         client.close()
-        assert time.monotonic() - begun < 5  # without a limit, at least 250 s
+        assert time.monotonic() - begun < 5  # it would take at least 250 s without a limit

@@ -1,4 +1,4 @@
-"""Our own server as the upstream, through each of its dialects."""
+"""Tests of our own server as the upstream, through each of its dialects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SGLANG = {
     "state": {"state": "state"},
     "instruction": "prompt",
 }
-# Protocol, scheme, path and mapping of each dialect of our server.
+# The protocol, scheme, path and mapping of each dialect of our server.
 UPSTREAMS: dict[str, tuple[str, str, str, str | dict[str, Any]]] = {
     "openpi": ("openpi", "ws", "/openpi", "openpi-libero"),
     "openpi-batch": ("openpi-batch", "ws", "/openpi", "openpi-libero"),

@@ -1,4 +1,6 @@
-"""Actions bit-identical to what the upstream answers to its own client, for each protocol."""
+"""Tests that actions are bit-identical to the upstream's answers to its own client, for each
+protocol.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ MAPPINGS["gr00t sim"] = MAPPINGS["gr00t"] | {
 
 
 def libero(obs: Obs, text: str) -> dict[str, Any]:
-    """As openpi's examples/libero/main.py builds it, from float32 readings."""
+    """Return an observation as openpi's examples/libero/main.py builds it, from float32
+    readings.
+    """
     return {
         "observation/image": obs.cameras["front"],
         "observation/wrist_image": obs.cameras["wrist"],
@@ -106,7 +110,7 @@ def seen(number: int) -> Obs:
 
 @pytest.fixture(scope="module")
 def ports() -> Iterator[dict[int, str]]:
-    """Two servers of each kind, by their ports."""
+    """Yield the kind of each server by its port; there are two servers of each kind."""
     kinds = {free_port(): kind for kind in sorted(DIRECT) * 2}
     with upstreams(kinds):
         yield kinds
@@ -114,7 +118,7 @@ def ports() -> Iterator[dict[int, str]]:
 
 @pytest.fixture(scope="module", params=sorted(DIRECT))
 def served(request: pytest.FixtureRequest, ports: dict[int, str]) -> tuple[str, dict[str, Any]]:
-    """A kind of server, and the settings that name two of it."""
+    """Return a kind of server, and settings with the addresses of its two servers."""
     kind = request.param
     protocol = kind.partition(" ")[0]
     urls = [

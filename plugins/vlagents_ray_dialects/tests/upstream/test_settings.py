@@ -1,4 +1,6 @@
-"""Settings, contracts that are compared with what an upstream says, and answers that are none."""
+"""Tests of settings, of contracts that are compared with an upstream's metadata, and of invalid
+answers.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,7 @@ def test_the_deployment_states_what_the_mapping_does_not_say() -> None:
     contract = {"action": {"dim": 7, "space": "joint"}, "chunk": 10}
     agent = Upstream.from_config(OPENPI | {"mapping": "openpi-droid", "contract": contract})
     assert agent.contract.action.dim == 7
-    assert agent.contract.action.gripper_open == 0  # the mapping's
+    assert agent.contract.action.gripper_open == 0  # from the mapping
     assert agent.contract.chunk == 10
     assert set(agent.contract.cameras or {}) == {"front", "wrist"}
 
@@ -131,7 +133,9 @@ Serving = Callable[..., str]
 
 @pytest.fixture
 def serving() -> Iterator[Serving]:
-    """Servers in this process, of a handler each."""
+    """Yield a function that starts a server in this process with a handler, and returns its
+    address.
+    """
     with ExitStack() as stack:
 
         def serve_with(handler: Callable[[Any], None], **options: Any) -> str:
@@ -202,7 +206,8 @@ def test_an_answer_that_is_none_is_an_error_of_ours(serving: Serving, kind: str)
 
 
 def test_connections_share_a_batch(serving: Serving) -> None:
-    # Each waits for the two others: asked in turn, they never pass.
+    # Each connection waits for the two others, so connections that are served in turn would wait
+    # forever.
     together = threading.Barrier(3, timeout=60)
 
     def answer(connection: Any) -> None:

@@ -27,7 +27,7 @@ from vlagents_ray.validation import described
 from vlagents_ray_dialects.messages import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
-TEXT_KEY = "task"  # our key of the instruction in "language", which replaces the client's
+TEXT_KEY = "task"  # our key of the instruction in the map "language"; it replaces the client's key
 _FLAT_TEXT_KEY = "annotation.human.task_description"  # the key of most of N1.5's robots
 _ARRAY_MODALITIES = ("video", "state")
 _MODALITIES = (*_ARRAY_MODALITIES, "language")
@@ -36,11 +36,11 @@ _BATCH = 256  # maximum number of observations in one message
 
 @dataclass(frozen=True, slots=True)
 class GR00TRequest:
-    """One message of a client."""
+    """The request in a message of a client."""
 
     endpoint: str  # one of ENDPOINTS
     data: dict[str, Any]
-    packed: bool  # whether its arrays have the format of msgpack_numpy
+    packed: bool  # whether the arrays of the request have the format of msgpack_numpy
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ _TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the field
 
 
 def read_token(payload: bytes | memoryview, limits: MessageLimits) -> str | None:
-    """Return the API key in a message without decoding the other fields.
+    """Return the API key in a message, without decoding the other fields.
 
     Args:
         payload: The message.
@@ -119,7 +119,7 @@ def read_request(payload: bytes | memoryview, limits: MessageLimits) -> GR00TReq
     packed = False
 
     def array(node: dict[Any, Any]) -> Any:
-        """Return the array in a map, and note whether it has the format of msgpack_numpy."""
+        """Return the array in a map, and record whether it has the format of msgpack_numpy."""
         nonlocal packed
         packed = packed or msgpack.is_packed(node)
         return _array(node, limits)
@@ -233,7 +233,8 @@ def write_actions(
 
     Args:
         actions: The actions of the B sessions by name, (H, D) each.
-        observations: The request, whose form the reply has: with or without a batch dimension.
+        observations: The observations of the request; the reply has a batch dimension if they have
+            one.
         info: Further values, which are only sent to N1.6 and newer.
 
     Returns:
@@ -349,7 +350,7 @@ def _texts(language: Any, number: int) -> list[str | None]:
 
 
 def _text(key: Any, value: Any) -> str:
-    """Return an instruction; of a list over time, the newest one."""
+    """Return an instruction; for a list over time, return the newest instruction."""
     while isinstance(value, list) and value:
         value = value[-1]
     if not isinstance(value, str):
@@ -357,11 +358,9 @@ def _text(key: Any, value: Any) -> str:
     return value
 
 
-# Arrays in the format of most of GR00T's clients: .npy files.
-#
-# The header of a file is matched, not evaluated, and must agree with the size of the content, so
-# that no memory is allocated for a false shape. Arrays of text become lists; arrays of objects and
-# structures are rejected.
+# Arrays in the format of most of GR00T's clients: .npy files. The header of a file is matched, not
+# evaluated, and its shape must agree with the size of the content before memory is allocated.
+# Arrays of text become lists; arrays of objects and structures are rejected.
 
 _NPY = b"\x93NUMPY"
 # The header that numpy writes for every plain array; other headers (structures, objects) are
@@ -449,19 +448,18 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-# The client's side of GR00T's protocol: writing requests, and reading replies within limits.
-#
-# N1.5's clients send flat keys and receive only the action; clients of N1.6 and newer send
+# The client's side of GR00T's protocol: writing requests, and reading replies within limits. N1.5's
+# clients send flat keys and receive only the action; clients of N1.6 and newer send
 # `{"observation": {...}, "options": None}` and receive `[action, info]`. The observation is nested,
 # or flat for servers that run with `--use-sim-policy-wrapper`. A server that marks its modalities
-# with `__ModalityConfig__` reads arrays of `msgpack_numpy`.
+# with `__ModalityConfig__` accepts arrays in the format of `msgpack_numpy`.
 
 _KEYS_AT_MOST = 64
 _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
 
 
 def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str, Any]:
-    """Stack observations of one moment each into a batch.
+    """Stack observations, each of one time step, into a batch.
 
     Args:
         observations: For each, {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language":
@@ -549,7 +547,8 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
         For each observation, the actions by name, (H, D) each.
 
     Raises:
-        MalformedMessage: The reply is not a map of arrays, or has another number of actions.
+        MalformedMessage: The reply is not a map of arrays, or its number of actions differs from
+            `number`.
     """
     actions = reply[0] if isinstance(reply, list) and len(reply) == 2 else reply
     if not isinstance(actions, dict) or not actions:
@@ -574,8 +573,8 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
 
 
 def reads_packed(reply: Any) -> bool:
-    """Return whether the reply to `get_modality_config` is from a server that reads arrays of
-    `msgpack_numpy`.
+    """Return whether the reply to `get_modality_config` is from a server that accepts arrays in the
+    format of `msgpack_numpy`.
     """
     if not isinstance(reply, dict):
         return False

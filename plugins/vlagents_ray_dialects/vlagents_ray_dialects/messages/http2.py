@@ -6,14 +6,15 @@ from __future__ import annotations
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _HEAD_BYTES = 9
-_SIZE_BYTES = 3  # the size of the payload has this many bytes, at the begin of a head
-# The cost of a frame with a larger payload is the cost of its bytes. Clients send messages in
-# frames of 16 KiB.
+# The number of bytes at the beginning of a frame's head that contain the size of the payload.
+_SIZE_BYTES = 3
+# Frames with a larger payload are not counted, since the limits of bytes cover them. Clients send
+# messages in frames of 16 KiB.
 _SMALL_BYTES = 4096
 _TYPE = 3  # index of the type of a frame in its head
 _CANCELLATION = 3  # RST_STREAM, the type of a frame that cancels a request
-# A robot cancels a request only after a timeout. A request that is begun and cancelled costs its
-# sender 30 bytes, and gRPC's server the begin and the end of a call.
+# A robot cancels a request only after a timeout. Beginning and cancelling a request costs its
+# sender 30 bytes, and costs gRPC's server the beginning and the end of a call.
 _FRAMES_OF_A_CANCELLATION = 8
 
 
@@ -22,7 +23,8 @@ class FrameCounter:
 
     A cancellation counts as `_FRAMES_OF_A_CANCELLATION`. Control frames (PING, SETTINGS,
     WINDOW_UPDATE), begun and cancelled requests, and messages in tiny pieces are all small frames.
-    A small frame costs its sender a few bytes, and gRPC's library as much as a new connection.
+    A small frame costs its sender a few bytes, but costs gRPC's library as much as a new
+    connection.
     """
 
     def __init__(self) -> None:
@@ -30,7 +32,9 @@ class FrameCounter:
         self._missing_bytes = 0  # the bytes of the current frame's payload that have not arrived
 
     def count(self, data: bytes) -> int:
-        """Return the number of small frames whose heads end in the next bytes of a client."""
+        """Return the number of small frames whose heads are completed by the next bytes of a
+        client.
+        """
         small_frames = 0
         start = 0
         while start < len(data):

@@ -43,8 +43,8 @@ _REQUESTS: Mapping[Name, Sequence[str]] = {
     ),
     OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
 }
-_STEPS = 2**31  # time steps are below this, so that they fit into a pickle's plain integers
-_SHOWN = 40  # largest number of a client's keys in an error, and of the characters of each
+_STEPS = 2**31  # upper limit of time steps, so that they fit into a pickle's plain integers
+_SHOWN = 40  # maximum number of a client's keys in an error, and of characters of each key
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class RobotObservation:
     timestamp: float  # the client's clock, s since 1970
     timestep: int  # the number of the last action that the client executed
     values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
-    must_go: bool  # whether the client has no actions left
+    must_go: bool  # whether the client has no action left
 
 
 def read_instructions(data: Buffer, limits: MessageLimits) -> PolicyInstructions:
@@ -195,7 +195,8 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
                     f"{name[:_SHOWN]!r}: expected a number, got {_shown(value)}"
                 )
             numbers.append(value)
-        with np.errstate(over="ignore"):  # too large numbers become infinite, as in LeRobot
+        # Numbers that are too large become infinite, as in LeRobot.
+        with np.errstate(over="ignore"):
             frame_values[STATE] = np.array(numbers, np.float64).astype(np.float32)
 
     for name in robot.cameras:
@@ -211,9 +212,8 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
 def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
     """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
 
-    The pickle has the form that LeRobot's server writes, except that each tensor is a call of
-    `torch.tensor` with its float32 numbers. So this process needs no torch, and the pickle contains
-    no archive.
+    The pickle has the form of LeRobot's own, except that each tensor is a call of `torch.tensor`
+    with its float32 numbers. So this process needs no torch, and the pickle contains no archive.
 
     Args:
         rows: The chunk, (H, D) float32.
@@ -299,7 +299,7 @@ _VARINT_BYTES = 10  # largest length of a number, bytes
 
 
 class TransferState(enum.IntEnum):
-    """The position of a piece in its message."""
+    """The position of a piece in an observation that is sent in several pieces."""
 
     BEGIN = 1
     MIDDLE = 2
@@ -355,9 +355,7 @@ EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
 
 
 def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
-    """Yield the number and the value of each field that is a number or bytes; other fields are
-    skipped.
-    """
+    """Yield the field number and the value of each integer or bytes field; skip other fields."""
     view = memoryview(message)
     offset = 0
     while offset < len(view):
@@ -388,8 +386,8 @@ def _varint(view: memoryview, offset: int) -> tuple[int, int]:
     raise MalformedMessage("protobuf: a number that ends too early")
 
 
-# The mapping of LeRobot's robots: the names of LeRobot's datasets, to which its own server converts
-# the names of a robot.
+# The mapping of LeRobot's robots. It reads the names of LeRobot's datasets, to which LeRobot's own
+# server also converts the names of a robot.
 
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 

@@ -2,8 +2,8 @@
 images are records.
 
 LeRobot's modules `remote_inference/{protocol,codec,chunk_contract}.py` (commits 0c72316c, 91f903c8)
-define the format. A message has an instance, a session, a generation and a request, which its reply
-repeats; a client discards a reply of any other request.
+define the format. A message has the ids of an instance, a session, a generation and a request,
+which its reply repeats; a client discards a reply to any other request.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ MessageType = Literal[
     "language_result",
     "error",
 ]
-# Those that belong to a session, and therefore need all ids.
+# Types of messages that belong to a session, and therefore need all ids.
 _OF_A_SESSION = ("control", "ack", "observation", "action", "language_request", "language_result")
 # The values of an observation that its action repeats.
 IDENTITY = ("artifact_identity", "observation_id", "capture_time", "task", "task_version")
-# What a client may ask for beyond chunks one after another: that the robot merges them by the
-# observations that they belong to (two versions), and blends their rows.
+# The optional ways in which a robot merges chunks: aligned by the observations to which the chunks
+# belong (two versions), and with blended rows.
 MERGES = ("chunk_alignment_v1", "chunk_alignment_v2", "chunk_blending_v1")
 
 _ENVELOPE = (
@@ -63,7 +63,8 @@ _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}\Z")
 _RECORD = "__lerobot_type__"
 _INTEGERS = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64")
 _DTYPES = frozenset(["bool", *_INTEGERS, "float16", "float32", "float64"])
-_ERROR_CHARACTERS = 2048  # number of characters of an error's text, as LeRobot's own server has
+# Maximum number of characters of an error's text, as in LeRobot's own server.
+_ERROR_CHARACTERS = 2048
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +86,11 @@ class Envelope:
 class _JpegImage(bytes):
     """A JPEG image in a message, which is not decoded yet."""
 
-    shape: tuple[int, ...]  # that the message states
+    shape: tuple[int, ...]  # the shape that the message declares
 
 
 def is_segment(text: object) -> bool:
-    """Return whether a value may be a part of a key: the name of a deployment, or an id."""
+    """Return whether a value may be part of a Zenoh key, as the name of a deployment or an id."""
     return isinstance(text, str) and _SEGMENT.match(text) is not None
 
 
@@ -153,7 +154,7 @@ def decode_images(values: Mapping[str, Any], budget: Budget) -> dict[str, Any]:
         The features by name; images are (H, W, 3) uint8 RGB.
 
     Raises:
-        MalformedMessage: An image cannot be decoded, or has another size than it states.
+        MalformedMessage: An image cannot be decoded, or its size differs from the declared shape.
         MessageTooLarge: The images exceed a limit.
     """
     names = [name for name, value in values.items() if isinstance(value, _JpegImage)]
@@ -162,7 +163,7 @@ def decode_images(values: Mapping[str, Any], budget: Budget) -> dict[str, Any]:
     for name, image in zip(names, images, strict=True):
         if image.shape != values[name].shape:
             raise MalformedMessage(
-                f"{name}: expected the shape {values[name].shape} that the record states, got "
+                f"{name}: expected the shape {values[name].shape} that the record declares, got "
                 f"{image.shape}"
             )
         decoded[name] = image
@@ -184,7 +185,7 @@ def encode(envelope: Envelope) -> bytes:
 
 
 def error_body(error: VLAgentsError) -> dict[str, Any]:
-    """Return the body of the message with an error; its code is one of LeRobot's."""
+    """Return the body of the message with an error, whose code is one of LeRobot's."""
     code = "execution"
     if isinstance(error, (StaleMessage, IncompatibleRequest, UnsupportedRequest)):
         code = error.code
@@ -206,13 +207,13 @@ class StaleMessage(MalformedMessage):
 
 
 class IncompatibleRequest(MalformedMessage):
-    """The client's robot, or its observation, is another one than this deployment's."""
+    """The client's robot, or its observation, does not match the features of this deployment."""
 
     code = "incompatible"
 
 
 class UnsupportedRequest(MalformedMessage):
-    """The client asks for what this deployment does not offer."""
+    """The client requests something that this deployment does not offer."""
 
     code = "unsupported"
 

@@ -28,10 +28,10 @@ def unpack(
     Args:
         data: The message.
         limits: The limits of its size, its number of values and their nesting.
-        hook: Receives each map, innermost first, and returns the value that replaces it; the keys
-            of a map that it returns must be text. Values of a list that it returns, such as an
-            array of text, also count; the hook itself limits them to `limits.items`.
-        text: Largest size of one text, bytes; None if the limit of the message is enough.
+        hook: Receives each map, innermost first, and returns the value that replaces it. The keys
+            of a returned map must be text. The values of a returned list, such as an array of text,
+            also count towards the limit; the hook itself limits them to `limits.items`.
+        text: Maximum size of one text, bytes; None if only the size of the message is limited.
 
     Returns:
         The value in the message.

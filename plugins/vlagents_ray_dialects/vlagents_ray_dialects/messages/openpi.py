@@ -49,7 +49,9 @@ def encode(value: Any) -> bytes:
 
 
 def _array(node: dict[Any, Any], most: int) -> Any:
-    """Return the array or number in a map, or the map itself; an array has at most `most` texts."""
+    """Return the array or number in a map, or the map itself; an array of text may have at most
+    `most` texts.
+    """
     if b"__ndarray__" in node:
         data, dtype, shape = node.get(b"data"), node.get(b"dtype"), node.get(b"shape")
         if isinstance(dtype, str) and dtype.startswith("<U") and isinstance(data, bytes):
@@ -109,11 +111,9 @@ def _node(value: Any) -> Any:
     )
 
 
-# Mappings of openpi's example clients, and of RoboArena's.
-#
-# openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see
-# `_parse_image` in its src/openpi/policies/libero_policy.py and droid_policy.py, and
-# `convert_image` in aloha_policy.py.
+# Mappings of the example clients of openpi, and of RoboArena's client. openpi's servers accept
+# images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see `_parse_image` in openpi's
+# src/openpi/policies/libero_policy.py and droid_policy.py, and `convert_image` in aloha_policy.py.
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openpi, examples/libero/main.py
@@ -151,7 +151,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 ROBOARENA: dict[str, dict[str, Any]] = {
-    # openpi's DROID keys, but the camera numbers begin with 0
+    # The keys are those of openpi's DROID client, but the camera numbers begin with 0.
     "roboarena": PRESETS["openpi-droid"]
     | {
         "cameras": {

@@ -27,10 +27,10 @@ def decode(body: bytes, limits: MessageLimits = DEFAULT_LIMITS) -> tuple[dict[st
         limits: The limits of its size and content.
 
     Returns:
-        The observation, and whether it was encoded twice.
+        The observation, and whether the body was encoded twice.
 
     Raises:
-        MalformedMessage: The body is not such a request.
+        MalformedMessage: The body is not a request in this format.
         MessageTooLarge: The body exceeds a limit.
     """
     if len(body) > limits.body_bytes:
@@ -54,7 +54,7 @@ def encode(
 
     Args:
         value: The action, as an array or a list of rows, or the observation.
-        twice: Whether it is encoded twice.
+        twice: Whether the body is encoded twice.
     """
     text = json_numpy.dumps(value)
     return (json.dumps(text) if twice else text).encode()

@@ -1,8 +1,10 @@
-"""Converts our observation to another system's, and its actions to ours: a `KeyMapping` in reverse.
+"""Converts our observation to another system's format, and the other system's actions to ours: a
+`KeyMapping` in reverse.
 
-Each entry of a mapping is then the destination of a value. The vectors of several entries with the
-same key are joined according to their `start` and `stop`. Of alternatives `a|b` the first key is
-used. The `*` of a name matches all cameras or states that no other entry names.
+In reverse, the key of each entry of a mapping is the destination of a value. The vectors of several
+entries with the same key are joined according to their `start` and `stop`. If an entry has
+alternatives `a|b`, the first key is used. The `*` of a name matches all cameras or states that no
+other entry names.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ _MOST = 4096  # largest number of elements of a joined vector
 class Outgoing:
     """A mapping in reverse.
 
-    Raises:
-        ConfigError: A state has several parts without `stop`, so that their lengths are unknown.
+    Raises: ConfigError: A state has several parts without `stop`, so that their lengths are
+    unknown.
     """
 
     mapping: KeyMapping
@@ -51,7 +53,7 @@ class Outgoing:
                 )
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
-        """Convert an observation to the other system's.
+        """Convert an observation to the other system's format.
 
         Args:
             obs: The observation.
@@ -87,7 +89,7 @@ class Outgoing:
         return theirs
 
     def rows(self, theirs: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
-        """Convert the other system's actions to ours.
+        """Convert the other system's actions to our format.
 
         Args:
             theirs: The actions, (D,) or (H, D), or several such arrays by name.
@@ -118,7 +120,9 @@ class Outgoing:
             )
         if len({arrays[name].shape[:-1] for name in ranges}) != 1:
             shapes = {name: arrays[name].shape for name in ranges}
-            raise InvalidAction(f"action: expected the same number of rows in all, got {shapes}")
+            raise InvalidAction(
+                f"action: expected the same number of rows in all arrays, got {shapes}"
+            )
 
         pieces = []
         for name, columns in ranges.items():
@@ -172,8 +176,8 @@ class Outgoing:
         )
 
     def _has_separate_gripper(self) -> bool:
-        """Return whether the gripper has a number of its own; otherwise its number is part of a
-        state, which sets it.
+        """Return whether the gripper has a separate number; if not, a state of the observation sets
+        it.
         """
         gripper = self.mapping.gripper
         if gripper is None:
@@ -223,7 +227,9 @@ class Outgoing:
         return vectors
 
     def _put(self, theirs: dict[str, Any], key: str, value: Any) -> None:
-        """Set a value in `theirs`, or in its map that a nested key names."""
+        """Set a value in `theirs`, or, for a nested key, in the map within `theirs` that the key
+        names.
+        """
         key = _first(key)
         target = theirs
         if self.is_nested(key):
@@ -234,7 +240,7 @@ class Outgoing:
 
 
 def _first(key: str) -> str:
-    """Return the first of the alternatives of a key."""
+    """Return the first alternative of a key."""
     return key.partition("|")[0]
 
 
@@ -249,7 +255,7 @@ def _matching(
     """Return the keys and values of one entry.
 
     Args:
-        name: The name of the entry; a `*` matches all values without an entry of their own.
+        name: The name of the entry; a `*` matches all values that no other entry names.
         key: The key of the entry, in which `*` is replaced.
         values: The values of the observation by name.
         entries: All entries of the mapping by name.
@@ -287,7 +293,7 @@ def _split(
     if is_mismatch:
         raise InvalidObservation(
             f"state {name!r}: got {vector.size} numbers, the mapping says {known_width}; change "
-            "one of them"
+            f"one of them"
         )
 
     pieces = []
@@ -325,7 +331,7 @@ def _joined(
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:
-    """Return an array of actions as float32; raise `InvalidAction` if it is none."""
+    """Return an array of actions as float32; raise `InvalidAction` for any other value."""
     is_numeric = isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
     if not is_numeric or not 0 < value.ndim <= 2:
         raise InvalidAction(f"{name!r}: expected (D,) or (H, D) numbers, got {described(value)}")

@@ -1,5 +1,5 @@
-"""Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or
-imported.
+"""A reader of pickles with a few known structures. It reads opcodes as data: nothing is unpickled,
+looked up or imported.
 
 A pickle is a program for a stack machine, and its dangerous opcodes import and call any name in it.
 This reader has no such opcode: a pair of module and name is compared, as text, with the closed
@@ -26,8 +26,8 @@ from vlagents_ray.protocol.frame_layout import Buffer, read_array
 from vlagents_ray.protocol.messages import MessageLimits
 
 _PROTOCOLS = (4, 5)
-_INTEGER = 9  # largest number of bytes of an integer
-_SHOWN = 60  # largest number of characters of a client's text in an error
+_INTEGER = 9  # maximum size of an integer, bytes
+_SHOWN = 60  # maximum number of characters of a client's text in an error
 
 
 class Name(NamedTuple):
@@ -39,7 +39,7 @@ class Name(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Record:
-    """An object of a data class, known only by name and fields."""
+    """An object of a data class, of which only the name of the class and the fields are read."""
 
     name: Name
     fields: dict[str, Any] | None = None  # None until they are read
@@ -54,8 +54,8 @@ class Reduced:
 
 
 Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
-"""A function that returns the value of a call in a pickle, given its arguments; it raises
-`MalformedMessage` for invalid arguments.
+"""A function that returns the value of a call in a pickle, given the arguments of the call; it
+raises `MalformedMessage` for invalid arguments.
 """
 
 
@@ -80,8 +80,8 @@ def read_pickle(
         limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts
             (`text`).
         records: The data classes that may occur, with the names of their fields.
-        calls: The functions that may occur, with our replacements; None for a class that is only an
-            argument.
+        calls: Our replacement of each function that may occur; None for a class that may only occur
+            as an argument.
 
     Returns:
         The object, in which an object of a data class is a `Record`.
@@ -112,8 +112,8 @@ def fields_of(value: Any, class_name: Name) -> dict[str, Any]:
 
 
 class _StackMachine:
-    """A stack machine for the opcodes of a pickle, without calls; the arguments are those of
-    `read_pickle`.
+    """A stack machine that executes the opcodes of a pickle, without calls; its arguments are those
+    of `read_pickle`.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class _StackMachine:
         self._records = records
         self._calls = calls
 
-        self._items = 0  # the number of values so far
+        self._items = 0  # the number of values that have been pushed
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
@@ -165,7 +165,7 @@ class _StackMachine:
         return data
 
     def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
-        """Push a value with the levels of containers and the number of values in it."""
+        """Push a value, together with its levels of containers and its number of values."""
         if depth > self._limits.depth:
             raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
         self._stack.append(_StackValue(value, depth, items))
@@ -220,7 +220,7 @@ class _StackMachine:
         self._stack.append(entry)
 
     def tuple_of(self, entries: Sequence[_StackValue]) -> None:
-        """Push a tuple of the values of entries."""
+        """Push a tuple with the values of these entries."""
         values = tuple(_finished(entry.value) for entry in entries)
         items = 1 + sum(entry.items for entry in entries)
         self.push(values, _above(entries), items)
@@ -333,7 +333,9 @@ def _above(entries: Sequence[_StackValue]) -> int:
 
 
 def _finished(value: Any) -> Any:
-    """Return a value on the stack in its stored form: in place of a `Reduced`, its object."""
+    """Return a value on the stack; if it is a `Reduced`, return the object that the call
+    created.
+    """
     if not isinstance(value, Reduced):
         return value
     if value.value is None:
@@ -362,7 +364,7 @@ _F8 = struct.Struct(">d")
 def _number(
     form: struct.Struct, then: Callable[[_StackMachine, Any], None]
 ) -> Callable[[_StackMachine], None]:
-    """Return a function that executes an opcode: it reads a number, and passes it to `then`."""
+    """Return a function that executes an opcode by reading a number and passing it to `then`."""
     return lambda machine: then(machine, form.unpack(machine.take(form.size))[0])
 
 
@@ -372,7 +374,7 @@ def _bytes(machine: _StackMachine, length: int) -> None:
 
 
 def _fixed(value: Any) -> Callable[[_StackMachine], None]:
-    """Return a function that executes an opcode: it pushes a fixed value."""
+    """Return a function that executes an opcode by pushing a fixed value."""
     return lambda machine: machine.push(value)
 
 
@@ -413,9 +415,8 @@ _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
 }
 
 
-# numpy's arrays, types and numbers in a pickle: the calls in numpy's own pickles.
-#
-# Based on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
+# Replacements of the calls with which numpy pickles its arrays, types and numbers. They are based
+# on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
 # structures, and big-endian arrays, are rejected.
 
 
@@ -434,7 +435,7 @@ def _dtype(arguments: tuple[Any, ...]) -> Reduced:
 
 
 def _ordered_dtype(code: str, state: Any) -> _Dtype:
-    """Return a type with the byte order in its state."""
+    """Return a type with the byte order that its state specifies."""
     match state:
         case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
             return _Dtype(order + code)
@@ -445,8 +446,8 @@ def _ordered_dtype(code: str, state: Any) -> _Dtype:
 
 
 def _array(arguments: tuple[Any, ...]) -> Reduced:
-    """Read `_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by
-    columns, data).
+    """Read `_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, is_column_major,
+    data).
     """
     match arguments:
         case (Name("numpy", "ndarray"), (int(0),), memoryview() as code) if bytes(code[:2]) == b"b":
@@ -471,7 +472,7 @@ def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
         case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
             return Reduced(value=_ordered(data, dtype, shape, order == "F"))
     raise MalformedMessage(
-        "pickle: numpy: expected an array by rows; send numpy.ascontiguousarray of it"
+        "pickle: numpy: expected an array in row-major order; send numpy.ascontiguousarray of it"
     )
 
 
@@ -485,7 +486,7 @@ def _scalar(arguments: tuple[Any, ...]) -> int | float:
 
 
 def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:
-    """Return the array whose numbers are stored by rows or by columns."""
+    """Return the array with these bytes, which are in row-major or column-major order."""
     if by_columns:
         return read_array(data, str(dtype), shape[::-1]).T
     return read_array(data, str(dtype), shape)

@@ -1,9 +1,8 @@
 """The part of RPyC's protocol for a service with text arguments and results; based on rpyc 6.0.
-
-RPyC allows a peer to access attributes of the server's objects, to call them, and to pass objects
-that the server calls back. This reader supports none of that: it identifies the root and its
-methods by number, and accepts only values without references. A peer can therefore only call the
-methods that the server offers.
+RPyC allows a peer to access attributes of the server's objects, to call these objects, and to pass
+objects that the server calls back. This reader supports none of that: it identifies the root and
+its methods by number, and accepts only values without references. A peer can therefore only call
+the methods that the server offers.
 
 A frame consists of a header (length, compressed?), a message and a newline. A message consists of
 its type and one value, encoded in "brine": `(sequence number, content)`.
@@ -26,14 +25,14 @@ ROOT = 0  # the number of the root; the numbers of its methods follow
 _ROOT_NAME = ("vlagents_ray.Policy", 1, 1)
 _METHOD_CLASS = "builtins.method"  # peers do not inspect an object of this class
 _METHODS_AT_MOST = 64
-_COMPRESS_OVER = 3000  # longer messages are compressed, as by RPyC, bytes
+_COMPRESS_OVER = 3000  # minimum size of a message that is compressed, bytes, as in RPyC
 _REQUEST, _REPLY, _EXCEPTION = 1, 2, 3  # types of messages
-# Labels of boxed values; a local one is an object of the receiver.
+# Labels of boxed values. A local reference refers to an object of the receiver.
 VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4
 
 
 class Handler(IntEnum):
-    """The operations that a peer may request; all others of RPyC would access objects."""
+    """The operations that a peer may request; all other operations of RPyC would access objects."""
 
     PING = 1
     CLOSE = 2
@@ -191,7 +190,7 @@ def read_reply(
         exception), and its content; None if the message is a request.
     """
     message = _message(body, compressed, limit)
-    # Nothing is offered to a server, so its requests are not answered.
+    # A server is offered no methods, so its requests are not answered.
     if message[0] not in (_REPLY, _EXCEPTION):
         return None
     content = read_brine(message[1:])
@@ -243,7 +242,7 @@ def _unbox(boxed: Any) -> Any:
         is_method = value[:2] == (_METHOD_CLASS, 2)
         if is_method and _is_int(number) and 0 < number < _METHODS_AT_MOST:
             return Reference(number)
-    raise MalformedMessage("rpyc: objects are not taken here; send values")
+    raise MalformedMessage("rpyc: objects are not accepted here; send values")
 
 
 def _is_int(value: object) -> bool:
@@ -252,13 +251,12 @@ def _is_int(value: object) -> bool:
 
 
 # Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; based
-# on rpyc 6.0.
-#
-# Its other types (slices, sets, complex numbers, …) are rejected, since no client needs them here.
+# on rpyc 6.0. The other types of brine (slices, sets, complex numbers, …) are rejected, since no
+# client needs them here.
 
 _DEPTH = 16  # largest number of levels of nesting
 _ITEMS = 1024  # largest number of values in a message
-_DIGITS = 20  # largest length of an integer, including its sign
+_DIGITS = 20  # maximum number of characters of an integer, including its sign
 _F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
 
 
@@ -269,7 +267,7 @@ def read_brine(data: memoryview) -> Any:
         data: The encoded value, and nothing else.
 
     Raises:
-        MalformedMessage: The data are not such a value.
+        MalformedMessage: The data are not exactly one value in brine.
         MessageTooLarge: The value is nested too deeply, or has too many values.
     """
     return _BrineReader(data).all()
@@ -307,7 +305,7 @@ class _BrineReader:
     def __init__(self, data: memoryview) -> None:
         self._data = data
         self._offset = 0  # offset of the next byte
-        self._items = 0  # the number of values so far
+        self._items = 0  # the number of values that have been read
 
     def all(self) -> Any:
         """Return the value, which must be the only one."""

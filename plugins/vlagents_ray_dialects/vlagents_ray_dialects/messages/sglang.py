@@ -27,18 +27,18 @@ MSGPACK, JSON = "application/msgpack", "application/json"
 
 _IMAGE_PREFIX = "observation.images."
 _BASE64_KEYS = ("b64_json", "base64")  # base64 keys of an image that is a JPEG or PNG file
-_VALUE_KEYS = ("values", "data")  # value keys of an array that is written as a list
+_VALUE_KEYS = ("values", "data")  # value keys of a map with an array that is written as a list
 _DTYPES = {name: np.dtype(name) for name in ("uint8", "int32", "int64", "float32", "float64")}
 
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """How a client requests its answer.
+    """The form in which a client requests its answer.
 
     Attributes:
-        is_raw: Whether it is the actions alone, instead of SGLang's envelope.
+        is_raw: Whether the answer contains only the actions, without SGLang's envelope.
         as_arrays: Whether actions are arrays, which only msgpack has, instead of lists.
-        with_timings: Whether it has the server's times.
+        with_timings: Whether the answer has the server's times.
     """
 
     is_raw: bool
@@ -48,18 +48,19 @@ class AnswerForm:
 
 @dataclass(frozen=True, slots=True)
 class GenerationRequest:
-    """The observations of one or several robots, each of which gets a chunk of actions.
+    """The observations of one or several robots; the answer has a chunk of actions for each robot.
 
     Attributes:
         observations: The observation of each robot: `images`, `state`, `prompt`, `parameters`, and
-            whatever else the client sends.
-        is_batch: Whether the client sends several observations together, perhaps only one of them.
+            any other fields of the client.
+        is_batch: Whether the request has the form of a batch, which may contain only one
+            observation.
         session_names: The session of each robot; empty if the client names none.
         begins_episode: Whether the episode of each robot begins with its observation.
-        horizon: Number of rows that the client requests of each chunk; None for all.
-        width: Number of values of each row that the client expects; None for any.
-        request_id: Id that the client gave the request; None if it gave none.
-        form: How the client requests its answer.
+        horizon: Number of rows of each chunk that the client requests; None for all rows.
+        width: Number of values that the client expects in each row; None for any number.
+        request_id: The client's id of the request; None if the request has none.
+        form: The form of the answer.
     """
 
     observations: list[dict[str, Any]]
@@ -98,13 +99,14 @@ def read_request(payload: Mapping[str, Any], media_type: str, budget: Budget) ->
 
     Args:
         payload: The request, as `decode` returns it.
-        media_type: That of the answer, which decides whether actions are arrays by default.
+        media_type: The media type of the answer, which determines whether actions are arrays by
+            default.
         budget: Counts the decoded images; raises an error beyond its limits.
 
     Raises:
         MalformedMessage: A part of the request has another form.
-        InvalidObservation: The observations of a batch have different lengths, or the request has
-            something that no policy here uses.
+        InvalidObservation: The observations of a batch have different lengths, or the request has a
+            field that no policy here uses.
         MessageTooLarge: An image exceeds a limit, or there are too many observations.
     """
     parameters = _map(payload, "parameters")
@@ -181,7 +183,7 @@ def answer(
     """Return the answer to a request, for `encode`.
 
     Args:
-        chunks: The actions for each observation, (H, D) float32, all of one shape.
+        chunks: The actions for each observation, (H, D) float32, all with the same shape.
         request: The request.
         request_id: The id of the request.
         model: The name of the policy.
@@ -190,7 +192,7 @@ def answer(
     form = request.form
 
     def written(values: np.ndarray) -> np.ndarray | list[Any]:
-        """Return actions as the client reads them."""
+        """Return actions in the form that the client requests."""
         return values if form.as_arrays else values.tolist()
 
     body: dict[str, Any]
@@ -198,8 +200,8 @@ def answer(
         actions = np.stack(chunks) if request.is_batch else chunks[0]
         body = {"request_id": request_id, "actions": written(actions)}
     else:
-        # RLinf reads the first entry alone, and expects the actions of all its environments in it:
-        # SGLang's layout before commit 0350f48.
+        # RLinf reads only the first entry, and expects it to contain the actions of all
+        # environments: this was SGLang's layout before commit 0350f48.
         is_stacked = request.is_batch and bool(request.session_names)
         entries = [np.stack(chunks)] if is_stacked else list(chunks)
         horizon, width = chunks[0].shape
@@ -232,7 +234,9 @@ def encode(value: Mapping[str, Any], media_type: str) -> bytes:
 def _entry(
     index: int, values: np.ndarray, written: Callable[[np.ndarray], np.ndarray | list[Any]]
 ) -> dict[str, Any]:
-    """Return the entry of an envelope with the actions of one observation, or of all of them."""
+    """Return the entry of an envelope with the actions of one observation, or of all
+    observations.
+    """
     return {
         "index": index,
         "input_index": index,
@@ -257,7 +261,7 @@ def _map(payload: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def _observation(payload: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the observation of a request, with SGLang's other names of its parts replaced:
+    """Return the observation of a request, after replacing SGLang's alternative names:
     `observation.images.NAME`, `observation.state`, `task`.
     """
     if "input" in payload:
@@ -310,12 +314,13 @@ def _decode_images(observation: dict[str, Any], budget: Budget) -> None:
 
 
 def _plain_array(value: Any, name: str, *, pixels: bool = False) -> Any:
-    """Return an array that is written as a list, or as a map with one; any other value as it is.
+    """Return an array that is written as a list, or as a map with a list; return any other value
+    unchanged.
 
     Args:
         value: The value.
         name: The name of the value in errors.
-        pixels: Whether whole numbers are pixels, which are uint8.
+        pixels: Whether integers are pixels, which are returned as uint8.
     """
     dtype, shape = None, None
     if isinstance(value, dict):
@@ -345,12 +350,12 @@ def _plain_array(value: Any, name: str, *, pixels: bool = False) -> Any:
 
 
 def _each(observation: Mapping[str, Any], size: int, budget: Budget) -> list[dict[str, Any]]:
-    """Return the observations of a batch, whose arrays and lists have one row for each.
+    """Return the observations of a batch, whose arrays and lists have one row for each observation.
 
     Args:
         observation: All observations together.
         size: The number of observations.
-        budget: Limits their number.
+        budget: Limits the number of observations.
     """
     if not 1 <= size <= budget.limits.requests:
         raise MessageTooLarge(
@@ -360,7 +365,7 @@ def _each(observation: Mapping[str, Any], size: int, budget: Budget) -> list[dic
 
 
 def _one(node: Mapping[Any, Any], index: int, size: int, path: str) -> dict[str, Any]:
-    """Return the part of one robot of a map with the values of all robots."""
+    """Return the values of one robot from a map with the values of all robots."""
     one: dict[str, Any] = {}
     for key, value in node.items():
         name = f"{path}{_short(key)}"
@@ -383,7 +388,7 @@ def _short(key: object) -> str:
 
 
 def _session_names(parameters: Mapping[str, Any]) -> list[str]:
-    """Return the names of sessions in a request; empty without any."""
+    """Return the names of the sessions in a request; an empty list if the request has none."""
     names = parameters.get("session_ids")
     if names is None:
         return []
@@ -416,7 +421,7 @@ def _begins_episode(parameters: Mapping[str, Any], size: int) -> list[bool]:
 
 
 def _size(parameters: Mapping[str, Any], observation: Mapping[str, Any], name: str) -> int | None:
-    """Return a number of rows or values that the client requests; None if it states none."""
+    """Return a number of rows or values that the client requests; None if the request has none."""
     size = parameters.get(name, observation.get(name))
     if size is None:
         return None
@@ -426,7 +431,9 @@ def _size(parameters: Mapping[str, Any], observation: Mapping[str, Any], name: s
 
 
 def _request_id(payload: Mapping[str, Any]) -> str | None:
-    """Return the client's id of the request; None if there is none that may be logged."""
+    """Return the client's id of the request; None if it has none, or one that must not be
+    logged.
+    """
     for key in ("request_id", "id"):
         name = payload.get(key)
         if isinstance(name, str) and name and is_name(name):
@@ -440,7 +447,7 @@ def _form(
     observation: Mapping[str, Any],
     media_type: str,
 ) -> AnswerForm:
-    """Return how a client requests its answer."""
+    """Return the form in which a client requests its answer."""
     runtime = _map(payload, "runtime")
     response_format = runtime.get("response_format", "envelope")
     if not isinstance(response_format, str) or response_format not in ("envelope", "raw"):
@@ -472,13 +479,13 @@ def _form(
 # Mappings of clients of `/v1/actions`.
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # SGLang's own names: cameras and state are called as the client calls them.
+    # SGLang's own names: the client's names of cameras and state are used unchanged.
     "sglang": {
         "cameras": {"*": {"key": "images/*", "layout": "any"}},
         "state": {"state": {"key": "state", "optional": True}},
         "instruction": "prompt",
     },
-    # RLinf, rlinf/envs/libero/libero_env.py, by way of `vlagents_ray_dialects.rlinf`.
+    # RLinf, rlinf/envs/libero/libero_env.py, through `vlagents_ray_dialects.rlinf`.
     "rlinf-libero": {
         "cameras": {
             "front": "main_images",

@@ -118,7 +118,7 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: VlaEvalMessage) -> bytes:
-    """Encode a message, with the present time."""
+    """Encode a message with the current time."""
     fields = {
         "type": message.kind,
         "payload": message.payload,
@@ -162,8 +162,8 @@ def _node(value: Any) -> Any:
 def _two_arms(state_key: str, cameras: dict[str, str]) -> dict[str, Any]:
     """Return the mapping of a benchmark with two arms of six joints and a gripper each.
 
-    Angles are in rad, grippers in [0, 1] with 1 open, the left arm comes first. Only the head
-    camera is needed, as a benchmark may leave out others.
+    Angles are in rad, grippers in [0, 1] with 1 open; the left arm comes first. Only the head
+    camera is needed, as a benchmark may omit the other cameras.
 
     Args:
         state_key: The benchmark's name of the state, whose layout is also that of the actions.

@@ -36,7 +36,8 @@ _ROBOT_3 = {"cameras", "camera_data_type", "gripper", "joints", "xyzrpy", "tquat
 _ROBOT_2 = {"cameras", "camera_data_type", "gripper", "state", "info"}
 _LEVELS = 4  # levels of nesting above the values in `info`: message, robots, robot, info
 _STATE_NAMES = ("joints", "xyzrpy", "tquat", "state")
-_NO_OPTIONS = {"self", "obs", "instruction", "contract"}  # arguments of `reset` that are no options
+# Arguments of `reset` that are not options.
+_NO_OPTIONS = {"self", "obs", "instruction", "contract"}
 
 
 class Segments(Protocol):
@@ -99,11 +100,12 @@ class RobotColumns:
 
 @dataclass(frozen=True, slots=True)
 class ObservationRequest:
-    """The observation in a call of a client."""
+    """The observation in a client's call."""
 
     obs: Obs
     instruction: str | None
-    robots: tuple[str, ...]  # the names in order; empty for vlagents 0.2, which has no names
+    # The robots' names in order; empty for vlagents 0.2, which has no names.
+    robots: tuple[str, ...]
 
 
 def read_act(text: str | bytes, budget: Budget, segments: Segments) -> ObservationRequest:
@@ -280,8 +282,8 @@ def _vector(value: Any, name: str, limits: MessageLimits) -> np.ndarray:
 def _image(
     image: Any, image_format: Any, name: str, budget: Budget, segments: Segments
 ) -> np.ndarray:
-    """Return the image of a camera, (H, W, 3) uint8; of several frames, (N, H, W, 3), the last
-    one.
+    """Return the image of a camera, (H, W, 3) uint8; the last frame if there are several, (N, H, W,
+    3).
     """
     limits = budget.limits
     if image_format == JPEG:
@@ -359,7 +361,7 @@ def _mapping(value: Any, path: str) -> dict[str, Any]:
 
 
 def _require_known(value: Mapping[str, Any], known_keys: set[str], path: str) -> None:
-    """Raise `MalformedMessage` if an object has other keys."""
+    """Raise `MalformedMessage` if an object has keys that are not known."""
     unknown = value.keys() - known_keys
     if unknown:
         raise MalformedMessage(
@@ -368,14 +370,12 @@ def _require_known(value: Mapping[str, Any], known_keys: set[str], path: str) ->
 
 
 # The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and their
-# results.
-#
-# The server sends a reference to its root once; a call consists of this reference and the name of a
-# method. No object of this process is offered to the server, which returns text, a truth value, or
-# an error.
+# results. The server sends a reference to its root once; a call consists of this reference and the
+# name of a method. This process offers no object to the server; the server returns text, a truth
+# value, or an error.
 
 _ACTION_LEVELS = 4  # levels of nesting above an action: reply, acts, step, robot
-_ERROR = 2000  # most characters of an error that are kept
+_ERROR = 2000  # maximum number of characters of an error that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -475,7 +475,7 @@ def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str,
     if any(step.keys() != steps[0].keys() for step in steps):
         raise MalformedMessage(
             "vlagents: expected the same robots in each step of `acts`, got others than "
-            f"{shown(list(steps[0]))}"
+            "{shown(list(steps[0]))}"
         )
 
     actions = {}

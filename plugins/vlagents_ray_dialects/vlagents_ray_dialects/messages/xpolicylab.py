@@ -2,8 +2,9 @@
 `msgpack_numpy` writes them.
 
 The modules `client_server/ws/protocol/{schemas,codec,messages}.py` of XPolicyLab define the format:
-commit 7198143e has its first generation, in which a client sends `infer` alone. The second one adds
-`call`, which names a method of the policy. Observations are those of its data format v1.0.
+commit 7198143e has the first generation of the protocol, in which a client sends only `infer`. The
+second generation adds `call`, which names a method of the policy. Observations have XPolicyLab's
+data format v1.0.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from vlagents_ray_dialects.messages.msgpack import (
     write_packed,
 )
 
-# The answer to each message; a `close` has none.
+# The type of the answer to each message; a `close` has no answer.
 ANSWERS = {
     "hello": "hello_ack",
     "prepare_case": "prepare_case_ack",
@@ -47,10 +48,11 @@ CLOSE, ERROR = "close", "error"
 
 _FAILED = {"infer": "infer_failed", "call": "call_failed", "reset": "reset_failed"}
 _IMAGE_KEYS = ("color", "colors", "rgb", "image")  # image keys of a camera
-# The comment in a JPEG whose channels are red, green, blue. Without it they are reversed, as they
-# were written by OpenCV from RGB pixels (`encode_image_bit` in XPolicyLab's process_data.py).
+# The comment in a JPEG whose channels are red, green, blue. In a JPEG without it the channels are
+# reversed, since OpenCV wrote it from RGB pixels (`encode_image_bit` in XPolicyLab's
+# process_data.py).
 _RGB_COMMENT = b"\xff\xfe\x00\x0aXPL-RGB1"
-_HEADER_BYTES = 4096  # in which the comment is looked for
+_HEADER_BYTES = 4096  # the number of bytes in which the comment is searched
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +60,11 @@ class Frame:
     """One message, in either direction.
 
     Attributes:
-        kind: The type of the message; empty if it has none.
-        message_id: The id of the message, which a client uses again when it repeats the message;
-            empty if it has none.
-        labels: What an answer repeats: the ids of evaluation, case and trial, and two numbers.
+        kind: The type of the message; empty if the message has none.
+        message_id: The id of the message, which stays the same when a client repeats the message;
+            empty if the message has none.
+        labels: The fields that an answer repeats: the ids of evaluation, case and trial, and two
+            numbers.
         payload: The content.
     """
 
@@ -71,7 +74,9 @@ class Frame:
     payload: Any
 
     def require_valid(self) -> None:
-        """Raise `MalformedMessage` if the message has no id, another type or no map."""
+        """Raise `MalformedMessage` if the message has no id, an unknown type, or a payload that is
+        not a map.
+        """
         if not self.message_id:
             raise MalformedMessage(
                 f"message_id: expected a text of 1 to {NAME_CHARACTERS} characters, got none"
@@ -86,7 +91,7 @@ class Frame:
             raise MalformedMessage(f"payload: expected a map, got {type(self.payload).__name__}")
 
 
-NO_FRAME = Frame("", "", {"evaluation_id": ""}, {})  # in place of a message that cannot be read
+NO_FRAME = Frame("", "", {"evaluation_id": ""}, {})  # stands for a message that cannot be read
 
 
 def decode(data: bytes, budget: Budget) -> Frame:
@@ -101,7 +106,7 @@ def decode(data: bytes, budget: Budget) -> Frame:
         images that are files are still encoded, see `read_observation`.
 
     Raises:
-        MalformedMessage: The message is no map.
+        MalformedMessage: The message is not a map.
         MessageTooLarge: The message exceeds a limit.
     """
     raw = unpack(data, budget.limits, _node)
@@ -125,7 +130,7 @@ def decode(data: bytes, budget: Budget) -> Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """Encode a message, with the present time."""
+    """Encode a message with the current time."""
     fields = {
         "message_type": frame.kind,
         "message_id": frame.message_id,
@@ -161,12 +166,12 @@ def batch_of(value: Any, most: int) -> list[dict[str, Any]]:
     """Return the observations of a batch.
 
     Args:
-        value: The list that a client sent.
+        value: The list of observations that a client sent.
         most: The largest number of observations.
 
     Raises:
-        MalformedMessage: It is no list of maps.
-        MessageTooLarge: It has too many.
+        MalformedMessage: The value is not a list of maps.
+        MessageTooLarge: The list has too many observations.
     """
     if not isinstance(value, list) or not value:
         raise MalformedMessage(f"obs: expected a list of observations, got {shown(value)}")
@@ -178,27 +183,27 @@ def batch_of(value: Any, most: int) -> list[dict[str, Any]]:
 
 
 def require_observation(value: Any) -> dict[str, Any]:
-    """Return an observation; raise `MalformedMessage` if it is no map."""
+    """Return an observation; raise `MalformedMessage` if the value is not a map."""
     if not isinstance(value, dict):
         raise MalformedMessage(f"observation: expected a map, got {type(value).__name__}")
     return value
 
 
 def environment_of(observation: Mapping[str, Any], default: int = 0) -> int:
-    """Return the index of the environment that an observation is from.
+    """Return the index of the environment of an observation.
 
     Args:
         observation: The observation.
-        default: The index if it names none.
+        default: The index if the observation has none.
 
     Raises:
-        MalformedMessage: It is no index.
+        MalformedMessage: The value is not an index.
     """
     return environment_index(observation.get("env_idx", default))
 
 
 def environment_index(value: Any) -> int:
-    """Return the index of an environment; raise `MalformedMessage` if it is none."""
+    """Return the index of an environment; raise `MalformedMessage` for any other value."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "iu" and value.size == 1:
         value = value.item()
     if type(value) is not int or not 0 <= value < 2**31:
@@ -236,7 +241,8 @@ def read_observation(observation: Mapping[str, Any], budget: Budget) -> dict[str
         if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 1:
             image = image.tobytes()
         if isinstance(image, bytes):
-            files[name] = image.rstrip(b"\0")  # a column of HDF5 pads it
+            # XPolicyLab stores images in a column of HDF5, which pads them.
+            files[name] = image.rstrip(b"\0")
         elif image is not None:
             views["color"] = image
 
@@ -262,7 +268,7 @@ def read_observations(
 
 
 def action_maps(columns: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
-    """Return a chunk as a client reads it, one map for each row.
+    """Return a chunk in the client's format, one map for each row.
 
     Args:
         columns: The columns of the chunk by the client's names, each (H, n) float32.
@@ -275,7 +281,7 @@ def action_maps(columns: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]
 
 
 def _error_code(frame: Frame, error: VLAgentsError) -> str:
-    """Return the code of an error in this protocol."""
+    """Return XPolicyLab's code for an error."""
     if frame.kind and frame.kind not in ANSWERS and frame.kind != CLOSE:
         return "unknown_message_type"
     if isinstance(error, DeadlineExceeded):
@@ -286,8 +292,8 @@ def _error_code(frame: Frame, error: VLAgentsError) -> str:
 
 
 def _node(node: dict[Any, Any]) -> Any:
-    """Return the array in a map, or the map with texts as keys: an observation may have the index
-    of an environment as a key.
+    """Return the array in a map, or the map with its keys as text, since a key may be the index of
+    an environment.
     """
     if is_packed(node):
         return read_packed(node)

@@ -2,9 +2,10 @@
 sockets.
 
 A peer sends a greeting of 64 bytes, the command READY, and then messages. A message consists of
-frames of a head and a body; all frames but the last one announce another one. ZeroMQ's own library
-buffers a message until it is complete, however many frames it has, and an empty frame costs its
-sender 2 bytes and its reader 64. Here the reader checks each head before the body arrives.
+frames, each with a head and a body; every frame except the last one announces another frame.
+ZeroMQ's own library buffers a message until it is complete, however many frames it has, and an
+empty frame costs its sender 2 bytes and its reader 64. Here the reader checks each head before the
+body arrives.
 """
 
 from __future__ import annotations
@@ -16,16 +17,17 @@ from dataclasses import dataclass
 from vlagents_ray.errors import MalformedMessage
 
 GREETING_BYTES = 64
-HEAD_BYTES = 1  # the number of bytes of a frame's flags, which its size follows
+HEAD_BYTES = 1  # the size of a frame's flags, bytes; the frame's size follows them
 COMMAND_BYTES = 512  # maximum size of a command
 _SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
 _MECHANISM = b"NULL".ljust(20, b"\0")  # no encryption and no password
 _MAJOR_VERSION = 3
 _MORE, _LONG, _COMMAND = 1, 2, 4  # flags of a frame
 _SHORT_SIZE, _LONG_SIZE = struct.Struct(">B"), struct.Struct(">Q")
-_VALUE_SIZE = struct.Struct(">I")  # the size of the value of a property of READY
-_TTL_BYTES = 2  # the time to live of a PING, before the context that the answer repeats
-_SOCKET_TYPES = (b"REQ", b"DEALER")  # the sockets that may connect
+_VALUE_SIZE = struct.Struct(">I")  # the number of bytes of the size of a property's value in READY
+# The number of bytes of a PING's time to live; the context that the answer repeats follows it.
+_TTL_BYTES = 2
+_SOCKET_TYPES = (b"REQ", b"DEALER")  # the types of sockets that may connect
 GREETING = _SIGNATURE + bytes([_MAJOR_VERSION, 0]) + _MECHANISM + bytes(32)
 
 
@@ -53,11 +55,12 @@ def check_greeting(greeting: bytes | bytearray) -> None:
     is_zmtp = signature[:1] == _SIGNATURE[:1] and signature[9:10] in (b"", _SIGNATURE[9:])
     if not is_zmtp or (version and version[0] < _MAJOR_VERSION):
         raise MalformedMessage(
-            "zmtp: expected a greeting of ZMTP 3, got another one; use libzmq 4 or newer"
+            "zmtp: expected a greeting of ZMTP 3, got another greeting; use libzmq 4 or newer"
         )
     if len(mechanism) == len(_MECHANISM) and mechanism != _MECHANISM:
         raise MalformedMessage(
-            "zmtp: expected the mechanism NULL, got another one; use a socket without encryption"
+            "zmtp: expected the mechanism NULL, got another mechanism; use a socket without "
+            "encryption"
         )
 
 
@@ -159,7 +162,7 @@ def _command(name: bytes, content: bytes) -> bytes:
 
 
 def _frame(body: bytes, flags: int) -> bytes:
-    """Return a frame with these flags, besides the one for a long size."""
+    """Return a frame with these flags; the flag for a long size is added if necessary."""
     if len(body) < 256:
         return bytes([flags]) + _SHORT_SIZE.pack(len(body)) + body
     return bytes([flags | _LONG]) + _LONG_SIZE.pack(len(body)) + body

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 # The actions in an answer, (D,) or (H, D), or several such arrays by the upstream's names.
 Answer = np.ndarray | Mapping[str, np.ndarray]
-_LOGGED = 8000  # most characters of an upstream's error that are logged
+_LOGGED = 8000  # maximum number of characters of an upstream's error that are logged
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class ClientOptions:
     """The address and the settings of an upstream."""
 
     url: str
-    timeout_s: float  # after this time without an answer, the connection counts as lost, s
+    timeout_s: float  # time without an answer after which the connection counts as lost, s
     key: str | None = field(default=None, repr=False)  # the upstream's API key
     limits: MessageLimits = DEFAULT_LIMITS
 
@@ -42,12 +42,14 @@ class UpstreamClient(abc.ABC):
     """One connection to an upstream, used by one thread at a time."""
 
     batches: ClassVar[bool] = False  # whether `ask` sends all observations in one message
-    # Whether the upstream keeps a session for each connection, by default.
+    # Whether the upstream keeps a session for each connection, unless the deployment says
+    # otherwise.
     keeps_sessions: ClassVar[bool] = False
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment has no mapping."""
-    schemes: ClassVar[tuple[str, ...]] = ()  # the schemes that a URL may have, the usual one first
-    takes_key: ClassVar[bool] = True  # whether the protocol has a place for an API key
+    # The schemes that a URL may have, the usual scheme first.
+    schemes: ClassVar[tuple[str, ...]] = ()
+    takes_key: ClassVar[bool] = True  # whether the protocol has a field for an API key
     text_key: ClassVar[str] = "task"  # the replacement of `*` in the key of the instruction
 
     def __init__(self, options: ClientOptions) -> None:
@@ -55,8 +57,8 @@ class UpstreamClient(abc.ABC):
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key `a/b` of the mapping means the key `b` within `a`; if not, it is
-        a single key.
+        """Return whether a key `a/b` of the mapping means the key `b` within `a`, rather than a
+        single key.
         """
         return "/" in key
 
@@ -95,8 +97,9 @@ class UpstreamClient(abc.ABC):
         """Return the differences between the upstream's metadata and the mapping, each with its
         cure.
 
-        SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had none.
-        A camera of `image_keys` that the mapping lacks may be missing on purpose.
+        SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had no
+        such camera. A camera of `image_keys` that the mapping lacks is no difference, as it may be
+        missing on purpose.
         """
         upstream_input = metadata.get("input")
         keys = upstream_input.get("image_keys") if isinstance(upstream_input, Mapping) else None
@@ -123,7 +126,7 @@ class UpstreamClient(abc.ABC):
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
         """Return the number of rows of the upstream's actions; None if the metadata do not contain
-        it. SGLang has it in `output`.
+        it. SGLang's metadata contain it in `output`.
         """
         output = metadata.get("output")
         rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
@@ -144,11 +147,12 @@ class UpstreamClient(abc.ABC):
         return actions
 
     def failed(self, text: object, noun: str = "an error") -> PolicyFailed:
-        """Log an error that the upstream sent, and return ours, without the upstream's details.
+        """Log an error that the upstream sent, and return our error, without the upstream's
+        details.
 
         Args:
             text: The text of the upstream's error.
-            noun: What the upstream sent, for messages.
+            noun: A noun for what the upstream sent, for the message.
         """
         logger.error(
             "upstream %s answered with %s: %s", self.options.url, noun, shown(text, _LOGGED)

@@ -26,9 +26,9 @@ from vlagents_ray_dialects.upstream.client import Answer, UpstreamClient
 logger = logging.getLogger(__name__)
 
 _CONNECT_S = 5.0  # the time limit of one attempt to connect, s
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0  # pauses between two attempts to connect
-# The number of connections that one row may lose, so that a row that crashes an upstream does not
-# end all connections.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0  # pauses between two attempts to connect, s
+# The number of connections that one row may lose, so that a row that crashes an upstream cannot end
+# all connections.
 _ATTEMPTS = 3
 
 Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
@@ -39,11 +39,12 @@ class _Share:
     """Rows of a batch that are sent together."""
 
     rows: range
-    attempts: int = 0  # the number of connections that were lost with them
+    attempts: int = 0  # the number of connections that were lost while these rows were sent
 
 
 class Lanes:
-    """The shared connections; a lost one is reopened in the background while the others continue.
+    """The shared connections; a lost connection is reopened in the background while the others
+    continue.
 
     Args:
         clients: The clients, not connected yet.
@@ -55,7 +56,7 @@ class Lanes:
         self._clients = clients
         self._check = check
         self._retry_s = retry_s
-        self._ready: list[UpstreamClient] = []  # the connected clients
+        self._ready: list[UpstreamClient] = []  # the clients that are connected
         self._changed = threading.Condition()
         # The error of the last attempt to connect.
         self._reason: VLAgentsError = NoReplica("upstream: not connected yet")
@@ -76,7 +77,8 @@ class Lanes:
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
-            # Waiting may help if the upstream is unavailable, but not if it is the wrong one.
+            # If the upstream is unavailable, the next attempt may succeed. If it is the wrong one,
+            # no attempt will.
             self._changed.wait_for(
                 lambda: self._ready or self._reason.status != NoReplica.status, timeout_s
             )
@@ -89,7 +91,7 @@ class Lanes:
         """Send observations to the upstreams.
 
         If a connection is lost, its rows are sent again over another connection, or over the same
-        one after it is reopened: an upstream without sessions keeps no state of them.
+        one after it is reopened. This is safe, as an upstream without sessions keeps no state.
 
         Args:
             observations: The observations, in the upstream's format.
@@ -154,8 +156,8 @@ class Lanes:
         observations: Sequence[Mapping[str, Any]],
         results: list[Answer | Exception],
     ) -> None:
-        """Send shares over one connection until there are no more or it is lost; a connection that
-        has ended takes no share.
+        """Send shares over one connection until no shares are left or the connection is lost; a
+        connection that has ended sends none.
         """
         while True:
             if not client.is_open:
@@ -179,7 +181,7 @@ class Lanes:
                 return
             except Exception as error:  # noqa: BLE001 - the result of these rows alone
                 answers = [error] * len(share.rows)
-                # One of the rows may be the cause, and must not fail the others.
+                # One of the rows may have caused the loss; the other rows are then sent without it.
                 if len(share.rows) > 1:
                     work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
             for row, answer in zip(share.rows, answers, strict=True):
@@ -245,9 +247,9 @@ class Lanes:
         logger.info("upstream %s answers", client.options.url)
 
 
-# Connections to upstreams that keep sessions: one for each session's episode.
+# Connections to upstreams that keep sessions: one connection for each session's episode.
 
-_AT_ONCE = 32  # largest number of sessions of a batch that are sent at the same time
+_AT_ONCE = 32  # maximum number of sessions of a batch that are sent at the same time
 
 
 class SessionConnections:
@@ -255,9 +257,9 @@ class SessionConnections:
 
     Args:
         urls: The addresses of the upstreams.
-        make: Returns a client of an address.
+        make: Returns a client for an address.
         check: Raises an error if the metadata shows that an upstream is the wrong one.
-        retry_s: The time for which the begin of an episode waits for an upstream, s.
+        retry_s: The time for which the beginning of an episode waits for an upstream, s.
     """
 
     def __init__(

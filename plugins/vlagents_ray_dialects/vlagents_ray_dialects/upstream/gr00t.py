@@ -16,7 +16,7 @@ from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, Upstrea
 
 
 class GR00TClient(UpstreamClient):
-    """A client of servers of N1.6 and newer, and of N1.5, whose modality keys have the form
+    """A client of servers of N1.6 and newer, and of N1.5; N1.5's modality keys have the form
     `video.front`.
 
     If the mapping has such keys, the observation also has them, as `Gr00tSimPolicyWrapper` expects.
@@ -33,8 +33,8 @@ class GR00TClient(UpstreamClient):
         self._socket: Any = None
         self._monitor: Any = None
         self._text_key = TEXT_KEY
-        self._flat = False  # whether the server is of N1.5
-        self._packed = False  # whether it reads arrays of `msgpack_numpy`
+        self._flat = False  # whether the server is an N1.5 server
+        self._packed = False  # whether the server accepts arrays in the format of `msgpack_numpy`
 
     @property
     def is_open(self) -> bool:
@@ -75,7 +75,7 @@ class GR00TClient(UpstreamClient):
             batched = wire.batch(observations, self._text_key)
         except ValueError as error:
             raise InvalidObservation(
-                f"gr00t: {error}; all sessions of a deployment must send the same"
+                f"gr00t: {error}; all sessions of a deployment must send the same keys and shapes"
             ) from error
 
         content = wire.flat(batched) if self._flat or flat else batched
@@ -158,7 +158,7 @@ class GR00TClient(UpstreamClient):
         deadline = time.monotonic() + timeout_s
         message = wire.write(endpoint, data, self.options.key, packed=self._packed)
         try:
-            self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
+            self._wait(self._zmq.POLLOUT, deadline, "it accepts no connection")
             self._socket.send(message, self._zmq.NOBLOCK)
             self._wait(self._zmq.POLLIN, deadline, "no answer")
             payload = self._socket.recv(self._zmq.NOBLOCK)
@@ -187,7 +187,9 @@ class GR00TClient(UpstreamClient):
 
 
 def _is_flat(reply: Any) -> bool:
-    """Return whether modalities have N1.5's keys, which begin with the name of the modality."""
+    """Return whether modalities have the keys of N1.5, which begin with the name of the
+    modality.
+    """
     video = reply.get("video") if isinstance(reply, dict) else None
     config = video.get("as_json", video) if isinstance(video, dict) else None
     if isinstance(config, str):

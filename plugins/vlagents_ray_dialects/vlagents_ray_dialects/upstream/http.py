@@ -37,7 +37,7 @@ class HttpClient(UpstreamClient):
     """A client that posts one observation per request, over a connection that stays open."""
 
     schemes: ClassVar[tuple[str, ...]] = ("http", "https")
-    path: ClassVar[str]  # the path of the requests, for a URL without a path
+    path: ClassVar[str]  # the path of the requests if the URL has no path
     about: ClassVar[str | None] = None  # path of the upstream's metadata, a JSON object
     media_type: ClassVar[str] = "application/json"
 

@@ -1,4 +1,4 @@
-"""Another policy server's model as a policy: its settings, and the policy itself."""
+"""The policy `upstream`, which is the model of another policy server, and its settings."""
 
 from __future__ import annotations
 
@@ -160,11 +160,11 @@ class UpstreamConfig(BaseModel, extra="forbid"):
         return self.sessions == "connection"
 
     def keys(self) -> KeyMapping:
-        """Return the mapping, by default the one of the protocol."""
+        """Return the mapping, by default the mapping of the protocol."""
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
 
 
-# The key in `Act.info` of the time that the upstreams needed for the batch, ms.
+# The key in `Act.info` of the upstreams' time for the batch, ms.
 UPSTREAM_MS = "upstream_ms"
 
 
@@ -217,7 +217,7 @@ class Upstream(Agent):
                 )
 
         def make(url: str) -> UpstreamClient:
-            """Make a client of an address."""
+            """Create a client for an address."""
             return config.client(ClientOptions(url, config.timeout_s, key))
 
         if config.keeps_sessions:
@@ -305,7 +305,7 @@ class Upstream(Agent):
 
 
 def _contract(mapped: Contract, configured: Mapping[str, Any]) -> Contract:
-    """Return the contract of a mapping, overridden by the one in the deployment file."""
+    """Return the contract of a mapping, overridden by the contract in the deployment file."""
     overrides = {name: value for name, value in configured.items() if value is not None}
     fields: dict[str, Any] = mapped.to_json()
     action = fields["action"] | overrides.get("action", {})

@@ -13,11 +13,11 @@ from vlagents_ray_dialects.messages import rpyc
 from vlagents_ray_dialects.messages import vlagents as wire
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
 
-_PAUSE_S = 0.2  # the pause between two checks whether the upstream's model is loaded, s
+_PAUSE_S = 0.2  # the pause between two checks whether the upstream has loaded its model, s
 
 
 class VlagentsClient(UpstreamClient):
-    """A client of one agent, shared by all connections; each observation contains the
+    """A client of a server whose agent is shared by all connections; each observation contains the
     instruction.
     """
 
@@ -104,7 +104,8 @@ class VlagentsClient(UpstreamClient):
         except OSError as error:
             raise self.lost(error) from error
         except VLAgentsError:
-            self.close()  # the position in the stream is lost
+            # The read stopped within a reply, so the connection cannot be used further.
+            self.close()
             raise
 
     def _receive(self, connection: socket.socket, count: int, deadline: float) -> bytearray:

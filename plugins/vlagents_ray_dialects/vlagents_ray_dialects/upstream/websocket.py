@@ -1,5 +1,5 @@
-"""Clients of the protocols over WebSockets: openpi's, for one observation or a batch,
-RoboArena's and vla-eval's.
+"""Clients of the protocols over WebSockets: openpi's (single observations and batches), RoboArena's
+and vla-eval's.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from vlagents_ray_dialects.messages.outgoing import Outgoing
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
 
 _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
-# `websockets` logs each lost connection as an error, which is also raised.
+# `websockets` logs each lost connection as an error, but also raises it.
 _LOG.setLevel(logging.CRITICAL)
 _CLOSE_S = 1  # the time limit for the closing handshake, s
 _REFUSED = (401, 403)  # statuses of an upstream that rejects the API key
-# No pings are sent, as an upstream that computes on its event loop does not answer them meanwhile.
-# Older versions of `websockets` never send pings.
+# No pings are sent, since an upstream that computes on its event loop does not answer them during
+# the computation. Older versions of `websockets` never send pings.
 _NO_PINGS: dict[str, Any] = (
     {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 )
@@ -40,7 +40,7 @@ class WebSocketClient(UpstreamClient):
     """A client over a WebSocket, with limits on the size of messages and on the waiting time.
 
     A separate thread answers the upstream's pings, so that a connection stays open while no session
-    acts.
+    sends requests.
     """
 
     schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
@@ -94,7 +94,7 @@ class WebSocketClient(UpstreamClient):
             raise self.unreachable(error) from error
 
     def send(self, message: bytes) -> None:
-        """Send a message; raise `ConnectionLost` if the upstream does not take it in time."""
+        """Send a message; raise `ConnectionLost` if the upstream does not accept it in time."""
         try:
             self._opened().send(message, self.options.timeout_s)
         except (ConnectionClosed, OSError) as error:
@@ -230,7 +230,9 @@ class RoboArenaClient(OpenPiClient):
             self._read(answer)
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return the cameras that the upstream needs and the mapping lacks, each with its cure."""
+        """Return a message for each camera that the upstream needs and the mapping lacks, with its
+        cure.
+        """
         differences = []
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
         wrist_cameras = [key for key in cameras if "wrist" in key]
@@ -321,7 +323,9 @@ class VlaEvalClient(WebSocketClient):
         return [actions]
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return the state, with its cure, if the upstream needs it and the mapping lacks it."""
+        """Return a message about the state, with its cure, if the upstream needs it and the mapping
+        lacks it.
+        """
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
@@ -338,8 +342,8 @@ class VlaEvalClient(WebSocketClient):
         self.send(vla_eval.encode(vla_eval.VlaEvalMessage(message_type, payload, self._seq)))
 
     def _answer(self, message_type: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
-        """Return the payload of the answer of a type to the last message; older answers are
-        skipped.
+        """Return the payload of the answer to the last message, which has the given type; skip
+        older answers.
         """
         deadline = time.monotonic() + timeout_s
         while True:
