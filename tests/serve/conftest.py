@@ -14,7 +14,7 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 
 @pytest.fixture
 def serving() -> Iterator[Callable[..., Engine]]:
-    """Starts engines, which end with the test."""
+    """Return a function that starts engines, which are closed after the test."""
     engines: list[Engine] = []
 
     def serve(agent: Agent, **options: Any) -> Engine:

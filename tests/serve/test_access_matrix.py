@@ -1,4 +1,4 @@
-"""docs/access.md is true: each cell of its table, tried on a replica with API keys and all its
+"""Each cell of the table in docs/access.md is tested on a replica with API keys and all its
 endpoints.
 """
 
@@ -68,7 +68,7 @@ def test_what_the_table_says_is_so(replica: KeyedReplica, cell: Cell) -> None:
         return
     assert not done, said
     if cell.stated != "nothing":
-        # A connection may be cut off before the request was rejected.
+        # The server may close the connection before it rejects the request.
         assert said == cell.stated or (said == "ended" and cell.when == "after" and visitor.ends)
 
 

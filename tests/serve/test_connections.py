@@ -1,5 +1,5 @@
-"""Who is let in at a replica's own ports, before which nothing is read, and when a connection
-has to end.
+"""Connections at a replica's own ports: which clients are accepted, that nothing is read before,
+and when a connection must end.
 """
 
 from __future__ import annotations
@@ -60,16 +60,17 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.requests import IncomingMessage
 
 BASE = urlsplit("http://127.0.0.1")
-# Where a test is about those; others hold though this process stands still.
+# Short limits for tests about these limits; other tests use long ones, so that they pass even if
+# this process is paused.
 SLOW_S, IDLE_S = 0.4, 3.0
 
 
 class Seen(list[str | None]):
-    """Of all sessions together."""
+    """The instructions and marks that reached the policy, in all sessions."""
 
 
 class Witness(Agent):
-    """Knows what reached it, and takes its time if it is told to."""
+    """A policy that records the requests that reach it, and can be blocked."""
 
     def __init__(self) -> None:
         self.seen, self.hold, self.acting = Seen(), threading.Event(), threading.Event()
@@ -170,7 +171,7 @@ RESET = frame(
 
 
 def answer(port: int, *segments: bytes) -> bytes:
-    """All that the server says until it hangs up."""
+    """Return all bytes that the server sends before it closes the connection."""
     said = b""
     with socket.create_connection(("127.0.0.1", port)) as attacker, contextlib.suppress(OSError):
         attacker.settimeout(60)
@@ -248,7 +249,7 @@ def listen_to_the_end(client: Stream) -> None:
 
 
 def half(payload: int) -> bytes:
-    """A frame's header and a part of what it announces."""
+    """Return a frame's header and part of the announced payload."""
     return (
         bytes([0x82, 0x80 | 127])
         + struct.pack(">Q", payload)
@@ -280,7 +281,7 @@ def test_what_comes_without_a_handshake_is_cut_off_and_not_read(
     monkeypatch.setattr(own_port, "_HANDSHAKE_S", 0.2)
     silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
     for each in silent:
-        with contextlib.suppress(OSError):  # it is cut off meanwhile
+        with contextlib.suppress(OSError):  # the server may close the connection in the meantime
             each.sendall(first)
     assert not answer(keyed.own.address.port, first).startswith(b"HTTP/1.1 101")
     wait_for(lambda: not keyed.own._clients)
@@ -290,7 +291,9 @@ def test_what_comes_without_a_handshake_is_cut_off_and_not_read(
 
 
 def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps_waiting() -> None:
-    """It is the server that does not read while the policy is busy."""
+    """While the policy is busy, the missing reads are the server's, so the connection does not
+    count as silent.
+    """
     with (
         replica(slow_s=SLOW_S, idle_s=IDLE_S) as quiet,
         replica(slow_s=SLOW_S, idle_s=IDLE_S) as busy,
@@ -412,7 +415,7 @@ def test_the_proxied_port_counts_a_keys_connections_too(
         pytest.raises(InvalidStatus) as refused,
         connect(url, additional_headers=shown(token)),
     ):
-        pytest.fail("was let in")
+        pytest.fail("the client was accepted")
     assert refused.value.response.status_code == 429
     wait_for(lambda: not keyed.known.keys._connections)
     with connect(url, additional_headers=shown(token)) as again:
@@ -534,7 +537,7 @@ FAULTS = [
     (local.UnixConnection, "_authenticate"),
     (local.UnixConnection, "overdue"),
 ]
-# The same of an HTTP connection at the own port.
+# Faults of an HTTP connection at the replica's own port.
 HTTP_FAULTS = [
     (Intake, "reserve"),
     (http_connection, "message_admission"),
@@ -558,29 +561,29 @@ HTTP_FAULTS = [
 
 @pytest.fixture
 def no_records() -> Iterator[None]:
-    """No records of the log, whose tracebacks would refer to the messages."""
+    """Disable logging, since tracebacks in log records would keep references to messages."""
     logging.disable(logging.CRITICAL)
     yield
     logging.disable(logging.NOTSET)
 
 
 def open_sockets() -> int:
-    """The number of sockets of this process."""
+    """Return the number of sockets of this process."""
     folder = "/proc/self/fd"
     files = []
     for name in os.listdir(folder):
-        with contextlib.suppress(FileNotFoundError):  # that of the folder itself
+        with contextlib.suppress(FileNotFoundError):  # the descriptor of the listed folder itself
             files.append(os.readlink(f"{folder}/{name}"))
     return sum(file.startswith("socket:") for file in files)
 
 
 def frame_of(data: bytes) -> bytes:
-    """A frame without a mask of random bytes, of any size."""
+    """Return a frame of any size with a fixed mask."""
     return frame_head(len(data), bytes(4)) + data
 
 
 def post(path: str, body: bytes, length: int | None = None) -> bytes:
-    """A request with the key "arm", whose body may be incomplete."""
+    """Return an HTTP request with the key "arm". Its body may be shorter than `length`."""
     lines = [
         f"POST {path} HTTP/1.1",
         "host: 127.0.0.1",
@@ -593,7 +596,7 @@ def post(path: str, body: bytes, length: int | None = None) -> bytes:
 
 
 def reset_over_shm(keyed: Replica) -> None:
-    """Send a large reset with the key "arm", whatever it is answered."""
+    """Send a large reset with the key "arm", and ignore its answer."""
     client = ShmTransport(keyed.local.address, Credentials("vlr_arm"))
     with contextlib.suppress(VLAgentsError, OSError):
         client.connect(1)
@@ -617,7 +620,7 @@ def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
     monkeypatch: pytest.MonkeyPatch,
     no_records: None,
 ) -> None:
-    """It is raised in callbacks of sockets, of timers, and of the threads that decode and
+    """The error is raised in callbacks of sockets and timers, and in the threads that decode and
     answer.
     """
     keyed.known.add("arm", rate=4)

@@ -1,4 +1,6 @@
-"""Each robot whose reset states no SLO has that of its deployment, however its session opens."""
+"""A robot whose reset contains no SLO has the SLO of its deployment, however its session was
+opened.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,14 @@ def engine() -> Iterator[Engine]:
 
 
 def plan(engine: Engine) -> tuple[RobotNeed | None, float]:
-    """What the robot of the only session needs, and its share of ticks in time."""
+    """Return the needs of the only session's robot, and its required share of ticks in time."""
     [session] = engine.sessions.all()
     return session.plan.need, session.plan.share
 
 
 def test_a_reset_in_process_has_the_slo_of_the_deployment(engine: Engine) -> None:
     info = answered(engine, "arm", Request("reset", Obs())).info
-    assert info[SLO] == {"load": 0.0, "in_time": True}  # no batch was measured yet
+    assert info[SLO] == {"load": 0.0, "in_time": True}  # no batch has been measured yet
     assert plan(engine) == (NEED, 0.9)
 
 
@@ -105,7 +107,7 @@ def test_the_setting_reaches_the_engine_and_the_metadata() -> None:
     args = ServerArgs(policy="noop", slo=OF_FILE.to_json())
     policy = LocalPolicy(args, {})
     assert policy.engine.settings.slo == OF_FILE
-    # As Serve passes them to a replica.
+    # In the form in which Serve passes them to a replica.
     assert ServerArgs(**args.model_dump(mode="json")).slo == args.slo
     policy.initialize()
     assert policy.metadata["slo"] == OF_FILE.to_json()

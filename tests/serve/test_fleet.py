@@ -1,4 +1,4 @@
-"""The arithmetic of robots in time."""
+"""The calculation of how many robots a replica serves in time."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_robot_replans_before_its_rows_are_executed() -> None:
     assert CHUNKS_OF_50.interval_s(5.0) == 0.0
     assert RobotNeed(10.0, 50, age_s=1.0).interval_s(0.4) == pytest.approx(0.6)
     assert RobotNeed(10.0, 50, age_s=0.4).interval_s(0.4) == 0.0
-    assert RobotNeed(10.0, 50, age_s=0.45).interval_s(0.4) == 0.1  # once a tick
+    assert RobotNeed(10.0, 50, age_s=0.45).interval_s(0.4) == 0.1  # once per tick
 
 
 def test_a_robot_with_single_actions_asks_once_a_tick() -> None:
@@ -93,7 +93,7 @@ def test_a_policy_that_is_slower_than_a_tick_serves_no_robot() -> None:
 
 
 def test_the_largest_fleet_is_that_of_the_costs() -> None:
-    # Batches of 16 take 158 ms; a robot needs one every 5 s less twice that.
+    # Batches of 16 take 158 ms. A robot needs one answer every 5 s minus twice this time.
     by_hand = USABLE * 16 / 0.15826 * (5.0 - 2 * 0.15826)
     assert most_robots(PI0, CHUNKS_OF_50, 16) == math.floor(by_hand)
 
@@ -104,7 +104,7 @@ def test_a_further_robot_never_makes_a_replica_emptier(
 ) -> None:
     before = replica_load(curve, robots, 16).load
     more = {**robots, newcomer: robots.get(newcomer, 0) + 1}
-    # Its batches may be larger by one row than those of the robots before.
+    # With the new robot, batches may have one more row than before.
     after = replica_load(curve, more, min(16, sum(robots.values()))).load
     assert after >= before
 
@@ -124,7 +124,7 @@ def test_robots_that_replan_as_told_use_no_more_than_the_replica_has(
 def load_by_size(
     costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int, transport_s: float
 ) -> list[float]:
-    """The load with each size of batches, robot by robot, until some robot is late."""
+    """Return the load for each batch size, computed robot by robot, until some robot is late."""
     robots = sum(needs.values())
     loads = []
     for size in range(1, min(max_batch_size, robots) + 1):
@@ -166,7 +166,8 @@ def test_the_load_of_different_robots_is_that_of_one_after_the_other(
     robots = sum(needs.values())
     assert load.latency_s == answer_s(costs, load.batch_size, robots) + transport_s
 
-    # The robots together send as many requests as the replica can answer, and no robot starves.
+    # Together the robots send as many requests as the replica can answer, and no robot runs out of
+    # rows.
     paced_s = {need: load.replan_s(need) for need in needs}
     if load.load <= USABLE:
         usable_hz = USABLE * load.batch_size / costs.cost_s(load.batch_size)

@@ -1,5 +1,5 @@
-"""A replica that is frozen, and continues: what clients have abandoned meanwhile is not executed,
-whatever its way to the policy.
+"""A replica that is frozen and continues: requests that clients abandoned in the meantime are not
+executed, over any transport.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.replica.replica import answer_frame
 
-# A gateway is a client of the replica, whose own clients the replica does not know.
+# A gateway is a client of the replica. The replica does not know the gateway's own clients.
 REPLICA_CLIENTS = [name for name in CLIENTS if name not in GATEWAYS]
-BRIGHTNESS = 3  # brightness of the act that is abandoned
-SENT_S = 0.1  # time in which a client on another thread has sent its act
-READ_S = 0.5  # time in which a replica that continues has read the act
+BRIGHTNESS = 3  # brightness of the picture in the abandoned act
+SENT_S = 0.1  # time after which a client on another thread has sent its act
+READ_S = 0.5  # time after which a replica that continues has read the act
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def server() -> Iterator[StoppableServer]:
 
 
 def acts_of_others(server: StoppableServer) -> None:
-    """Let the policy execute all that waits, and an act of another client after it."""
+    """Let the policy execute all waiting requests, and then an act of another client."""
     for op in ("reset", "act"):
         server.ask(OTHERS[1], op)
 
@@ -90,7 +90,7 @@ def test_an_act_whose_client_waits_is_executed_when_the_replica_continues(
 def test_an_act_that_was_abandoned_in_the_queue_is_not_executed(
     server: StoppableServer, name: str
 ) -> None:
-    """The replica had read it before it was frozen."""
+    """The replica had read the act before it was frozen."""
     client: LeavingClient = CLIENTS[name](server)
     server.hold_policy()
     queued = len(server.queued)
@@ -108,7 +108,7 @@ def test_an_act_that_was_abandoned_in_the_queue_is_not_executed(
 def test_a_session_over_http_outlives_the_connection_of_its_earlier_requests(
     server: StoppableServer, name: str
 ) -> None:
-    """It is the connection of a request that shows whether its client has left."""
+    """Whether a client has left is judged by the connection of the request itself."""
     CLIENTS[name](server).leave()
     client = CLIENTS[name](server)
     client.send(BRIGHTNESS)
@@ -116,7 +116,9 @@ def test_a_session_over_http_outlives_the_connection_of_its_earlier_requests(
 
 
 class Handle:
-    """An engine whose clients call it over a Serve handle, and the clock of its pauses."""
+    """An engine whose clients call it over a Serve handle, with a simulated clock for its
+    pauses.
+    """
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -138,7 +140,7 @@ class Handle:
         return ACTED if error is None else error.code
 
     def pass_time(self, seconds: float, *, checked: bool = True) -> None:
-        """Let time pass; in more than 0.3 s without a check, the process was paused."""
+        """Let time pass. More than 0.3 s without a check count as a pause of the process."""
         self.now += seconds
         if checked:
             self.engine.pauses.check()
@@ -156,7 +158,7 @@ def handle() -> Iterator[Handle]:
 def test_over_a_handle_a_call_after_a_pause_is_executed_if_it_names_the_pause(
     handle: Handle, is_recorded: bool
 ) -> None:
-    """A call that does not may be one of a client that has left."""
+    """A call that does not name the pause may belong to a client that has left."""
     assert handle.call("reset", 1) == ACTED
     handle.pass_time(7.0, checked=is_recorded)
     pause = handle.call("act", BRIGHTNESS)

@@ -1,10 +1,10 @@
-"""Bytes from clients that nobody has let in, at every port of a keyed replica: none crashes it,
-makes it grow, or acts.
+"""Fuzzing of every port of a replica with API keys by clients without access: no bytes crash the
+replica, make its memory grow, or cause an act.
 
-What is fuzzed are the states of each protocol before authentication: handshakes that are nearly
-right, whole requests before, with and after rejected ones, in segments cut anywhere.
-`tests/integration/test_fuzz.py` does so after it. Some thousands in CI; as many as wanted by hand,
-all of them from one seed:
+The tests fuzz the states of each protocol before authentication: nearly correct handshakes, and
+complete requests before, with and after rejected ones, cut into segments at random positions.
+`tests/integration/test_fuzz.py` fuzzes the states after authentication. CI runs some thousand
+sequences. More can be run by hand, all generated from one seed:
 
     export VLAGENTS_FUZZ_SEQUENCES=1000000 VLAGENTS_FUZZ_SEED=1
     pytest tests/serve/test_fuzz_before_keys.py -s --timeout 7200
@@ -49,9 +49,9 @@ from vlagents_ray_dialects.messages.rpyc import Handler
 
 SEQUENCES = int(os.environ.get("VLAGENTS_FUZZ_SEQUENCES", many(3000)))
 SEED = int(os.environ.get("VLAGENTS_FUZZ_SEED", "1"))
-EVERY = 500  # sequences; then a client with a key
+EVERY = 500  # sequences between checks with a client that has a key
 ANSWER_S = 20.0
-GROWTH = 64 * 2**20  # bytes, whatever the number of sequences
+GROWTH = 64 * 2**20  # bytes of memory growth, whatever the number of sequences
 PATHS = ("/v1/stream", "/", "/openpi", "/roboarena", "/vla-eval", "/xpolicylab", "/nope")
 KEYS = (None, "vlr_wrong", "vlr_leaver", "vlr_elsewhere", "vlr_", "\xe9", "x" * 5000)
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
@@ -65,8 +65,8 @@ Segments = list[bytes]
 
 @dataclass
 class Target:
-    """A port, what comes close to a right message there, and the endpoint that a client with a key
-    takes.
+    """A port, the pieces of nearly correct messages for it, and the endpoint that a client with a
+    key uses.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Target:
 
 
 def sequence(target: Target, replica: KeyedReplica, choose: random.Random) -> Segments:
-    """Right pieces and nearly right ones in an order that may be wrong, cut into segments."""
+    """Return correct and nearly correct pieces, possibly in a wrong order, cut into segments."""
     pieces = target.pieces(replica, choose)
     if choose.random() < 0.3:
         choose.shuffle(pieces)
@@ -92,7 +92,7 @@ def sequence(target: Target, replica: KeyedReplica, choose: random.Random) -> Se
     return [whole[a:b] for a, b in zip([0, *cuts], [*cuts, len(whole)], strict=True)]
 
 
-# What is said to each port.
+# The messages for each port.
 
 
 def headers(choose: random.Random) -> bytes:
@@ -151,7 +151,7 @@ def at_http(_replica: KeyedReplica, choose: random.Random) -> Segments:
 
 
 def posts(choose: random.Random, paths: Sequence[str]) -> Segments:
-    """Requests over HTTP."""
+    """Return HTTP requests."""
     path = choose.choice(paths)
     kind, content = choose.choice(
         (
@@ -201,7 +201,7 @@ def at_gr00t(_replica: KeyedReplica, choose: random.Random) -> Segments:
 
 
 def at_zmq(replica: KeyedReplica, choose: random.Random) -> Segments:
-    """Below its messages: ZMTP's own greeting, handshake and frames."""
+    """Return ZMTP's greeting, handshake and frames, the layer below GR00T's messages."""
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
     ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00\x00"
     message = at_gr00t(replica, choose)[0]
@@ -210,7 +210,9 @@ def at_zmq(replica: KeyedReplica, choose: random.Random) -> Segments:
 
 
 def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Segments:
-    """Its protocol has no key: all that comes before a client's first whole observation."""
+    """Return messages before a client's first complete observation, since vlagents' protocol has no
+    key.
+    """
     getroot = request(1, Handler.GETROOT, (TUPLE, ()))
     getattr_ = request(2, Handler.GETATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "act"))))
     half = document(1, "move to the human").encode()[: choose.randint(0, 100)].decode()
@@ -230,27 +232,27 @@ def at_vlagents(_replica: KeyedReplica, choose: random.Random) -> Segments:
     ]
 
 
-# How.
+# The ways of sending.
 
 
 def over_tcp(
     port: Callable[[KeyedReplica], int], *, hangs_up: bool = True
 ) -> Callable[[KeyedReplica, random.Random, Segments], str]:
     def send(replica: KeyedReplica, choose: random.Random, segments: Segments) -> str:
-        """Until the server hangs up, which it does once it has read all of it; ZMQ may wait for
-        more.
+        """Send segments until the server closes the connection, which it does once it has read all
+        of them. ZMQ may wait for more.
         """
         said = b""
         with socket.socket() as connection:
             connection.settimeout(ANSWER_S if hangs_up else 0.5)
-            # One address has few ports a minute.
+            # One address has only few ports per minute.
             connection.bind((f"127.0.0.{choose.randint(2, 250)}", 0))
             connection.connect(("127.0.0.1", port(replica)))
             gone = (ConnectionError,) if hangs_up else (ConnectionError, TimeoutError)
-            with contextlib.suppress(*gone):  # it did not wait for the rest
+            with contextlib.suppress(*gone):  # the server did not wait for the remaining segments
                 for segment in segments:
                     connection.sendall(segment)
-                with contextlib.suppress(OSError):  # it has hung up
+                with contextlib.suppress(OSError):  # the server has closed the connection
                     connection.shutdown(socket.SHUT_WR)
                 while more := connection.recv(65536):
                     said += more
@@ -290,8 +292,8 @@ _OF_THREAD = threading.local()
 
 
 def over_zmq(replica: KeyedReplica, _choose: random.Random, segments: Segments) -> str:
-    """One message, in as many parts as there are segments; a connection is closed after 64
-    without a key.
+    """Send one message with as many parts as there are segments. The server closes a connection
+    after 64 messages without a key.
     """
     if not hasattr(_OF_THREAD, "context"):
         _OF_THREAD.context = zmq.Context()
@@ -358,7 +360,7 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
     replica: KeyedReplica, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.ERROR)
-    # test_gr00t_strangers.py and test_access_middleware.py show these pauses.
+    # test_gr00t_strangers.py and test_access_middleware.py test these pauses.
     monkeypatch.setattr(gr00t, "_REFUSAL_S", 0.001)
     for module in (access_middleware, http_messages):
         monkeypatch.setattr(module, "REFUSAL_S", 0.001)
@@ -388,7 +390,7 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
           f"{before[2]} and {after[2]} descriptors")  # fmt: skip
     for target in TARGETS:
         print(f"{target.name}: {dict(target.said.most_common(8))}")
-    # Of clients with a key.
+    # Acts of clients with a key are excluded.
     assert [mark for mark in replica.policy.done if not mark.startswith("mark of ")] == []
     assert [
         record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR
@@ -399,7 +401,7 @@ def test_nothing_that_comes_before_a_key_crashes_bloats_or_acts(
 
 
 def at_rest(replica: KeyedReplica) -> None:
-    """Nobody is connected any more."""
+    """Return whether no client is connected any more."""
     wait_for(lambda: not replica.own._clients and not replica.local._clients)
     wait_for(
         lambda: not any(thread.name.startswith("vlagents 127") for thread in threading.enumerate())

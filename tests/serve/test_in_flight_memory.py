@@ -1,5 +1,5 @@
-"""What a replica holds for requests that wait for its policy is what it counts as in flight, at
-each endpoint.
+"""The memory of a replica for requests that wait for its policy is the memory that it counts as in
+flight, at each endpoint.
 """
 
 from __future__ import annotations
@@ -40,13 +40,15 @@ pytestmark = pytest.mark.own_process
 IN_FLIGHT = 48 * 2**20
 SLACK = 24 * 2**20  # bytes of buffers, of the interpreter and of its allocator
 FILE = 4 * 2**20  # bytes of a memory file
-ACTS = 512  # in one message
+ACTS = 512  # number of acts in one message
 SMALL = Obs(state={"j": np.zeros(3, np.float32)})
 
 
 @dataclass
 class Gate(Agent):
-    """Acts fast, but for observations with the state "wait", until the gate opens."""
+    """A policy that acts fast, except for observations with the state "wait", which wait until the
+    gate opens.
+    """
 
     opened: threading.Event = field(default_factory=threading.Event)
     entered: threading.Event = field(default_factory=threading.Event)
@@ -56,7 +58,7 @@ class Gate(Agent):
             self.entered.set()
             assert self.opened.wait(60)
         else:
-            time.sleep(0.003)  # long enough for a second thread to read meanwhile
+            time.sleep(0.003)  # long enough for a second thread to read in the meantime
         return [Act(np.zeros(2, np.float32)) for _ in obs]
 
     def act(self, obs: Obs) -> Act:
@@ -92,7 +94,7 @@ def replica() -> Iterator[Replica]:
 
 
 def allocated() -> int:
-    """Bytes of this process alone, without shared pages."""
+    """Return the bytes of this process, without shared pages."""
     gc.collect()
     [line] = [
         line
@@ -110,8 +112,8 @@ def many_acts(session: str) -> bytes:
 
 
 def hold_policy(replica: Replica) -> ShmTransport:
-    """A client whose act keeps the policy busy, after acts of two sessions, so that another
-    thread reads.
+    """Let an act occupy the policy, after acts of two sessions, so that another thread reads.
+    Return the client.
     """
     client = ShmTransport(replica.near.address)
     client.connect(5)
@@ -158,7 +160,7 @@ def over_own_port(replica: Replica, _: ShmTransport) -> Iterator[None]:
         stream.send(encode_requests([Request("reset", SMALL, session="b")]), 5)
         stream._socket.setblocking(True)
         stream._socket.settimeout(0.5)
-        with contextlib.suppress(TimeoutError):  # it is not read any more
+        with contextlib.suppress(TimeoutError):  # the server reads no more
             for _ in range(60):
                 stream._socket.sendall(frame_head(len(message), bytes(4)) + message)
     yield
@@ -167,7 +169,7 @@ def over_own_port(replica: Replica, _: ShmTransport) -> Iterator[None]:
 
 
 def _send_all(client: ShmTransport, messages: Iterator[tuple[bytes, int | None]]) -> None:
-    """Send messages, each with a memory file or none, until the server reads no more."""
+    """Send messages, each with or without a memory file, until the server reads no more."""
     connection = client._socket
     assert connection is not None
     connection.setblocking(True)
@@ -183,7 +185,7 @@ def _send_all(client: ShmTransport, messages: Iterator[tuple[bytes, int | None]]
 
 @contextlib.contextmanager
 def over_shared_memory(_replica: Replica, client: ShmTransport) -> Iterator[None]:
-    """Frames of small acts, in memory of the client."""
+    """Send frames of small acts in memory of the client."""
     frame = many_acts("b")
     head = LocalAddress.REQUEST.pack(1, 0, len(frame))
     _send_all(
@@ -213,8 +215,8 @@ def in_compact_form(_replica: Replica, client: ShmTransport) -> Iterator[None]:
 
 @contextlib.contextmanager
 def with_copies(_replica: Replica, client: ShmTransport) -> Iterator[None]:
-    """From the ninth view on, each act copies its whole memory file, although it needs 12 bytes
-    of it.
+    """Send acts in more memory files than the server keeps mapped, so that each further act copies
+    its whole file, although it needs only 12 bytes of it.
     """
 
     def messages() -> Iterator[tuple[bytes, int | None]]:
@@ -248,11 +250,11 @@ def test_requests_that_wait_take_no_more_memory_than_they_count(
                 admission.held > IN_FLIGHT / 4 or replica.engine.queue.depth() > MOST_UNANSWERED / 2
             )
         )
-        time.sleep(0.5)  # for as much more as the server takes
+        time.sleep(0.5)  # time in which the server may read more
         assert admission.held <= IN_FLIGHT
         assert admission.held >= REQUEST_BYTES * replica.engine.queue.depth()
         assert allocated() - before < admission.held + SLACK
-        replica.engine.queue.close()  # nobody waits for tens of thousands of acts
+        replica.engine.queue.close()  # do not wait for tens of thousands of acts
     client.close()
 
 
@@ -279,7 +281,7 @@ def test_an_act_in_compact_form_is_refused_while_there_is_no_room(replica: Repli
     assert client.call([Request("reset", SMALL)], 10)[0].error is None
     assert client.call([Request("act", SMALL)], 10)[0].error is None
     admission = replica.engine.admission
-    size = IN_FLIGHT - REQUEST_BYTES  # the last message may not be dropped yet
+    size = IN_FLIGHT - REQUEST_BYTES  # the last message may not be freed yet
     admission.hold(size, True, 0)
     [reply] = client.call(
         [Request("act", SMALL, request_id=str(number)) for number in range(2)], 10

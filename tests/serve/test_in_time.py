@@ -1,4 +1,4 @@
-"""What robots report about their ticks, and how a replica adds it up."""
+"""The reports of robots about their ticks, and their sums at a replica."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_an_engine_adds_up_what_its_sessions_report() -> None:
     try:
         answered(engine, "arm", Request("reset", obs=Obs()))
         answered(engine, "arm", Request("act", obs=Obs()))
-        assert engine.sessions.times() == []  # nothing is kept without a report
+        assert engine.sessions.times() == []  # nothing is stored without a report
 
         for _ in range(2):
             obs = Obs(info={TICKS: [10, 1], EXECUTED_AGE: 80.0})

@@ -1,5 +1,5 @@
-"""When Serve calls a replica running: when its policy has loaded, not before, and not if it did
-not.
+"""The time at which Serve considers a replica running: after its policy has loaded, not before, and
+not if loading failed.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS
 
 
 class Bare(PolicyReplica):
-    """A replica that Serve has not made, and that has nothing to close."""
+    """A replica that Serve has not created, and that has nothing to close."""
 
     def __del__(self) -> None:  # type: ignore[override]
         pass
 
 
 def replica(start: Any) -> Bare:
-    """A replica with what starting touches."""
+    """Return a replica with only the attributes that its start uses."""
     engine: Any = SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None))
     one = object.__new__(Bare)
     vars(one).update(
@@ -100,7 +100,7 @@ def test_a_replica_runs_when_its_parts_have_prepared_for_the_loaded_policy() -> 
 def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     cause: Exception, shown: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """`serve status` shows what is raised here with its traceback, after which the cause is hard
+    """`serve status` shows a raised exception with its traceback, in which the cause would be hard
     to find.
     """
 
@@ -113,7 +113,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     lines = traceback.format_exception(failed.value)
     assert ("direct cause" in "".join(lines)) == shown
     assert ("in fail" in "".join(lines)) == shown
-    assert ("in fail" in caplog.text) != shown, "it is in one of the two"
+    assert ("in fail" in caplog.text) != shown, "the cause is in exactly one of the two"
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,9 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
 def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(
     args: dict[str, Any], said: str
 ) -> None:
-    """Serve shows the text of its own exceptions, and of any other a traceback of forty lines."""
+    """Serve shows only the text of its own exceptions, but a traceback of forty lines for any other
+    exception.
+    """
     builder = import_attr(IMPORT_PATH)
     with pytest.raises(RayServeException) as failed:
         call_user_app_builder_with_args_if_necessary(builder, {"policy": "noop"} | args)
@@ -143,7 +145,7 @@ def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(
 def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(
     act_s: float,
 ) -> None:
-    """Its policy may hold the interpreter's lock: Serve's checks are all that limits that."""
+    """The policy may hold the GIL meanwhile. Only Serve's checks limit this time."""
     policy = application(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
     assert policy._deployment_config.max_constructor_retry_count == 1, (
         "it gives up after the first failed start"
@@ -157,7 +159,7 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, plain: bool
 ) -> None:
     new_key(tmp_path / "keys", "arm")
-    everywhere = SimpleNamespace(host="0.0.0.0", ssl_certfile=None)  # noqa: S104 - what is warned of
+    everywhere = SimpleNamespace(host="0.0.0.0", ssl_certfile=None)  # noqa: S104 - an address that causes a warning
     monkeypatch.delenv(HOST, raising=False)
     monkeypatch.setattr(module, "http_options", lambda: everywhere)
     monkeypatch.setattr(module, "write_audit", lambda: None)

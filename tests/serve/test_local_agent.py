@@ -1,4 +1,4 @@
-"""A deployment's policy in this process has the results of a replica."""
+"""A deployment's policy that runs in this process gives the same results as a replica."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ THIS = f"{__name__}:Trembling"
 
 
 class Trembling(Agent):
-    """Goes to zero in steps of a length, which tremble; its own count of acts must be that of
-    one episode.
+    """A policy that steps to zero with noisy steps. It fails in some third acts, so its count of
+    acts must belong to one episode.
     """
 
     def __init__(self, length: float = 1.0) -> None:
@@ -49,7 +49,7 @@ class Trembling(Agent):
 
 
 class Beginning(Trembling):
-    """Its chunks begin with rows of the plan."""
+    """A policy whose chunks begin with rows of the plan."""
 
     continues_plans = True
     longest_prefix = 3
@@ -63,7 +63,9 @@ def replica() -> Iterator[Replicas]:
 
 
 def outcomes(summary: Summary) -> list[dict[str, Any]]:
-    """What is the same in all runs; the message of an error has the id of its request."""
+    """Return the results that are equal in all runs. The message of an error contains the id of its
+    request.
+    """
     found = [one.result.outcome for case in summary.results.cases for one in case.episodes]
     return [one | {"error": (one["error"] or "").partition(";")[0]} for one in found]
 
@@ -136,7 +138,8 @@ def test_ctrl_c_in_a_call_is_no_error_of_the_policy(monkeypatch: pytest.MonkeyPa
 def test_the_metadata_say_how_chunks_continue_plans(agent: Agent, stated: tuple[bool, int]) -> None:
     replicas = Replicas([agent])
     try:
-        replicas.agent().reset(Obs(state={"position": np.zeros(1)}), None)  # after the load
+        # after the policy has loaded
+        replicas.agent().reset(Obs(state={"position": np.zeros(1)}), None)
         metadata = policy_metadata(ServerArgs(policy=THIS), replicas.engines[0], None, {})
         assert (metadata["continues_plans"], metadata["longest_prefix"]) == stated
     finally:

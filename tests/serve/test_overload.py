@@ -1,5 +1,5 @@
-"""What a message may cost is asked before it is paid: by the key's rate, by memory, and on which
-thread.
+"""The cost of a message is checked before it is incurred: against the key's rate and against
+memory, and on the right thread.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ from vlagents_ray_dialects.messages import xpolicylab as xpolicylab_codec
 
 JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))
-LARGE = jpeg_png.encode_jpeg(np.zeros((1100, 1000, 3), np.uint8), 1, "420")  # over a megapixel
+LARGE = jpeg_png.encode_jpeg(np.zeros((1100, 1000, 3), np.uint8), 1, "420")  # more than a megapixel
 DECODED = 32 * 32 * 3
-SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
+SLACK = 48 * 2**20  # bytes of buffers in the kernel and the interpreter
 OBS = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
 SEEN = {"cameras": {"front": {"$": ["img", 0]}}}
 
@@ -127,7 +127,7 @@ def message_admission(
     return MessageAdmission(Admission(most), limits, Account(caller).charge())
 
 
-# Before anything is decoded.
+# Checks before anything is decoded.
 
 
 @pytest.fixture(scope="module")
@@ -138,8 +138,8 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The decoders that were called, and the parsers outside of the test's own thread, in which
-    its clients run.
+    """Return a growing list of called decoders, and of parsers outside the test's own thread, in
+    which its clients run.
     """
     by: list[str] = []
     for module, name in (
@@ -195,14 +195,14 @@ def _post(path: str, kind: str, content: bytes) -> Callable[[Visitor, str], str]
 
 NOTHING_TO_DECODE = {
     *(endpoint for endpoint in ATTEMPTS if endpoint.startswith("`GET")),
-    "`POST /v1/close`",  # nothing that it brings is decoded
-    "own port, another path",  # is rejected
-    "`WS /v1/weights`",  # is rejected without the scope
-    "`POST /v1/weights/{step}`",  # is rejected without the scope
+    "`POST /v1/close`",  # the endpoint decodes no content
+    "own port, another path",  # rejected
+    "`WS /v1/weights`",  # rejected without the scope
+    "`POST /v1/weights/{step}`",  # rejected without the scope
     "`POST /v1/weights/{step}`, scope `weights`",  # two options in the URL
-    "`POST /v1/live/command`",  # is rejected without the scope
-    "`POST /v1/live/command`, scope `operate`",  # a name and a word, in 16 KiB at most
-    "`WS /v1/live`",  # is rejected without the scope
+    "`POST /v1/live/command`",  # rejected without the scope
+    "`POST /v1/live/command`, scope `operate`",  # a name and a word, at most 16 KiB
+    "`WS /v1/live`",  # rejected without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }
 NO_KEY = {
@@ -218,7 +218,7 @@ FORM = (
     b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
 )
 ACTS = {"`POST /v1/act`", "own port, HTTP act"}  # these reset a session first
-# Each endpoint at which something to decode arrives, for a key; docs/access.md has them all.
+# The endpoints that decode content for a key. docs/access.md lists all endpoints.
 CARRY = {
     endpoint: attempt
     for endpoint, attempt in ATTEMPTS.items()
@@ -241,10 +241,10 @@ def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
         head = (
             f"POST /v1/act HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {visitor.token}\r\n"
         )
-        # None of it is here yet.
+        # The body has not been sent yet.
         connection.sendall(f"{head}content-length: 60000000\r\n\r\n".encode())
         answer = b""
-        while more := connection.recv(65536):  # until it is closed
+        while more := connection.recv(65536):  # until the server closes the connection
             answer += more
     assert b" 429 " in answer.splitlines()[0]
     assert b"retry-after: " in answer.lower()
@@ -262,7 +262,7 @@ def test_nothing_of_a_key_over_its_rate_is_decoded(
     attempt, when = CARRY[endpoint], "with" if "gateway" in endpoint else "after"
     assert attempt(replica.visitor("over its rate"), when) == "429"
     assert decoded == []
-    # An act before a reset.
+    # 409 is the answer to an act before a reset.
     assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")
     assert decoded != []
 
@@ -297,7 +297,7 @@ def test_endpoints_without_a_key_count_what_they_hold(
 
 
 def test_nothing_that_serves_decodes_without_an_admission() -> None:
-    """A dialect that made a budget of its own would ask neither the key nor the replica."""
+    """A dialect with a separate budget would check neither the key's nor the replica's limits."""
     package = Path(vlagents_ray.__file__).parent
     served = list((package / "serve").rglob("*.py"))
     assert package / "serve/engine/admission.py" in served
@@ -305,8 +305,8 @@ def test_nothing_that_serves_decodes_without_an_admission() -> None:
         assert "Budget(" not in file.read_text().replace("class MessageAdmission(Budget):", ""), (
             file
         )
-    # Files that the policy has seen are decoded again, one save at a time, by
-    # `vlagents_ray_live.ring`.
+    # Files that the policy has seen are decoded again only by `vlagents_ray_live.ring`, one saved
+    # recording at a time.
     for file in {*served, *(package / "protocol").glob("*.py")}:
         assert "jpeg_png" not in file.read_text(), file
 
@@ -321,7 +321,7 @@ def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
     assert decoded == []
 
 
-# What a message may take.
+# The memory that a message may use.
 
 
 def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]) -> None:
@@ -379,7 +379,7 @@ def test_what_images_declare_is_refused_before_the_first_is_decoded(decoded: lis
 def test_4k_cameras_pass_by_default() -> None:
     limits = DEFAULT_LIMITS
     assert max(3840 * 2160, 4096 * 2160) <= limits.pixels
-    assert limits.decoded_bytes >= 3 * 4 * 3840 * 2160  # four of them at once
+    assert limits.decoded_bytes >= 3 * 4 * 3840 * 2160  # four images at once
     assert 4 * limits.decoded_bytes <= limits.in_flight_bytes
 
 
@@ -417,14 +417,14 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     robots = [message("robot") for _ in range(2)]
     assert [error for _, error in robots] == [None] * 2
     assert isinstance(message("robot")[1], Overloaded)
-    del simulations[0]  # answered, or dropped
+    del simulations[0]  # the message was answered or dropped
     assert message("robot")[1] is None
-    assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
-    # Into which it will never fit.
+    assert isinstance(message("simulation")[1], Overloaded)  # robots keep the memory that they use
+    # A limit into which the message will never fit.
     small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, free(NoKey.OPEN))
     [answer] = read_requests(frame(reset(priority="simulation")), small)
     assert isinstance(answer, Reply)
-    assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
+    assert isinstance(answer.error, MessageTooLarge), "the client is not asked to wait"
     assert "limits.in_flight_bytes" in str(answer.error)
 
 
@@ -461,7 +461,7 @@ def test_incomplete_messages_give_way_to_a_complete_one() -> None:
     assert given_up == ["a"]
     with pytest.raises(Overloaded):
         held[0].resize(80)
-    with pytest.raises(Overloaded):  # a simulation takes nothing from robots
+    with pytest.raises(Overloaded):  # simulations cannot use the robots' memory
         whole.hold(30, False, 0)
     assert given_up == ["a"]
     whole.release(20, "robot")
@@ -478,11 +478,11 @@ def test_how_long_to_wait_travels_with_the_refusal() -> None:
         assert told.retry_after_s == 2.5  # type: ignore[union-attr]
 
 
-# On which thread.
+# The thread on which a message is decoded.
 
 
 class Sees(Agent):
-    """Answers how high the camera's image is."""
+    """A policy that returns the height of the camera's image."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         return {}
@@ -493,7 +493,9 @@ class Sees(Agent):
 
 @pytest.fixture
 def held_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, list[str]]]:
-    """Large images are decoded once the event is set; the names of the threads that decode them."""
+    """Block the decoding of large images until the event is set, and return the names of the
+    threads that decode them.
+    """
     go_on, threads, original = threading.Event(), [], jpeg_png.decode_file
 
     def decode(file: ImageFile) -> np.ndarray:
@@ -576,12 +578,13 @@ def test_a_frame_that_waits_for_another_to_be_decoded_spends_its_own_deadline(
     client = _connected(endpoints[0])
     client.send(frame(reset()), 10)
     assert decode_replies(client.recv(10))[0].error is None
-    client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 1)  # both are read at once
+    # both messages are read at once
+    client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 1)
     client.send(act(LARGE, "large"), 10)
     client.send(act(JPEG, "small", deadline_ms=200), 10)
     client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 0)
     wait_for(lambda: decoders != [])
-    time.sleep(0.3)  # the deadline
+    time.sleep(0.3)  # the deadline passes
     go_on.set()
     assert decode_replies(client.recv(10))[0].act is not None
     assert isinstance(decode_replies(client.recv(10))[0].error, DeadlineExceeded)
@@ -683,7 +686,7 @@ def test_a_message_that_is_read_again_elsewhere_counts_once(
 
 def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> Any:
-        raise AssertionError("on several cores")
+        raise AssertionError("images were decoded on several cores")
 
     monkeypatch.setattr(codecs, "thread_map", refuse)
     two = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}}
@@ -698,7 +701,7 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
     )
 
 
-# Over the rate.
+# Clients over their rate.
 
 
 def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_behind(
@@ -711,7 +714,7 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
     start, receive = threading.Thread.start, UnixConnection._receive
 
     def noted(thread: threading.Thread) -> None:
-        # Which reads the key file.
+        # The thread "keys" reads the key file.
         if threading.current_thread().name.startswith("policy") and thread.name != "keys":
             started.append(thread.name)
         start(thread)
@@ -741,19 +744,19 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
         for _ in range(6):
             socket.send_fds(one, [LocalAddress.REQUEST.pack(0, 0, len(message))], [descriptor])
     wait_for(lambda: len(held()) == len(crowd) and all(not one._polled for one in held()))
-    wait_for(lambda: len(read) > 2)  # one a second of all that wait
+    wait_for(lambda: len(read) > 2)  # one per second among all that wait
     for one in crowd:
         one.close()
     left = len(read)
     wait_for(lambda: not held())
     os.close(descriptor)
-    assert len(read) <= left + 2, "messages of clients that are gone were read"
+    assert len(read) <= left + 2, "messages of clients that have left were read"
     assert started == []
 
 
 @pytest.mark.parametrize("path", ["own", "/v1/stream", "/vla-eval"])
 def test_what_cannot_be_read_counts_too(replica: KeyedReplica, path: str) -> None:
-    """Or garbage would cost its sender nothing."""
+    """Otherwise garbage would be free for its sender."""
     visitor = replica.visitor("right")
     replica.known.change(visitor.name, rate=1e-6)
     wanted = {"own": _read_reply, "/v1/stream": _read_reply, "/vla-eval": _read_vla_eval}[path]
@@ -762,7 +765,7 @@ def test_what_cannot_be_read_counts_too(replica: KeyedReplica, path: str) -> Non
         replica.known.keys.check(visitor.token, "app").take_request()
 
 
-# What is kept of messages is bounded in bytes, however many the largest ones are.
+# The memory for messages is bounded in bytes, however many of the largest messages arrive.
 
 
 def _rss() -> int:
@@ -771,7 +774,7 @@ def _rss() -> int:
 
 
 def _keyed_stream(replica: KeyedReplica, token: str, path: str = "own") -> Stream:
-    """A WebSocket at the replica's own port, or at a path of its HTTP port."""
+    """Return a WebSocket at the replica's own port, or at a path of its HTTP port."""
     own = replica.own.address
     port, path = (own.port, own.path) if path == "own" else (replica.port, path)
     return Stream(
@@ -780,8 +783,8 @@ def _keyed_stream(replica: KeyedReplica, token: str, path: str = "own") -> Strea
 
 
 def _part(client: Stream, size: int) -> int:
-    """Send all but the last byte of a message of that size, as far as the server reads it;
-    return the bytes left.
+    """Send all but the last byte of a message of that size, until the server reads no more; return
+    the number of unsent bytes.
     """
     connection = client._socket
     connection.setblocking(False)
@@ -806,7 +809,7 @@ def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplic
         one for one in list(replica.own._clients) if getattr(one.caller, "name", "") == visitor.name
     ]
     begun = [one for one in mine if one._received.size > 2**20 + 100]
-    assert len(begun) <= 4  # one a second, of those that took half a second each
+    assert len(begun) <= 4  # one per second, since each took half a second
     assert replica.engine.admission.held <= len(begun) * STREAM_BYTES + 8 * 2**20
     assert _rss() - before < len(begun) * STREAM_BYTES + 8 * 2**20 + SLACK
     for client in clients:
@@ -843,7 +846,7 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
     first.send(frame, 10)
     assert isinstance(decode_replies(first.recv(10))[0].error, TooManyRequests)
     second.send(frame, 10)
-    with pytest.raises(TimeoutError):  # it is not read for a second
+    with pytest.raises(TimeoutError):  # the server does not read it for a second
         second.recv(0.1)
     with pytest.raises(InvalidStatus, match="429"):
         _keyed_stream(replica, visitor.token)
@@ -865,13 +868,13 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
     assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
     replica.known.change(visitor.name, rate=None)
     client.close()
-    # What they hold is read, which takes memory.
+    # The server now reads the bytes in these buffers, which takes memory.
     wait_for(lambda: visitor.name not in replica.known.keys._connections)
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
-    """The layout of its arrays came with the first message, which was rejected before it was
-    parsed.
+    """The first message, which was rejected before it was parsed, contained the layout of its
+    arrays.
     """
     visitor = replica.visitor("right")
     transport = ShmTransport(replica.local.address, Credentials(visitor.token))
@@ -891,8 +894,8 @@ def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedRepl
 def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message,
-    and a part more.
+    """12 connections that each send part of a message of 24 MiB use at most the 64 MiB of one
+    message, and part of another.
     """
     monkeypatch.setattr(gr00t, "_STRANGER_S", 3.0)
     monkeypatch.setattr(gr00t, "_MESSAGE_S", 3.0)
@@ -918,7 +921,7 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
         connection.sendall(
             b"\x04" + bytes([len(greeted)]) + greeted + b"\x02" + struct.pack(">Q", 2 * len(part))
         )
-        with contextlib.suppress(OSError):  # it is cut off meanwhile
+        with contextlib.suppress(OSError):  # the server closes the connection in the meantime
             connection.sendall(part)
     assert _rss() - before < DEFAULT_LIMITS.body_bytes + len(part) + SLACK
     wait_for(lambda: all(_ended(one) for one in held))
@@ -955,7 +958,7 @@ def test_a_request_at_groots_gateway_counts_as_in_flight_for_its_key() -> None:
         return str(refused.value)
 
     with ThreadPoolExecutor(3) as clients:
-        first = clients.submit(error_of, tokens[0], seen)  # 1.2 MB, which waits for a replica
+        first = clients.submit(error_of, tokens[0], seen)  # 1.2 MB, which wait for a replica
         wait_for(lambda: admission.held > 10**6)
         assert "overloaded" in error_of(tokens[0], seen)  # the share of a key is half
         other = clients.submit(error_of, tokens[1], seen)

@@ -1,4 +1,4 @@
-"""The security headers of every page that is served, and of the pages that are files."""
+"""The security headers of every served page, and the content policy of pages that are files."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_no_other_module_sends_html() -> None:
 
 
 def test_pages_that_are_files_load_nothing_from_elsewhere() -> None:
-    """A browser reads `frame-ancestors` in headers alone, which a file has not."""
+    """Browsers accept `frame-ancestors` only in headers, which a file does not have."""
     templates = [
         path for path in PACKAGE.rglob("*.j2") if "<!doctype html>" in path.read_text().lower()
     ]

@@ -1,4 +1,4 @@
-"""Ports for HAProxy, and the address that it listens at."""
+"""Ports for HAProxy, and the address at which it listens."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_block, free_port
 
 @pytest.fixture
 def claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """None of this process at the beginning, and none of the test at its end."""
+    """This process has no claims at the beginning, and those of the test are released at
+    its end.
+    """
     monkeypatch.setattr(ports, "_claims", deque())
     yield
     while ports._claims:
@@ -29,18 +31,18 @@ def claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def free_range(length: int) -> tuple[int, int]:
-    """Ports next to each other that nobody has, below those that the kernel gives to
+    """Return a range of free adjacent ports, below the ports that the kernel assigns to
     connections.
     """
     for first in range(10_000, 20_000, length):
         if all(is_free(EVERYWHERE, port) for port in range(first, first + length)):
             return first, first + length
-    pytest.fail(f"no {length} free ports next to each other")
+    pytest.fail(f"no {length} free adjacent ports")
 
 
 @contextmanager
 def drawn_elsewhere(setting: str, draw: str, number: int) -> Iterator[set[int]]:
-    """The ports that another process has drawn, which lives for as long as the context."""
+    """Yield the ports that another process has drawn; it lives during the context."""
     program = (
         f"import sys; from vlagents_ray.serve import ports; {setting}\n"
         f"print(*({draw} for _ in range({number})), flush=True); sys.stdin.read()"
@@ -78,7 +80,7 @@ def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.Mo
     monkeypatch.setattr(ports, "_CLAIMS", 40)
     monkeypatch.setattr(ports, "_excluded", set())
     keep(*range(first, first + 10))
-    given = [free_port() for _ in range(200)]  # more than there are: the oldest are given again
+    given = [free_port() for _ in range(200)]  # more than exist, so the oldest are assigned again
     assert min(given) >= first + 10
     assert all(len(set(given[i : i + 40])) == 40 for i in range(160))
 
@@ -100,7 +102,7 @@ def test_servers_that_start_at_once_get_different_blocks(monkeypatch: pytest.Mon
         monkeypatch.setattr(ports, "_BLOCKS", (first, end))
         ours = {free_block(10) for _ in range(3)}
         assert theirs | ours == set(range(first, end, 10))
-        assert free_block(10) in theirs | ours  # a further server shares one
+        assert free_block(10) in theirs | ours  # a further server shares a block
 
 
 @pytest.mark.usefixtures("claims")
@@ -137,7 +139,8 @@ def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.Mon
     assert "bind 192.0.2.7:8000\n" in front.settings()
     assert f"server inside {LOOPBACK}:8001\n" in front.settings()
     front.require()
-    monkeypatch.setenv("RAY_SERVE_HAPROXY_BALANCE_ALGORITHM", "leastconn")  # as a user may have it
+    # a setting that a user may have
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BALANCE_ALGORITHM", "leastconn")
     with pytest.raises(ConfigError, match="to this function"):
         front.require()
 

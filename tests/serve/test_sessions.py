@@ -1,4 +1,4 @@
-"""Session copies: own state, shared weights."""
+"""Copies of a policy for sessions, with separate state and shared weights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.torch
 
 
 class Stateful(Agent):
-    """Keeps state in every way that comes to mind."""
+    """A policy that keeps state in many different forms."""
 
     def initialize(self) -> None:
         self.history: list[int] = []
@@ -84,7 +84,7 @@ class Heavy(Agent):
 
     def initialize(self) -> None:
         self.model = torch.nn.Sequential(torch.nn.Linear(3, 3), torch.nn.BatchNorm1d(3))
-        self.model.actions = []  # as LeRobot's policies keep their queue
+        self.model.actions = []  # like LeRobot's policies store their queue
         self.table = {"big": np.zeros(10)}
         self.own = {"small": np.zeros(10)}
 
@@ -97,7 +97,7 @@ def test_weights_are_shared_and_module_state_is_not() -> None:
     assert a.model[1].running_mean is not b.model[1].running_mean
     a.model.actions.append(1.0)
     assert b.model.actions == []
-    assert a.table is b.table, "it is named"
+    assert a.table is b.table, "the message names the attribute"
     assert a.own is not b.own
 
 
@@ -142,7 +142,7 @@ def test_a_full_table_refuses_and_makes_room_for_the_idle_which_are_forgotten() 
 
 
 class Networked(Agent):
-    """Weights that are shared, state that is not."""
+    """A policy with shared weights and separate state."""
 
     shared = ("table",)
 
@@ -162,7 +162,7 @@ def test_a_session_goes_on_in_another_replica_with_its_state_and_the_other_ones_
     session.state += 5
     session.seen.append(np.arange(3))
     data = ours.dump(session)
-    assert len(data) < 2000  # no weights in it
+    assert len(data) < 2000  # the data contains no weights
     moved = theirs.load(data)
     assert moved.state.tolist() == [5, 5, 5]
     assert moved.seen[0].tolist() == [0, 1, 2]
@@ -190,7 +190,7 @@ def test_a_connection_ends_its_own_sessions_only() -> None:
     table = SessionTable(limit=10, idle_s=60)
     for name in ("a", "b"):
         table.open(name, Origin(owner="left"))
-    table.open("b", Origin(owner="right"))  # its client came again, by another connection
+    table.open("b", Origin(owner="right"))  # its client returned over another connection
     table.open("c")
     table.close_owned("left", ["a", "b", "c", "d"])
     assert table.ids() == ["b", "c"]
@@ -208,7 +208,7 @@ def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clo
 
 
 class HeldModels:
-    """Counts how often the model of each session is released."""
+    """Counts the releases of the model of each session."""
 
     def __init__(self) -> None:
         self.released: list[str] = []
@@ -284,7 +284,7 @@ def test_a_session_releases_its_model_however_it_ends_and_others_keep_theirs(end
         (9, 0, 0, False),
         (9, 7, 0, False),
         (9, 7, 9, False),
-        (10, 0, 0, True),  # the announced episode has moved here before its announcement
+        (10, 0, 0, True),  # the announced episode moved here before its announcement
         (10, 2, 0, True),
         (11, 0, 0, True),
         (9, 7, 10, True),  # a reset in progress counts as completed
@@ -348,6 +348,6 @@ def test_a_cancelled_reset_leaves_its_connection_in_the_episode_that_it_was_in(
 
     second, _ = table.begin(session, None, 0.0, origin)
     table.undo("a", first, origin, before)
-    assert origin.sessions == {"a": second, "b": 4}, "it is in a newer episode by now"
+    assert origin.sessions == {"a": second, "b": 4}, "the session is already in a newer episode"
     table.undo("a", second, origin, before)
     assert origin.sessions == {"a": previous, "b": 4}

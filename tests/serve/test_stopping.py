@@ -1,5 +1,5 @@
-"""What a client gets when its server stops, and what becomes of its acts when it leaves, at each
-endpoint.
+"""The answers to clients when a server stops, and the fate of a client's acts when the client
+leaves, at each endpoint.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.dialects.base import RouteDialect
 
 SITUATIONS = ("idle", "in flight", "waiting", "half a message")
-BRIGHTNESS = {"in flight": HELD + 1, "waiting": 3}  # brightness of the act
+BRIGHTNESS = {"in flight": HELD + 1, "waiting": 3}  # brightness of the picture in the act
 EACH = [
     pytest.param(name, situation, id=f"{name}, {situation}")
     for name in CLIENTS
     for situation in SITUATIONS
-    # Datagrams and Zenoh's samples arrive as a whole.
+    # Datagrams and Zenoh's samples always arrive as a whole.
     if situation != "half a message" or name not in ("shared memory", "lerobot_remote")
 ]
 
@@ -53,7 +53,7 @@ class Scene:
 
     @property
     def acts(self) -> list[int]:
-        """The acts that the policy has executed for the client since its first one."""
+        """Return the acts that the policy executed for the client since the client's first act."""
         return [
             brightness
             for brightness in self.server.policy.acted
@@ -63,7 +63,7 @@ class Scene:
 
 @contextlib.contextmanager
 def scene(name: str, situation: str) -> Iterator[Scene]:
-    """A client of a server, in this situation."""
+    """Yield a server and its client in this situation."""
     with contextlib.ExitStack() as stack:
         server = StoppableServer(stack)
         stack.callback(server.policy.gate.set)
@@ -83,7 +83,7 @@ def scene(name: str, situation: str) -> Iterator[Scene]:
 
 @pytest.mark.parametrize(("name", "situation"), EACH)
 def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str) -> None:
-    """It answers what it has accepted, and closes WebSockets with 1012 and a reason."""
+    """The server answers all accepted requests, and closes WebSockets with 1012 and a reason."""
     with scene(name, situation) as at:
         stopping = threading.Thread(target=at.server.stop)
         stopping.start()
@@ -103,13 +103,13 @@ def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str)
 
 
 @pytest.mark.parametrize("sends_more", [False, True], ids=["only reads", "sends half a message"])
-# LeRobot's clients take 4 MB: test_http2_front.py.
+# LeRobot's clients accept at most 4 MB; test_http2_front.py tests them.
 @pytest.mark.parametrize("name", ["own port", "GR00T", "vlagents"])
 def test_an_answer_that_is_written_before_a_stop_arrives_at_a_slow_client(
     name: str, sends_more: bool
 ) -> None:
-    """Also if the client has sent what is never read, for which the kernel resets a connection
-    that is closed.
+    """This also holds if the client has sent bytes that the server never reads, for which the
+    kernel resets a connection when it is closed.
     """
     with contextlib.ExitStack() as stack:
         server = StoppableServer(stack)
@@ -118,7 +118,8 @@ def test_an_answer_that_is_written_before_a_stop_arrives_at_a_slow_client(
         relay.gate.clear()
         client.send(LARGE)
         assert relay.is_holding.wait(BOUND_S)
-        if sends_more and name != "GR00T":  # whose client cannot, before it has an answer
+        # GR00T's client cannot send more before it has an answer
+        if sends_more and name != "GR00T":
             client.send_half()
         stopping = threading.Thread(target=server.stop)
         stopping.start()
@@ -143,7 +144,7 @@ def test_an_answer_over_shared_memory_arrives_though_a_later_message_is_never_re
         acts = [Request("act", Obs({"front": image(2)}), request_id="1")]
         transport._send(connection, acts, deadline)
         connection.setblocking(True)
-        connection.recv(1, socket.MSG_PEEK)  # the answer is written
+        connection.recv(1, socket.MSG_PEEK)  # the answer has been written
         server.engine.close()
         connection.send(b"x")
         server.near.close()
@@ -155,8 +156,8 @@ def test_an_answer_over_shared_memory_arrives_though_a_later_message_is_never_re
 def test_no_act_is_executed_for_a_client_that_left_before_it_began(
     name: str, situation: str
 ) -> None:
-    """A gateway notices only after an act that its client has left; that client's acts end with
-    its session.
+    """A gateway notices only after an act that its client has left. The acts of that client end
+    with its session.
     """
     with scene(name, situation) as at:
         of_client = [request for request in at.server.queued if request.session_id not in OTHERS]

@@ -1,4 +1,6 @@
-"""API keys: who is let in, how often, and that a change of the file counts."""
+"""API keys: which clients are accepted, at which rate, and how a change of the file takes
+effect.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,7 @@ from vlagents_ray.serve.requests import IncomingMessage
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)  # every check looks at the file
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)  # the file is checked at each request
     return tmp_path / "keys.json"
 
 
@@ -211,7 +213,9 @@ def test_a_network_drive_that_hangs_delays_one_request_and_closes_the_server_lat
 def test_a_file_that_cannot_be_read_any_more_closes_the_server(
     error: Exception, at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its owner or mode has changed, its folder is gone, its network drive hangs."""
+    """Reading fails if the file's owner or mode has changed, its folder is gone, or its network
+    drive hangs.
+    """
     now, failing = 1000.0, False
     monkeypatch.setattr(api_keys.time, "monotonic", lambda: now)
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
@@ -248,7 +252,7 @@ def test_a_change_of_mode_alone_is_looked_at(file: Path) -> None:
 
 
 def test_the_file_keeps_its_owner_and_its_mode(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who revokes a key is not who the server runs as."""
+    """The user who revokes a key may differ from the user who runs the server."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o755)
@@ -339,7 +343,7 @@ def test_each_request_of_a_message_is_charged_to_the_key_once(
     message = sender.message(charge)
     sender.send(message, decoded, Calls(ignore), admission=admission)
     engine.close()
-    # The engine is not started.
+    # The engine has not been started.
     assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3
     with pytest.raises(TooManyRequests):
         caller.take_request()
@@ -432,7 +436,7 @@ def test_off_loopback_somebody_must_have_decided_who_is_let_in(file: Path) -> No
     new_key(file, "arm")
     for host in ("127.0.0.1", "127.0.0.2", "localhost", "::1"):
         require_access(host, None, insecure=False)
-    for host in ("0.0.0.0", "192.0.2.1", "::", "", "127.example.org"):  # noqa: S104 - what is refused
+    for host in ("0.0.0.0", "192.0.2.1", "::", "", "127.example.org"):  # noqa: S104 - an address that is rejected
         with pytest.raises(ConfigError, match="--insecure"):
             require_access(host, None, insecure=False)
         require_access(host, Keys.from_file(file), insecure=False)
@@ -442,7 +446,7 @@ def test_off_loopback_somebody_must_have_decided_who_is_let_in(file: Path) -> No
 def test_keys_over_plain_http_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     api_keys.warn_of_plain_http("127.0.0.1")
     assert not caplog.records
-    api_keys.warn_of_plain_http("0.0.0.0")  # noqa: S104 - what is warned of
+    api_keys.warn_of_plain_http("0.0.0.0")  # noqa: S104 - an address that causes a warning
     assert "--plain-http" in caplog.text
 
 
@@ -501,7 +505,8 @@ def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
 def test_a_replica_writes_the_audit_log_where_nobody_has_set_up_logging(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(audit.logger, "propagate", False)  # as where the root has no handlers
+    # like in a process whose root logger has no handlers
+    monkeypatch.setattr(audit.logger, "propagate", False)
     monkeypatch.setattr(audit.logger, "handlers", [])
     monkeypatch.setattr(audit.logger, "level", logging.NOTSET)
     audit.write_audit()

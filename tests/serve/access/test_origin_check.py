@@ -1,4 +1,4 @@
-"""Which requests a server without keys takes for those of another site's page."""
+"""The requests that a server without keys rejects because they come from a page of another site."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OTHERS = (
     "evil.example@127.0.0.1.evil.example",
     "[::1",
     "evil.example.",
-    "a" * 300,  # no name is that long, and what a name means is remembered
+    "a" * 300,  # no host name is that long; the result of each lookup is cached
 )
 
 
@@ -59,9 +59,10 @@ def test_whoever_runs_the_server_says_which_of_them_are_its_own(
 
 def test_a_page_is_ours_at_its_address_alone() -> None:
     require_own_page({"host": "127.0.0.1:8000", "origin": "http://127.0.0.1:8000"})
-    require_own_page({})  # no browser
+    require_own_page({})  # a client that is not a browser
     for page in ("https://evil.example", "null", "http://[", "http://127.0.0.1:9000"):
         with pytest.raises(Forbidden, match="origin"):
             require_own_page({"host": "127.0.0.1:8000", "origin": page})
-    with pytest.raises(Forbidden):  # a name, whoever says that it is ours
+    # an origin with a host name is rejected, even if the operator has configured the name
+    with pytest.raises(Forbidden):
         require_own_page({"host": "a.example", "origin": "http://a.example"}, ["a.example"])

@@ -1,4 +1,6 @@
-"""Rate and sessions of a key with two replicas: each replica counts by itself, as docs/access.md says."""
+"""Rate and session limit of a key with two replicas: each replica counts separately, as
+docs/access.md explains.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ class Policy(Agent):
 
 @pytest.fixture
 def replicas() -> Iterator[list[int]]:
-    """The ports of two replicas, which read the same file of keys."""
+    """Yield the ports of two replicas that read the same file of keys."""
     key = {"name": "x", "sha256": sha256(b"x").hexdigest(), "rate": RATE, "sessions": SESSIONS}
     metadata = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}
     with contextlib.ExitStack() as stack:
@@ -46,7 +48,7 @@ def replicas() -> Iterator[list[int]]:
 
 
 def statuses(port: int, paths: list[str], sessions: list[str]) -> Counter[int]:
-    """Return how many requests at a replica got each status."""
+    """Return the number of requests at a replica by HTTP status."""
     counted: Counter[int] = Counter()
     for path, session in zip(paths, sessions, strict=True):
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
@@ -62,7 +64,9 @@ def statuses(port: int, paths: list[str], sessions: list[str]) -> Counter[int]:
 
 
 def test_a_key_has_its_rate_at_each_replica(replicas: list[int]) -> None:
-    """A burst of a second's requests; those at one replica do not count at the other."""
+    """A burst may contain the requests of one second. Requests at one replica do not count at the
+    other.
+    """
     paths = ["/v1/reset", *["/v1/act"] * (RATE - 1)]
     first, second = (statuses(port, paths, ["s"] * RATE) for port in replicas)
     assert first == second == {200: RATE}

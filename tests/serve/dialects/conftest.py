@@ -1,4 +1,4 @@
-"""The fixtures of tests of dialects."""
+"""Fixtures for tests of dialects."""
 
 from dialect_fixtures import everything, one_replica, open_dialect
 

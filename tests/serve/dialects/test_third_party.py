@@ -1,4 +1,4 @@
-"""A dialect of somebody else's: the example in `vlagents_ray/serve/dialects/base.py`, from
+"""A third-party dialect: the example in `vlagents_ray/serve/dialects/base.py`, installed from
 outside of this package.
 """
 
@@ -25,7 +25,7 @@ CLASS = f"{PACKAGE}:PlainDialect"
 
 @pytest.fixture(name="package")
 def installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The example as a module that can be imported; returns the folder that it lies in."""
+    """Write the example as an importable module, and return its folder."""
     _, _, rest = base.__doc__.partition("::\n\n")
     (tmp_path / f"{PACKAGE}.py").write_text(textwrap.dedent(rest.partition("\n`tests/")[0]))
     monkeypatch.syspath_prepend(tmp_path)
@@ -35,7 +35,7 @@ def installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(name="plain")
 def entry_point(package: Path) -> str:
-    """The name under which a distribution registers the example."""
+    """Return the name under which a distribution registers the example."""
     info = package / f"{PACKAGE}-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PACKAGE}\nVersion: 1\n")

@@ -1,5 +1,5 @@
-"""The guard before the robots' endpoint: keys and slow clients, on a real HTTP server without
-Ray.
+"""The access middleware in front of the robots' endpoint, with API keys and slow clients, on a real
+HTTP server without Ray.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TOKENS = {
 
 
 class Big(Agent):
-    """Tells more than any socket takes without being read."""
+    """A policy whose answers are larger than the buffers of any socket."""
 
     def act(self, obs: Obs) -> Act:
         return Act(
@@ -162,7 +162,7 @@ def test_only_the_page_itself_is_read_without_a_key(
 def test_who_asks_often_without_a_key_is_answered_as_late_as_with_a_wrong_one(
     endpoint: Endpoint,
 ) -> None:
-    """Each answer takes the event loop and Python's lock, for which robots wait."""
+    """Each answer takes time of the event loop and holds the GIL, which delays robots."""
     guard = AccessMiddleware(
         PlainTextResponse("a page without data"), Keys.from_file(endpoint.file), "noop"
     )
@@ -170,11 +170,13 @@ def test_who_asks_often_without_a_key_is_answered_as_late_as_with_a_wrong_one(
     begun = time.monotonic()
     for _ in range(81):
         assert client.get("/healthz").status_code == 200
-    assert time.monotonic() - begun > 1.0  # 20 at once, then at most 40 a second
+    assert time.monotonic() - begun > 1.0  # 20 answers at once, then at most 40 per second
 
 
 def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> None:
-    """A browser on the robot's machine says whose page asks, and reaches loopback."""
+    """A browser on the robot's machine can reach the loopback address, but names the page that
+    sends the request.
+    """
     unkeyed = AccessMiddleware(
         build_http_app(
             endpoint.engine,
@@ -189,7 +191,8 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
         assert own.get("/v1/metadata", {"origin": "https://evil.example"})[0] == 403
         assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
         rebound = {"origin": "http://evil.example:8000", "host": "evil.example:8000"}
-        assert own.get("/v1/metadata", rebound)[0] == 403  # a name that its site has lead here
+        # another site's name that resolves to this machine
+        assert own.get("/v1/metadata", rebound)[0] == 403
         with (
             pytest.raises(InvalidStatus) as refused,
             own.stream({"origin": "https://evil.example"}),
@@ -210,7 +213,7 @@ def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> Non
         (bearer(endpoint.tokens["other"]), 403),
     ):
         with pytest.raises(InvalidStatus) as refused, endpoint.stream(headers):
-            pytest.fail("was let in")
+            pytest.fail("the client was accepted")
         assert refused.value.response.status_code == status
         assert json.loads(refused.value.response.body or b"")["status"] == status
 
@@ -254,7 +257,7 @@ def test_a_client_without_a_right_key_hears_so_at_once(endpoint: Endpoint, trans
             RemoteAgent(endpoint.url, transport=transport, api_key=token) as agent,
         ):  # type: ignore[arg-type]
             agent.reset(Obs(), "x")
-    # It tries no further for the 60 s that a server may take to start.
+    # The client does not retry for the 60 s that a server may take to start.
     assert time.monotonic() - begun < 20
 
 
@@ -345,8 +348,8 @@ def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint)
 def test_an_application_that_misses_its_cancellation_receives_nothing_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`asyncio.wait_for` of Python 3.11 drops a cancellation that comes with the message that it
-    waits for.
+    """`asyncio.wait_for` of Python 3.11 drops a cancellation that arrives together with the awaited
+    message.
     """
     file = tmp_path / "keys.json"
     token = new_key(file, "leaver")
@@ -358,7 +361,7 @@ def test_an_application_that_misses_its_cancellation_receives_nothing_more(
         await send({"type": "websocket.accept"})
         try:
             while True:
-                with contextlib.suppress(asyncio.CancelledError):  # as `wait_for` does
+                with contextlib.suppress(asyncio.CancelledError):  # like `wait_for` does
                     received.append((await receive())["type"])
                 if len(received) > 3:
                     return
@@ -445,7 +448,7 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(
         ) as stream:
             stream.send(encode_requests([Request("reset", Obs())]))
             wait_for(deaf_ones)
-            # Before the last is sent, on a busy machine.
+            # On a busy machine the connection may close before the last message is sent.
             with contextlib.suppress(ConnectionClosed):
                 for _ in range(30):
                     stream.send(encode_requests([Request("act", Obs(info={"bytes": 2**20}))]))
@@ -469,9 +472,9 @@ def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> N
             )
             accepted, _, early = half.recv(4096).partition(b"\r\n\r\n")
             assert accepted.startswith(b"HTTP/1.1 101")
-            # Of a masked frame of 126 bytes, the first 4.
+            # The first 4 bytes of a masked frame of 126 bytes.
             half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))
-            assert (early or half.recv(4096))[0] == 0x88  # the server closes
+            assert (early or half.recv(4096))[0] == 0x88  # the server sends a close frame
         with (
             connect(
                 f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1

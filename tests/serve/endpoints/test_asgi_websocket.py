@@ -1,4 +1,4 @@
-"""WebSockets at the server's port, whose sockets are taken from uvicorn."""
+"""WebSockets at the server's port, whose sockets are taken over from uvicorn."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ HANDSHAKE = (
 
 
 class SlowEcho:
-    """An application that takes 10 ms for a message, and answers with 64 KiB."""
+    """An application that takes 10 ms for each message, and answers with 64 KiB."""
 
     def __init__(self) -> None:
         self.received = 0
-        self.serving = 0  # tasks that serve a WebSocket
+        self.serving = 0  # number of tasks that serve a WebSocket
         self.ended = threading.Event()
 
     async def serve(self, socket: WebSocket) -> None:
@@ -86,7 +86,7 @@ def test_messages_are_answered_in_order(port: int, echo: SlowEcho) -> None:
 
 
 def test_messages_of_a_client_that_has_left_are_not_served(port: int, echo: SlowEcho) -> None:
-    """The kernel holds thousands of them."""
+    """The kernel's buffers may still contain thousands of its messages."""
     with connected(port) as client:
         for _ in range(5000):
             client.send(b"x")
@@ -117,14 +117,14 @@ def test_a_client_that_answers_no_ping_is_cut_off(
         with socket.create_connection(("127.0.0.1", port), 10) as absent:
             absent.sendall(HANDSHAKE)
             assert absent.recv(4096).startswith(b"HTTP/1.1 101")
-            absent.recv(4096)  # the ping, which it does not answer
+            absent.recv(4096)  # a ping, which this client does not answer
             wait_for(echo.ended.is_set)
         present.send(b"x")
         assert present.recv(10) == ANSWER
 
 
 def test_a_websocket_without_a_socket_is_served_by_its_messages(echo: SlowEcho) -> None:
-    """As behind Serve's own proxy, which passes messages on to another process."""
+    """Serve's own proxy passes messages to another process, so the application has no socket."""
     guarded = AccessMiddleware(Starlette(routes=[WebSocketRoute("/", echo.serve)]), None, "app")
     with TestClient(guarded).websocket_connect("/") as client:
         client.send_bytes(b"x")
@@ -143,5 +143,5 @@ def test_a_client_that_leaves_before_it_is_accepted_leaves_no_task(
         client.send(b"x")
         assert client.recv(10) == ANSWER
     assert echo.ended.wait(10)
-    # Each task that serves a WebSocket ends with it; the handshakes above were all received.
+    # Each task ends with its WebSocket. All handshakes above were received.
     wait_for(lambda: echo.serving == 0)

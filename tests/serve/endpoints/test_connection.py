@@ -1,4 +1,4 @@
-"""Letting clients in at a listening socket, whatever goes wrong with one of them."""
+"""Accepting clients at a listening socket, whatever fails with one of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 
 
 class Endpoint(PolledServer[Any]):
-    """Keeps who comes, or rejects to."""
+    """An endpoint that keeps the connections of its clients, or fails to add them."""
 
     def __init__(self) -> None:
         listener = socket.create_server(("127.0.0.1", 0))
@@ -95,8 +95,8 @@ def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(
 def test_connections_that_their_clients_have_ended_neither_count_nor_delay_the_next(
     endpoint: Endpoint,
 ) -> None:
-    """They also fit into the backlog: the kernel would discard the next client's SYN, which is
-    sent again after one second.
+    """All connections also fit into the backlog. Otherwise the kernel would discard the next
+    client's SYN, which is sent again after one second.
     """
     endpoint._listener.listen(BACKLOG)
     endpoint._accepting = TokenBucket(1e-3, time.monotonic())  # one connection in 1,000 s

@@ -1,4 +1,4 @@
-"""Requests over HTTP that pass by Serve's own code."""
+"""HTTP requests that bypass Serve's own code."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ HEADERS = {"x-session-id": "robot", "content-type": "application/json"}
 
 
 class Log:
-    """The numbers in the observations that were acted on."""
+    """The numbers in the observations on which the policy acted."""
 
     def __init__(self) -> None:
         self.acts: list[Any] = []
 
 
 class Gated(Agent):
-    """Waits in an act until its gate is open."""
+    """A policy whose acts wait until its gate is open."""
 
     def __init__(self) -> None:
         self.gate = threading.Event()
@@ -52,7 +52,9 @@ class Gated(Agent):
 
 
 class Server:
-    """A replica with a prefix behind a stand-in for Serve, which counts what it passes on."""
+    """A replica with a prefix, behind a stand-in for Serve that counts the requests that it
+    receives.
+    """
 
     def __init__(self, prefix: str) -> None:
         self.prefix = prefix

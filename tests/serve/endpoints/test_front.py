@@ -1,5 +1,5 @@
-"""What happens before Serve's own code: headers that are not UTF-8, and messages over the limit
-of the server.
+"""Checks before Serve's own code: headers that are not UTF-8, and messages over the
+server's limit.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _close_of(url: str, size: int) -> tuple[int, str]:
                 if closed.rcvd is None
                 else (closed.rcvd.code, closed.rcvd.reason)
             )
-    raise AssertionError("the server has answered")
+    raise AssertionError("the server answered a message over its limit")
 
 
 def test_a_message_over_the_limit_gets_1009_with_a_reason_each_time() -> None:
@@ -52,7 +52,7 @@ def test_a_message_over_the_limit_gets_1009_with_a_reason_each_time() -> None:
             assert code == 1009
             assert str(STREAM_BYTES) in reason
         with connect(url, max_size=None, compression=None) as client:
-            client.send(bytes(STREAM_BYTES))  # as docs/other_clients.md says
+            client.send(bytes(STREAM_BYTES))  # the limit in docs/other_clients.md
             assert client.recv(timeout=10) == b"\0"
 
 
@@ -71,7 +71,7 @@ def test_headers_that_are_not_utf_8_are_malformed(header: bytes) -> None:
                 )
                 head, _, body = client.recv(65536).partition(b"\r\n\r\n")
                 assert head.split(b" ")[1] == b"400"
-                if b"x-\xe9" in header:  # the server itself rejects a name with such bytes
+                if b"x-\xe9" in header:  # the HTTP server itself rejects such a header name
                     continue
                 while not body.endswith(b"}"):
                     body += client.recv(65536)

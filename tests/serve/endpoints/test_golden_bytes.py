@@ -1,6 +1,6 @@
 """Each endpoint of the core answers with the recorded bytes in each situation.
 
-tests/golden/endpoints has the bytes, and `endpoint_situations` the table of situations.
+tests/golden/endpoints contains the bytes, and `endpoint_situations` the table of situations.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The robots' endpoint, over an engine without Ray: every fault has its documented answer."""
+"""The HTTP endpoint of robots, over an engine without Ray: each fault gets its documented
+answer.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ LIMITS = MessageLimits(body_bytes=300_000, pixels=64 * 64)
 
 
 class Mean(Agent):
-    """Acts with the mean colour of its camera and its joints."""
+    """A policy that returns the mean colour of its camera, and its joints."""
 
     @property
     def contract(self) -> Contract:
@@ -117,7 +119,7 @@ MULTIPART = {"x-session-id": "robot-1", "content-type": "multipart/form-data; bo
 
 
 def form(*parts: tuple[str, str | None, bytes]) -> bytes:
-    """Parts of a name, a filename if any, and content."""
+    """Return a multipart form. Each part has a name, a filename or None, and its content."""
     written = [
         b'--b\r\ncontent-disposition: form-data; name="%s"%s\r\n\r\n%s\r\n'
         % (name.encode(), b"" if file is None else b'; filename="%s"' % file.encode(), content)
@@ -127,7 +129,7 @@ def form(*parts: tuple[str, str | None, bytes]) -> bytes:
 
 
 OBS = ("obs", None, json.dumps(GOOD).encode())
-HINTS = [  # what is sent, and what the answer says of it
+HINTS = [  # a form, and the text in its error
     (
         form(OBS, ("cameras.front", "f", JPEG), ("cameras.front", "f", JPEG)),
         "expected the part 'cameras.front' once, got it twice",
@@ -226,7 +228,7 @@ def test_health_metadata_and_docs(client: TestClient) -> None:
 
 
 class Slow(Mean):
-    """A policy whose load has two steps, of which the second one waits."""
+    """A policy whose load has two steps; the second one waits."""
 
     def __init__(self) -> None:
         self.compiling, self.go_on = threading.Event(), threading.Event()
@@ -270,8 +272,8 @@ FRAME = encode_requests(
 )
 FRAMED = {"content-type": CONTENT_TYPE}
 
-# (request, status, code): each kind of fault that a robot's software can commit; tests/protocol has
-# more of frames.
+# (request, status, code) for each kind of fault in a robot's software; tests/protocol has further
+# faults of frames.
 FAULTS: list[tuple[dict[str, Any], int, str]] = [
     *[({"files": {"cameras.front": JPEG[:-cut]}}, 400, "malformed") for cut in (20, 700)],
     *[({"content": FRAME[:-cut], "headers": FRAMED}, 400, "malformed") for cut in (1, 900)],
@@ -383,15 +385,17 @@ def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
     engine.start()
     with TestClient(AccessMiddleware(build_http_app(engine, dict, LIMITS), None, "app")) as slow:
         post(slow, "reset")
-        # The policy is at work on it; on a busy machine the first may be over before.
+        # Until the policy acts on the request. On a busy machine the first deadlines may pass
+        # before.
         while not acts:
             answer = post(slow, "act", headers={"x-deadline-ms": "30"})
         assert (answer.status_code, answer.json()["code"]) == (504, "outcome_unknown")
-        answer = post(slow, "act", headers={"x-deadline-ms": "30"})  # it waits behind that
+        # this act waits behind the first one
+        answer = post(slow, "act", headers={"x-deadline-ms": "30"})
         assert (answer.status_code, answer.json()["code"]) == (504, "deadline_exceeded")
         gate.set()
         assert post(slow, "act").status_code == 200
-        assert acts == 2, "what was answered with deadline_exceeded was acted on"
+        assert acts == 2, "the policy acted on a request that was answered with deadline_exceeded"
     engine.close()
 
 
@@ -401,7 +405,7 @@ def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
         "unknown_app",
     )
     assert client.get("/v1/metadata/", follow_redirects=False).status_code == 404
-    for path in ("/nope", "/v1/act"):  # 403 would read as a problem of keys
+    for path in ("/nope", "/v1/act"):  # 403 would look like a missing key
         with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
             pass
         assert (refused.value.status_code, refused.value.json()["code"]) == (404, "unknown_app")

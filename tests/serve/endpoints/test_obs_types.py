@@ -1,5 +1,5 @@
-"""A policy gets observations of exactly the declared types, and no malformed request is the
-server's failure.
+"""A policy receives observations with exactly the declared types, and a malformed request never
+causes a server error.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vlagents_ray.serve.models.checkpoints import Checkpoints
 
 
 def require_types(obs: Obs) -> None:
-    """Fail unless each field has exactly the type of `Obs`."""
+    """Fail unless each field has exactly its declared type."""
     assert type(obs) is Obs
     assert type(obs.cameras) is dict
     assert type(obs.state) is dict
@@ -47,7 +47,9 @@ def require_types(obs: Obs) -> None:
 
 
 class Strict(Agent):
-    """Checks what it gets, and puts a value into its answers that only some encodings have."""
+    """A policy that checks its observations, and answers with a value that only some encodings
+    support.
+    """
 
     def __init__(self) -> None:
         self.wrong: list[str] = []
@@ -180,7 +182,9 @@ def with_value(field: str, value: Any) -> dict[str, Any]:
 
 
 def is_fine(status: int, field: str) -> bool:
-    """A deadline of a millisecond passes, which is no failure of the server either."""
+    """Return whether the status is no server error. A deadline of a millisecond may pass, which
+    gives 504.
+    """
     return status < 500 or (field == "deadline_ms" and status == 504)
 
 
@@ -227,7 +231,7 @@ def test_a_document_with_any_value_in_any_field_is_answered(
     "op", ["reset", "act", "close", "call", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []]
 )
 def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None:
-    """At the endpoints without status codes: own port, shared memory and plasma."""
+    """These tests cover the endpoints without status codes: own port, shared memory and plasma."""
     for field in FIELDS:
         for value in VALUES:
             data = b"".join(frame_layout.pack({"op": op} | with_value(field, value), list(BLOBS)))
@@ -282,8 +286,8 @@ class Joints(Agent):
 def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
     order: tuple[str, str],
 ) -> None:
-    """In one frame, the act is checked as it arrives, when the session still has the earlier
-    checkpoint.
+    """The act arrives in the same frame, while the session still uses the earlier checkpoint, whose
+    contract is checked first.
     """
     choices = {"arm7": {"dim": 7}, "arm3": {"dim": 3}}
     engine = Engine(Checkpoints(lambda config: Joints(config.get("dim", 0)), {}, choices))
@@ -306,7 +310,7 @@ def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(
         )
 
     first, second = order
-    for name in (second, first):  # so that both are loaded
+    for name in (second, first):  # load both checkpoints
         assert ask(reset(name))[0].error is None
     fitting_first, wrong_second = (3, 7) if second == "arm3" else (3, 3)
     assert ask(Request("act", observations[fitting_first], session="s"))[0].error is None

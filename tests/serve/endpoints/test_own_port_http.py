@@ -1,5 +1,5 @@
-"""HTTP at a replica's own port: what is special there. tests/golden has the bytes of requests and
-answers, which are those of the server's port.
+"""The special properties of HTTP at a replica's own port. tests/golden contains the bytes of
+requests and answers, which are equal to those at the server's port.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ SLOW_S = 0.4
 
 
 class Acts(list[int]):
-    """Of all sessions together."""
+    """The acts of all sessions together."""
 
 
 class Policy(Agent):
-    """Counts its acts, and waits in them if it is told to."""
+    """A policy that counts its acts, and waits in them if the test requests it."""
 
     def __init__(self) -> None:
         self.acts = Acts()
@@ -72,7 +72,7 @@ class Replica:
     known: ChangingKeys
 
     def request(self, op: str = "act", body: bytes = b"{}", *headers: str, **more: Any) -> bytes:
-        """A request in JSON, to a path of the replica's own port by default."""
+        """Return a JSON request, by default for a path of the replica's own port."""
         path = more.get("path", f"{self.own.path}/{op}")
         lines = [
             f"{more.get('method', 'POST')} {path} HTTP/{more.get('version', '1.1')}",
@@ -118,7 +118,7 @@ class Client:
         return status, headers, body
 
     def is_ended(self) -> bool:
-        """Return whether the server ends the connection, within a while."""
+        """Return whether the server ends the connection within some seconds."""
         with contextlib.suppress(ConnectionError):
             return self._file.read(1) == b""
         return True
@@ -305,7 +305,7 @@ def test_a_request_that_does_not_arrive_is_answered_408(
         part = one.request("act", b"{}")[:-1] if isinstance(sent, str) else sent
         begun = time.monotonic()
         client.socket.sendall(part)
-        if not part:  # an idle connection is no request
+        if not part:  # an idle connection is not a request
             time.sleep(2 * SLOW_S)
             assert client.ask(one.request("act"))[0] == 200
             return
@@ -372,8 +372,8 @@ def test_a_replica_that_drains_ends_the_connection_after_the_answer(
 def at_both_ports(
     one: Replica, address: StreamAddress | None, linked: StreamAddress | None = None
 ) -> Iterator[str]:
-    """The URL of the server's port of a replica, whose metadata name that address of its own one;
-    its answers name the same one, or `linked`.
+    """Yield the URL of the server's port of a replica. Its metadata contain `address` as the
+    replica's own port, and its answers the same address, or `linked`.
     """
     metadata = {
         "protocol": PROTOCOL_VERSION,
@@ -401,7 +401,7 @@ def test_answers_at_the_servers_port_name_the_own_port(served_replica: Replica) 
             )
             _, headers, _ = client.ask(served_replica.request("close", path="/v1/close"))
             assert "link" not in headers
-        # The session is the same at both.
+        # The session is the same at both ports.
         with Client(port) as client:
             assert client.ask(served_replica.request("reset", path="/v1/reset"))[0] == 200
         with served_replica.connect() as client:
@@ -472,7 +472,7 @@ def test_the_client_uses_the_servers_port_if_another_server_has_the_own_one(
 
 
 class OwnPortWithFailures:
-    """A port in front of a replica's own one, which closes each connection without an answer to its
+    """A port in front of a replica's own port. It closes each connection without an answer to its
     request until `fails` is cleared.
     """
 
@@ -537,7 +537,7 @@ def test_an_own_port_that_could_not_be_used_is_used_again_later_and_no_call_is_l
             return transport._direct is not None
 
         begun = time.monotonic()
-        while time.monotonic() < begun + 0.6:  # at least one ping without an answer
+        while time.monotonic() < begun + 0.6:  # time for at least one ping without an answer
             assert not call()
         own_port.fails.clear()
         wait_for(call)
@@ -588,7 +588,7 @@ def test_the_client_uses_the_servers_port_if_a_strange_server_has_the_own_one(
         listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
 
         def serve() -> None:
-            """Answer each connection in the same way, until the listener is closed."""
+            """Answer each connection in the same way until the listener is closed."""
             with contextlib.suppress(OSError):
                 while True:
                     with listener.accept()[0] as connection:

@@ -1,5 +1,5 @@
-"""Shared memory between a policy and processes on its machine: sessions, the end of clients,
-faults, and strangers.
+"""Shared memory between a policy and processes on its machine: sessions, clients that end, faults,
+and clients without access.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def served() -> Iterator[tuple[Engine, ShmServer]]:
 def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(
     served: tuple[Engine, ShmServer],
 ) -> None:
-    """A window of four frames: four files stay with the policy, and no frame is ever copied for
-    it.
+    """The policy has a window of four frames. It keeps four memory files, and no frame is
+    copied.
     """
     transport = client(served[1])
     call(transport, request("reset"), 5)
@@ -69,7 +69,7 @@ def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(
         act = call(transport, request("act", pixel % 250), 5).act
         assert act.action.tolist() == [p % 250 for p in range(max(1, pixel - 3), pixel + 1)]
     assert len(transport._memories) <= 16
-    call(transport, request("reset"), 5)  # all that it kept goes
+    call(transport, request("reset"), 5)  # the policy drops all kept frames
     for pixel in (1, 2, 3):
         call(transport, request("act", pixel), 5)
     assert sum(memory.busy for memory in transport._memories) <= 4
@@ -105,7 +105,7 @@ def test_vectors_of_sessions_and_odd_observations_come_as_they_are(
         [Request("act", odd, session=names[0], request_id="odd", step=first[0] + 3)], 5
     )
     assert reply.act.action.tolist()[-1] == 77
-    # It has four acts behind it, and may be called by that count.
+    # The session has acted four times; a client may also give the step as this count.
     for step in (first[0] + 3, 3, first[0] - 1):
         [reply] = transport.call(
             [Request("act", odd, session=names[0], request_id="odd", step=step)], 5
@@ -167,7 +167,7 @@ def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(
             odd.settimeout(5)
             odd.connect(f"\0{endpoint.address.socket}")
             socket.send_fds(odd, [message], [file.fileno()] * 2)
-            odd.recv(1000)  # an error, or the end
+            odd.recv(1000)  # an error, or the end of the connection
         wait_for(lambda: not endpoint._clients and not descriptors() - before)
     code = (
         "import sys, time, numpy as np\n"
@@ -205,7 +205,7 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, ShmServer]) -> None:
     for _ in range(300):
         cycle()
     wait_for(lambda: len(served[0].sessions) == 0)
-    with contextlib.suppress(TimeoutError):  # what is left then is said below
+    with contextlib.suppress(TimeoutError):  # the assertions below report the remaining resources
         wait_for(lambda: not descriptors() - files and not _new(running) and _mapped() <= mapped)
     assert not descriptors() - files
     assert not _new(running)
@@ -213,19 +213,19 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, ShmServer]) -> None:
 
 
 def _new(running: set[threading.Thread]) -> list[str]:
-    """Threads beside those, but for the helpers of a batch queue: the first batch that a busy
-    machine delays starts
-    them, and they end with it."""
+    """Return the names of new threads, except the helper threads of a batch queue. A batch that a
+    busy machine delays starts these, and they end with the queue.
+    """
     return [one.name for one in running_threads() - running if not one.name.startswith("policy-")]
 
 
 def _mapped() -> int:
-    """Memory files of clients that this process maps."""
+    """Return the number of clients' memory files that this process maps."""
     return Path("/proc/self/maps").read_text().count("memfd:vlagents-ray")
 
 
 class Gated(Agent):
-    """Acts when the gate opens."""
+    """A policy that acts when the gate opens."""
 
     gate = threading.Event()
     busy = threading.Event()
@@ -248,8 +248,8 @@ def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
     one, other = (ShmTransport(endpoint.address) for _ in range(2))
     for each, name in ((one, "first"), (other, "second")):
         call(each, Request("reset", Obs({}), name, request_id=name), 60)
-    # The queue polls beside a batch once it has seen a slow one, and one before it that was another
-    # session's.
+    # The queue polls during a batch only after one slow batch, and if the batch before belonged to
+    # another session.
     for ending in (False, False, True):
         asking = one if ending else other
         Gated.gate, Gated.busy = threading.Event(), threading.Event()
@@ -259,7 +259,7 @@ def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
             assert Gated.busy.wait(60)
             if ending:
                 asking._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
-                wait_for(lambda: len(engine.sessions) == 1, 50)  # while the batch is under way
+                wait_for(lambda: len(engine.sessions) == 1, 50)  # while the batch is running
             else:
                 time.sleep(0.02)
         finally:
@@ -300,7 +300,7 @@ def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(
     engine.sessions.limit = 1
     one, busy = client(endpoint), threading.Event()
     call(one, request("reset"), 5)
-    # The endpoint opens when all of them are gone.
+    # The poller handles these clients only after all of them have left.
     engine.queue.poller.call_soon(lambda: busy.wait(10) and None)
     for _ in range(3):
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as gone:
@@ -338,8 +338,8 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
 
     faults: list[tuple[bytes, int | None, str]] = [
         (b"x", None, "malformed"),
-        (pack(0, 10), None, "malformed"),  # no such memory
-        (pack(0, 2**40), memory(frame), "malformed"),  # longer than the memory
+        (pack(0, 10), None, "malformed"),  # there is no such memory file
+        (pack(0, 2**40), memory(frame), "malformed"),  # longer than the memory file
         (pack(0, len(frame)), memory(frame, sealed=False), "malformed"),
         (pack(0, 10), memory(b"garbage..."), "malformed"),
         (pack(0, 10), pipe(), "malformed"),
@@ -347,7 +347,7 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
         (pack(99, len(frame)), memory(frame), "too_large"),
         (pack(0, len(frame)), memory(frame), "not_reset"),
         (pack(0, 64, LocalAddress.COMPACT), memory(bytes(64)), "malformed"),
-        # Its arrays need more.
+        # The arrays need more memory than the file has.
         (pack(0, 64, LocalAddress.COMPACT) + act.message, memory(bytes(64)), "malformed"),
         (
             pack(0, act.size, LocalAddress.COMPACT) + act.message,
@@ -424,14 +424,16 @@ def test_another_user_is_not_let_in(
 
 
 def test_what_could_not_be_sent_keeps_no_memory() -> None:
-    """A server that reads nothing: once its socket is full, calls fail and take nothing more."""
+    """The server reads nothing. Once its socket is full, calls fail without occupying further
+    memory.
+    """
     name = f"vlagents-ray-test-{os.urandom(8).hex()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as deaf:
         deaf.bind(f"\0{name}")
         deaf.listen(1)
         transport = ShmTransport(LocalAddress(name, boot_id=""))
         busy = [0]
-        # sent, or its time was over before, and given up.
+        # Each message is sent or is abandoned at its deadline, until no more fit into the socket.
         while len(busy) <= 20 or busy[-1] > busy[-20]:
             with pytest.raises(DeadlineExceeded):
                 call(transport, request("act", size=8), 0.001)
@@ -446,8 +448,8 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
 
 
 def test_a_client_whose_key_is_refused_is_answered_a_few_times_and_then_ended() -> None:
-    """Otherwise a process without a key occupies the policy's thread, which answers each of its
-    messages.
+    """Otherwise a process without a key would occupy the policy's thread, which answers each
+    message.
     """
     keys: list[str | None] = []
 

@@ -1,5 +1,5 @@
-"""What a lone act costs, in what does not depend on the machine: calls of Python, looks at the
-socket, no move.
+"""The cost of a lone act in numbers that do not depend on the machine: calls of Python functions,
+polls of the socket, and core changes.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
 ACTS = 50
-MOST_CALLS = 82  # with 88 a round trip of 50 us takes 5 us more
+MOST_CALLS = 82  # with 88 calls a round trip of 50 us takes 5 us longer
 OBS = Obs({"front": np.zeros((64, 64, 3), np.uint8)}, 0.5, {"joints": np.zeros(7, np.float32)})
-# As often as time passes.
+# Functions whose number of calls depends on the elapsed time.
 POLLING = ("_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy")
 
 
 class Counted(Agent):
-    """Counts the calls of functions on the policy's thread."""
+    """A policy that counts the function calls on its thread."""
 
     calls: ClassVar[Counter[str]] = Counter()
 
@@ -51,7 +51,7 @@ class Counted(Agent):
 
 
 class Slow(Agent):
-    """Takes longer than one look."""
+    """A policy that takes longer than one poll of the socket."""
 
     def act(self, obs: Obs) -> Act:
         time.sleep(0.001)
@@ -60,7 +60,7 @@ class Slow(Agent):
 
 @contextlib.contextmanager
 def serving(agent: Agent) -> Iterator[ShmTransport]:
-    """A client that has a session."""
+    """Yield a client with a session."""
     engine = Engine(agent)
     endpoint = ShmServer(engine, LIMITS, NoKey.OPEN)
     endpoint.open()
@@ -78,8 +78,8 @@ def serving(agent: Agent) -> Iterator[ShmTransport]:
 
 def test_a_lone_act_costs_the_server_few_calls() -> None:
     def calls(transport: ShmTransport) -> float:
-        """The lower quartile: where the machine is busy, most may take long, and the queue looks
-        after those.
+        """Return the lower quartile of calls per act. On a busy machine most acts may be slow,
+        after which the queue makes further calls.
         """
         totals = []
         for number in range(ACTS):
@@ -89,15 +89,13 @@ def test_a_lone_act_costs_the_server_few_calls() -> None:
         return statistics.quantiles((b - a for a, b in pairwise(totals)), n=4)[0]
 
     with serving(Counted()) as transport:
-        # On a starved machine all acts of a round may take long.
+        # On an overloaded machine all acts of a round may be slow.
         rounds = (calls(transport) for _ in range(20))
         assert any(found <= MOST_CALLS for found in rounds), Counted.calls
 
 
 def test_a_client_that_waits_for_its_answer_reads_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To look whether it is there costs a fraction of the exception that reading raises where it
-    is not.
-    """
+    """Polling for the answer is much cheaper than the exception of a read without an answer."""
     reads = []
     receive = ShmTransport._receive
 
@@ -108,17 +106,15 @@ def test_a_client_that_waits_for_its_answer_reads_it_once(monkeypatch: pytest.Mo
     monkeypatch.setattr(ShmTransport, "_receive", counted)
     with serving(Slow()) as transport:
         for number in range(ACTS):
-            transport._answers_fast = True  # it looks before it sleeps
+            transport._answers_fast = True  # the client polls before it sleeps
             transport.call([Request("act", OBS, request_id=str(number))], 5)
-    assert len(reads) == ACTS + 1  # and the reset's
+    assert len(reads) == ACTS + 1  # one more for the reset
 
 
 def test_an_act_waits_for_no_certain_core(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`os.sched_setaffinity` returns when the thread runs on such a core, and keeps the
-    interpreter's lock until then.
-
-    A client once moved off the core of the policy's thread in this way. When other programs kept
-    the other core busy, all eight sessions of that process stood still for 3 s.
+    """`os.sched_setaffinity` returns only when the thread runs on one of the given cores, and holds
+    the GIL until then. An earlier client used it to leave the core of the policy's thread. When
+    other programs occupied the other core, all eight sessions of that process were blocked for 3 s.
     """
     moves: list[tuple[int, set[int]]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda *move: moves.append(move))

@@ -1,4 +1,4 @@
-"""Messages of several robots are decoded side by side while batches are slow."""
+"""Messages of several robots are decoded in parallel while batches are slow."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.batch_window import SLOW_S
 
 ROBOTS, CORES = 8, SIDE_BY_SIDE_CORES
-# Time to decode a message, where a wait takes the place of the decoder; long beside the rest.
+# Time to decode a message, simulated by a sleep that is long compared with all other work.
 MESSAGE_S = 0.2
 READERS = ("policy", "policy-reader")  # names of the threads that read connections
 WAIT_S = 30
 
 
 class Waits(Agent):
-    """A policy that waits at each batch, as for a GPU."""
+    """A policy whose batches sleep, as if they waited for a GPU."""
 
     def __init__(self, batch_s: float) -> None:
         self._batch_s = batch_s
@@ -53,17 +53,17 @@ class Waits(Agent):
 
 
 def observation(side: int, cameras: int = 1) -> Obs:
-    """An observation whose images are sent as JPEG."""
+    """Return an observation whose images are sent as JPEG."""
     return Obs({f"camera_{i}": np.zeros((side, side, 3), np.uint8) for i in range(cameras)})
 
 
-LONG = observation(400)  # its decoding is estimated as 0.8 ms
+LONG = observation(400)  # its estimated decoding time is 0.8 ms
 SHORT = observation(64)
 
 
 @contextlib.contextmanager
 def robots(number: int, batch_s: float = 2 * SLOW_S) -> Iterator[tuple[Engine, list[Stream]]]:
-    """An engine, and so many robots that have acted a few times."""
+    """Yield an engine, and connections of robots that have acted a few times."""
     engine = Engine(Waits(batch_s))
     own = OwnPortServer(engine, MessageLimits(), "127.0.0.1", None, NoKey.OPEN)
     own.open()
@@ -86,7 +86,7 @@ def robots(number: int, batch_s: float = 2 * SLOW_S) -> Iterator[tuple[Engine, l
 
 
 def ask(streams: list[Stream], op: Any, obs: Obs) -> None:
-    """Send a request of each robot, then wait for all replies."""
+    """Send a request from each robot, then wait for all replies."""
     for stream in streams:
         stream.send(encode_requests([Request(op, obs)], JPEG), WAIT_S)
     for stream in streams:
@@ -95,20 +95,20 @@ def ask(streams: list[Stream], op: Any, obs: Obs) -> None:
 
 
 def is_fast(engine: Engine, streams: list[Stream]) -> bool:
-    """Let the robots act once more, and return whether batches are fast now."""
+    """Let the robots act once more, and return whether batches are now fast."""
     ask(streams, "act", SHORT)
     return not engine.queue.window.overlaps
 
 
 @pytest.fixture(autouse=True)
 def cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four cores, however many this machine has."""
+    """Simulate four cores, whatever this machine has."""
     monkeypatch.setattr(thread_map, "allowed", lambda: CORES)
 
 
 @pytest.fixture
 def decoding_threads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The names of the threads that decode images."""
+    """Return a growing list of the names of threads that decode images."""
     names: list[str] = []
     original = jpeg_png.decode_file
 
@@ -144,7 +144,7 @@ def test_other_messages_are_decoded_by_the_thread_that_reads_them(
     decoding_threads: list[str], number: int, batch_s: float, obs: Obs
 ) -> None:
     with robots(number, batch_s) as (engine, streams):
-        if not batch_s:  # on a busy machine, even these batches may have been slow so far
+        if not batch_s:  # on a busy machine, even these batches may have been slow at first
             wait_for(lambda: is_fast(engine, streams))
         decoding_threads.clear()
         ask(streams, "act", obs)

@@ -1,4 +1,4 @@
-"""Waiting until a client has received the last answers ends with the connection."""
+"""The wait until a client has received its last answers ends when the connection ends."""
 
 from __future__ import annotations
 

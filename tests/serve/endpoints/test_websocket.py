@@ -1,4 +1,4 @@
-"""A replica's own port for WebSockets, over an engine without Ray."""
+"""WebSockets at a replica's own port, over an engine without Ray."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BASE = urlsplit("http://127.0.0.1")
 
 
 class Echo(Agent):
-    """Answers what the camera shows, and as many bytes as it is asked for."""
+    """A policy that returns a pixel of the camera, and as many bytes as requested."""
 
     def act(self, obs: Obs) -> Act:
         return Act(
@@ -74,7 +74,7 @@ def test_each_connection_is_a_session_that_ends_with_it(endpoint: OwnPortServer)
             assert act.action.tolist() == [3 * step + number]
     assert len(endpoint.engine.sessions) == 3
     clients[0].close()
-    clients[1]._socket.close()  # without a word
+    clients[1]._socket.close()  # without a close frame
     wait_for(lambda: len(endpoint.engine.sessions) == 1)
     assert ask(clients[2], "act", 9).act is not None
     clients[2].close()
@@ -95,7 +95,7 @@ def test_an_ordinary_websocket_client_is_served_too(
 ) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=compression) as socket_:
-        assert not socket_.protocol.extensions  # the server accepts no compression
+        assert not socket_.protocol.extensions  # the server declined compression
         socket_.ping().wait(5)
         probe = bytes_probe(300_000)
         socket_.send(probe)
@@ -107,7 +107,7 @@ def test_an_ordinary_websocket_client_is_served_too(
 def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: OwnPortServer) -> None:
     other = stream(endpoint)
     ask(other, "reset")
-    # It reads nothing before it has sent everything.
+    # The client reads nothing before it has sent the whole message.
     with contextlib.closing(stream(endpoint)) as late:
         late.send(bytes(STREAM_BYTES + 9 * 2**20), 5)
         with pytest.raises((ConnectionClosed, ConnectionResetError), match="1009"):
@@ -122,7 +122,7 @@ def test_a_message_that_is_too_long_ends_its_connection_alone(endpoint: OwnPortS
 def test_a_message_in_fragments_is_answered_as_a_whole_one(
     endpoint: OwnPortServer, fragments: int
 ) -> None:
-    """Browsers send large messages in fragments."""
+    """Browsers split large messages into fragments."""
     frame = encode_requests([Request("reset", Obs({"front": np.zeros((64, 64, 3), np.uint8)}))])
     size = -(-len(frame) // fragments)
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
@@ -136,7 +136,8 @@ def test_a_message_in_fragments_is_answered_as_a_whole_one(
 def test_many_small_fragments_end_their_connection(endpoint: OwnPortServer) -> None:
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
     with connect(url, compression=None) as client:
-        with suppress(ConnectionClosed):  # the server may close it before the last is sent
+        # the server may close the connection before the last fragment is sent
+        with suppress(ConnectionClosed):
             client.send([b"a"] * 50)
         with pytest.raises(ConnectionClosed, match="small fragments"):
             client.recv(5)
@@ -150,7 +151,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint.limits = MessageLimits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")
-    # A message of a TB begins.
+    # The beginning of a message of one terabyte.
     client._socket.sendall(b"\x82\xff" + (2**40).to_bytes(8, "big") + bytes(4))
     if floods:
         client._socket.settimeout(5)
@@ -170,13 +171,14 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     frame = encode_requests(
         [Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000}))]
     )
-    with suppress(ConnectionClosed, OSError):  # cut off before the last is sent, on a busy machine
+    # on a busy machine the server may close the connection before the last byte is sent
+    with suppress(ConnectionClosed, OSError):
         for _ in range(4):
             slow.send(frame, 5)
     for pixel in range(50):
         act = ask(other, "act", pixel).act
         assert act.action.tolist() == [pixel]
-    wait_for(lambda: len(endpoint.engine.sessions) == 1)  # it was cut off
+    wait_for(lambda: len(endpoint.engine.sessions) == 1)  # the server closed the other connection
     wait_for(
         lambda: not [thread for thread in threading.enumerate() if thread.name == "send-slowly"]
     )
@@ -291,7 +293,8 @@ def test_a_replica_that_stops_closes_its_connections_with_a_code_and_a_reason() 
         waiting.send(encode_requests([Request("reset", Obs())]))
         assert decode_replies(waiting.recv(5))[0].error is None
         engine.close()
-        waiting.send(encode_requests([Request("act", Obs())]))  # which is not read any more
+        # the server does not read this message
+        waiting.send(encode_requests([Request("act", Obs())]))
         endpoint.close()
         for client in (idle, waiting):
             with pytest.raises(ConnectionClosed) as closed:

@@ -1,5 +1,5 @@
-"""A deadline is counted from when the request came, not from when the policy's thread had time
-to read it.
+"""A deadline counts from the arrival of a request, not from the time at which the policy's thread
+reads it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ DEADLINE_MS = 300.0
 
 
 class Gated(Agent):
-    """Counts its acts; waits for the gate where it is told to."""
+    """A policy that counts its acts, and waits for the gate if the observation requests it."""
 
     gate = threading.Event()
     entered = threading.Event()
@@ -65,7 +65,7 @@ class Gated(Agent):
 
 
 class Shm:
-    """A client that can send without waiting for the answer."""
+    """A shared-memory client that can send without waiting for the answer."""
 
     def __init__(self, endpoint: ShmServer) -> None:
         self._transport = ShmTransport(endpoint.address)
@@ -82,7 +82,7 @@ class Shm:
 
 
 class WebSocket:
-    """The same at the replica's own port."""
+    """A WebSocket client of the replica's own port that can send without waiting for the answer."""
 
     def __init__(self, endpoint: OwnPortServer) -> None:
         self._stream = Stream(
@@ -99,7 +99,7 @@ class WebSocket:
 
 @pytest.fixture
 def timestamps() -> Iterator[None]:
-    """The kernel stamps what arrives by TCP."""
+    """Let the kernel add timestamps to data that arrives over TCP."""
     with kernel_timestamps():
         yield
 
@@ -126,7 +126,7 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
     for client in (slow, hasty):
         client.send(Request("reset", Obs()))
         assert client.receive().error is None
-    if behind == "an act":  # the only thread that reads is busy with it
+    if behind == "an act":  # the only thread that reads is busy with this act
         slow.send(Request("act", Obs(info={"wait": True})))
     else:
         engine.queue.poller.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
@@ -137,10 +137,10 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
     if behind == "an act":
         assert slow.receive().error is None
     assert type(hasty.receive().error) is DeadlineExceeded
-    # One that is read at once has all of its time.
+    # A request that is read at once has its whole time.
     hasty.send(Request("act", Obs(), deadline_ms=20e3))
     act = hasty.receive().act
-    assert act.action.tolist() == [1], "the late one was acted on"
+    assert act.action.tolist() == [1], "the policy acted on the late request"
     for client in (slow, hasty):
         client.close()
     engine.close()
@@ -150,20 +150,19 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(
 def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
     now = 100.0
     pauses = PauseDetector(lambda: now)
-    assert pauses.waited_s() == 0  # nobody looks
+    assert pauses.waited_s() == 0  # the detector's thread has not started
     pauses._checked = now
-    for _ in range(5):  # looks that come in time, or a little late
+    for _ in range(5):  # checks that are on time, or slightly late
         now += 0.2
         pauses.check()
         assert pauses.waited_s() == 0
     now += 7.0
-    assert pauses.waited_s() == pytest.approx(7.0)  # read before the thread has looked
+    assert pauses.waited_s() == pytest.approx(7.0)  # read before the thread has checked again
     pauses.check()
     now += 0.1
     assert pauses.waited_s() == pytest.approx(7.1)
     pauses.check()
-    # A pause within the backlog, as a busy machine makes them: what came in the long one is still
-    # unread.
+    # A short pause while the backlog of the long one is still unread, as on a busy machine.
     now += 0.6
     assert pauses.waited_s() == pytest.approx(7.7)
     pauses.check()
@@ -176,7 +175,7 @@ def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
     now += 0.6
     pauses.check()
     now += 0.2
-    assert pauses.waited_s() == pytest.approx(0.8)  # a short one has a short backlog
+    assert pauses.waited_s() == pytest.approx(0.8)  # a short pause has a short backlog
     pauses.check()
     for _ in range(2):
         now += 0.2
@@ -185,9 +184,7 @@ def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
 
 
 def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() -> None:
-    """Pauses that follow upon each other make a backlog longer by themselves alone, and not for
-    ever.
-    """
+    """Consecutive pauses extend the backlog only by their own length, and not forever."""
     now = 100.0
     pauses = PauseDetector(lambda: now)
     pauses._checked = now
@@ -206,7 +203,9 @@ def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() ->
 def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(
     sent: str, deadline_ms: float
 ) -> None:
-    """As its connection's record says, and not for as long as others may be late."""
+    """The answer follows the record of the request's own connection, and does not depend on how
+    long other requests may be late.
+    """
     now = 100.0
     engine = Engine(Gated())
     engine.start()
@@ -252,9 +251,9 @@ def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(
         if sent == "in the pause" and deadline_ms < 600:
             late = answer()
             assert late["code"] == "deadline_exceeded"
-            assert "within 300 ms" in late["detail"]  # what its sender asked for
+            assert "within 300 ms" in late["detail"]  # the deadline that the sender chose
             send("act")
-        assert answer()["action"] == [1.0], "the late one was acted on"
+        assert answer()["action"] == [1.0], "the policy acted on the late request"
     engine.close()
 
 

@@ -1,4 +1,4 @@
-"""An engine that closes waits for its policy alone: not for the other threads, one of which may be
+"""An engine that closes waits only for its policy, not for its other threads, one of which may be
 stuck.
 """
 
@@ -16,24 +16,24 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.engine.engine import Engine
 
-BOUND_S = 10.0  # far below what a stuck thread takes, and far above what closing takes
+BOUND_S = 10.0  # much shorter than a stuck thread's wait, and much longer than closing takes
 
 
 class Zero(Agent):
-    """Acts at once."""
+    """A policy that acts at once."""
 
     def act(self, obs: Obs) -> Act:
         return Act(np.zeros(1, np.float32))
 
 
 def decoding(engine: Engine, robot: bool) -> ThreadPoolExecutor:
-    """The threads that decode messages, which the first message starts."""
+    """Return the threads that decode messages; the first message starts them."""
     engine.admission.submit(lambda: None, robot).result(BOUND_S)
     return engine.admission._threads[robot]
 
 
 def preparing(engine: Engine) -> ThreadPoolExecutor:
-    """The threads that prepare observations."""
+    """Return the threads that prepare observations."""
     preparations = engine.intake._preparations
     assert preparations is not None
     return preparations._threads

@@ -1,4 +1,4 @@
-"""The engine: requests in, replies out, sessions apart."""
+"""The engine: requests and replies, and the isolation of sessions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from vlagents_ray.serve.engine.engine import Engine
 
 
 class Echo(Agent):
-    """Answers with what the session was told: instruction, seed and number of steps."""
+    """A policy that returns the session's instruction, seed and number of steps."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         if kwargs.get("fail"):
@@ -87,7 +87,7 @@ def test_an_act_before_a_reset_or_after_a_close_is_refused(serving: Callable[...
     for _ in range(2):
         ask(engine, "a", "reset")
         reply = ask(engine, "a", "act")
-        assert reply.act.action[1] == 1, "a reset begins from scratch"
+        assert reply.act.action[1] == 1, "a reset clears the state of the session"
     ask(engine, "a", "close")
     with pytest.raises(UnknownSession):
         ask(engine, "a", "act")
@@ -131,7 +131,7 @@ def test_what_the_policy_does_not_offer_is_refused_before_it_acts(
     with pytest.raises(NotOffered, match=r"expected only \[\], .*, got \['logprob'\]"):
         ask(engine, "a", "act", {"want": ["logprob"]})
     act = ask(engine, "a", "act").act
-    assert act.action[1] == 1, "the policy's step was not counted"
+    assert act.action[1] == 1, "the policy counts the step"
 
 
 def test_an_observation_or_a_contract_that_does_not_fit_is_refused_before_it_joins_a_batch(
@@ -181,7 +181,7 @@ def test_a_batch_of_the_wrong_length_is_the_policys_fault(serving: Callable[...,
 
 
 class Held(Agent):
-    """Acts for 20 ms and until it is let go."""
+    """A policy that acts for 20 ms, and longer until the test releases it."""
 
     shared: ClassVar = ("go",)
 
@@ -214,7 +214,7 @@ def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
     for session in "ab":
         ask(engine, session, "reset")
     agent.go.set()
-    for _ in range(5):  # until the queue knows that batches are slow
+    for _ in range(5):  # until the queue has measured that batches are slow
         ask(engine, "a", "act")
     agent.go.clear()
     for session in "ab":
@@ -241,7 +241,7 @@ def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
         engine.health.require_ready()
     with pytest.raises(PolicyFailed, match=r"no such checkpoint \(test_engine.py:\d+\)$"):
         engine.start()
-    # No path leaves it.
+    # Paths never leave the server.
     with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):
         ask(engine, "a", "reset")
 

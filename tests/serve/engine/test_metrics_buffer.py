@@ -1,4 +1,4 @@
-"""Timing in replies and load of a queue, over endpoints without Ray."""
+"""Timings in replies, and the load of a queue, over endpoints without Ray."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.ui
 
 
 class Large(Agent):
-    """Answers with much to encode; waits for the gate where it is told to."""
+    """A policy with large answers. It waits for the gate if the observation requests it."""
 
     gate = threading.Event()
 
@@ -105,7 +105,7 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     batches: list[int] = []
     requests: Counter[Any] = Counter()
 
-    def are_all_recorded() -> bool:  # some of it just after the answer
+    def are_all_recorded() -> bool:  # some values are recorded just after the answer
         collected = engine.stats.collect()
         batches.extend(collected.batches.values)
         requests.update({kind: sample.count for kind, sample in collected.requests.items()})
@@ -155,12 +155,12 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
     sample = stats.collect().requests[KIND]
     assert (sample.count, len(sample.values)) == (40_000, SAMPLE)
     mean = sum(value for (value,) in sample.values) / SAMPLE
-    # Five standard errors of a uniform draw.
+    # Five standard errors of a uniform distribution.
     assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5
 
 
 def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
-    """It would stop the policy for it, again and again."""
+    """Otherwise garbage collections would pause the policy regularly."""
     engine.start()
     sender, answered = (
         Sender(engine, "shm", caller=NoKey.OPEN, has_left=None),
@@ -199,7 +199,7 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     submit(
         engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None
     )
-    wait_for(lambda: engine.queue.depth() == 0)  # it is in its batch
+    wait_for(lambda: engine.queue.depth() == 0)  # the act is in its batch
     for name in ("b", "c"):
         submit(engine, name, Request("act", Obs()), lambda _: answered.release() and None)
     meter.read()

@@ -1,5 +1,5 @@
-"""Requests in flight: what is left of one that its sender gives up, and of a message that cannot
-be answered.
+"""Requests in flight: the effects of a request that its sender abandons, and of a message that
+cannot be answered.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 
 
 class Gated(Agent):
-    """Acts when the gate is open, and breaks with the error that it is told."""
+    """A policy that acts when the gate is open, and raises the error in the observation."""
 
     gate = threading.Event()
     busy = threading.Semaphore(0)
@@ -80,7 +80,7 @@ class Served:
         return reply
 
     def occupy(self) -> None:
-        """Make the policy busy until `go_on`."""
+        """Occupy the policy until `go_on`."""
         Gated.gate.clear()
         self.put(self.first, "act")
         assert Gated.busy.acquire(timeout=10)
@@ -134,7 +134,7 @@ def test_a_connection_acts_in_the_episode_that_it_began_before_its_close_was_exe
     assert [replies.get(timeout=10)[0].error for replies in waiting] == [None, None]
     served.ask(other, "act")
     other.release()
-    assert "other" not in served.engine.sessions, "it ends with its connection"
+    assert "other" not in served.engine.sessions, "the session ends with its connection"
 
 
 @pytest.mark.parametrize("was_in", ["none", "the episode before"])
@@ -142,7 +142,7 @@ def test_a_connection_acts_in_the_episode_that_it_began_before_its_close_was_exe
 def test_what_comes_late_over_an_old_connection_neither_acts_in_nor_ends_a_newer_episode(
     served: Served, was_in: str, with_step: bool
 ) -> None:
-    """Its client has closed it, and has reset the session over a new one."""
+    """The client has closed the old connection, and has reset the session over a new one."""
     old = served.sender("other")
     before = served.ask(old if was_in == "the episode before" else served.sender("other"), "reset")
     new = served.sender("other")
@@ -158,7 +158,7 @@ def test_what_comes_late_over_an_old_connection_neither_acts_in_nor_ends_a_newer
 def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_was_opened(
     served: Served, reset_over_http: bool
 ) -> None:
-    """As after a hand-over; a later reset that is withdrawn changes nothing."""
+    """This happens after a hand-over. A later reset that is withdrawn changes nothing."""
     served.ask(served.sender("other", connected=not reset_over_http), "reset")
     new = served.sender("new")
     served.occupy()
@@ -170,7 +170,9 @@ def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_w
     served.go_on()
     assert act.get(timeout=10)[0].error is None
     new.release()
-    assert "other" not in served.engine.sessions, "it ends with the connection that used it last"
+    assert "other" not in served.engine.sessions, (
+        "the session ends with the connection that used it last"
+    )
 
 
 @pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)], ids=repr)
@@ -292,7 +294,9 @@ def test_an_observer_that_fails_costs_no_answer(
 
 
 class Noting(Observer):
-    """Notes what it sees, and keeps the number of the request for the answer."""
+    """An observer that records its calls, and attaches a number to each request that it receives
+    back with the answer.
+    """
 
     def __init__(self, seen: list[str]) -> None:
         self.seen, self.requests = seen, 0
@@ -335,7 +339,7 @@ def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that
 
 
 class Listed(Agent):
-    """Notes the operations that it has executed."""
+    """A policy that records the operations that it executes."""
 
     def __init__(self) -> None:
         self.executed = Executed()
@@ -353,7 +357,7 @@ class Listed(Agent):
 
 
 class Executed(list[str]):
-    """Operations, of all sessions."""
+    """Executed operations of all sessions."""
 
 
 STEPS = {"reset": ("take", "run", "hold", "begin_episode"), "act": ("take", "run", "ready", "act")}
@@ -365,7 +369,7 @@ STEPS = {"reset": ("take", "run", "hold", "begin_episode"), "act": ("take", "run
 def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     op: str, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The deadline passes at each step on the way from the queue to the policy."""
+    """The deadline passes at each step between the queue and the policy."""
     policy = Listed()
     engine = Engine(policy)
     engine.start()
@@ -388,7 +392,7 @@ def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
     said_never: list[bool] = []
 
     def late(*arguments: object) -> object:
-        if queued.wait(10) and not said_never:  # as `Sender._expire` does, on another thread
+        if queued.wait(10) and not said_never:  # like `Sender._expire` on another thread
             engine.intake.withdraw(*sent)
             said_never.append(not sent[0].begun)
         return original(*arguments)

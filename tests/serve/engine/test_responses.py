@@ -1,4 +1,4 @@
-"""A reply has a limit at the server, looked at before anything of it is copied or encoded."""
+"""The size limit of a reply, which the server checks before it copies or encodes any of it."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.sessions import Session
 
 LIMIT = 1000
-INFO_LIMIT = LIMIT - 4  # beside an action of one number
+INFO_LIMIT = LIMIT - 4  # the limit minus an action of one number
 
 
 def large(nbytes: int) -> np.ndarray:
-    """An array that takes no memory until it is copied."""
+    """Return an array that takes no memory until it is copied."""
     return np.broadcast_to(np.float32(0), nbytes // 4)
 
 
 def nested_list(levels: int) -> list[Any]:
-    """Lists in lists, `levels` deep."""
+    """Return lists nested in lists, `levels` deep."""
     return [nested_list(levels - 1)] if levels > 1 else [0]
 
 
@@ -72,7 +72,7 @@ def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
         Act(np.zeros(1), info={"text": "x" * INFO_LIMIT}),
         Act(np.zeros(1), info={"bytes": bytes(INFO_LIMIT)}),
         Act(np.zeros(1), info={"a": [bytes(INFO_LIMIT // 2), {"b": "x" * (INFO_LIMIT // 2)}]}),
-        # The dict and the list are values as well.
+        # The dict and the list also count as values.
         Act(np.zeros(1), info={"list": [0] * (DEFAULT_LIMITS.items - 2)}),
         Act(np.zeros(1), info={"deep": nested_list(DEFAULT_LIMITS.depth - 1)}),
     ],
@@ -97,7 +97,9 @@ def test_no_info_may_be_said_with_none() -> None:
 
 
 def test_sessions_to_which_a_policy_gives_one_info_have_each_their_own() -> None:
-    """What the server adds to one answer, such as a command to that robot, is in no other."""
+    """Data that the server adds to one answer, such as a command to that robot, is in no other
+    answer.
+    """
     shared = {"upstream_ms": 1.0}
     (one, _), (other, _) = (
         replied(Act(np.zeros(1), info=shared)),
@@ -149,6 +151,6 @@ def test_an_error_in_this_process_names_no_server() -> None:
 def test_an_error_that_a_library_raised_names_the_line_of_the_caller(
     fail: Callable[[], Any],
 ) -> None:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - both libraries' errors are of this type
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - both libraries raise this type
         fail()
     assert re.fullmatch(r" \(test_responses\.py:\d+\)", raised_at(caught.value))

@@ -1,4 +1,4 @@
-"""What an engine does with what robots say of themselves: their SLO and their slack."""
+"""The use of the robots' SLOs and slack by an engine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROWS = 50
 
 
 class Chunks(Agent):
-    """Returns a chunk after 5 ms, and keeps the options of its reset."""
+    """A policy that returns a chunk after 5 ms, and keeps the options of its reset."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         return {"options": sorted(kwargs)}
@@ -101,7 +101,7 @@ def test_the_least_and_the_largest_slo_is_answered_and_disturbs_no_other_robot(
     assert type(answer["in_time"]) is bool
     for slack_ms in (5e-324, 1e308):
         act(engine, "extreme", slack_ms=slack_ms)
-    engine.pace._read = -math.inf  # as after half a second
+    engine.pace._read = -math.inf  # as if half a second had passed
     assert reset(engine, "b", slo={"hz": 10})[SLO]["in_time"] is True
     act(engine, "b", slack_ms=100.0)
 
@@ -134,11 +134,11 @@ def test_robots_of_a_busy_replica_are_told_when_to_replan(engine: Engine) -> Non
         reset(engine, name, slo={"hz": 10})
     for name in names[:5]:
         act(engine, name, slack_ms=2000.0)
-    engine.pace._read = -math.inf  # as after half a second
+    engine.pace._read = -math.inf  # as if half a second had passed
     replan_ms = act(engine, names[0], slack_ms=2000.0).info[REPLAN]
-    # 400 robots of 5 ms each.
+    # 400 robots with 5 ms each.
     assert 1000 < replan_ms < 5000
-    assert REPLAN not in act(engine, names[0]).info, "it states no slack"
+    assert REPLAN not in act(engine, names[0]).info, "the request has no slack"
 
 
 def test_an_slo_moves_with_its_session(engine: Engine) -> None:
@@ -161,7 +161,7 @@ def test_a_robot_that_executes_a_part_of_each_answer_needs_the_next_one_sooner(
     act(engine, "a", slack_ms=500.0)
     need = engine.sessions.get("a").plan.need
     assert need is not None
-    assert need.rows == 8, "the answer has 50"
+    assert need.rows == 8, "the answer has 50 rows"
 
 
 def test_requests_of_robots_that_came_too_late_wait_behind_others(engine: Engine) -> None:

@@ -1,4 +1,4 @@
-"""Deployment files, and servers whose settings cannot hold: all is rejected before anything
+"""Deployment files, and servers with impossible settings: errors are found before anything
 starts.
 """
 
@@ -87,7 +87,9 @@ def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: P
     ids=lambda file: file.stem,
 )
 def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> None:
-    """In this environment in the place of the policy's own: what is heavy comes with loading."""
+    """The file is checked with this environment in place of the policy's own, since heavy modules
+    are imported only when a policy loads.
+    """
     text = file.read_text()
     [app] = yaml.safe_load(text)["applications"]
     if (own := app["args"].get("environment", {}).get("python")) is not None:

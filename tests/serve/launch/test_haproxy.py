@@ -1,4 +1,6 @@
-"""When HAProxy is ready: what its statistics must say of an application's replicas."""
+"""The readiness of HAProxy, judged from its statistics of an application's replicas, and its
+settings.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ from vlagents_ray.serve.launch.haproxy import (
 )
 from vlagents_ray.serve.ports import free_port
 
-pytestmark = pytest.mark.slow  # HAProxy's own timeouts have to pass
+pytestmark = pytest.mark.slow  # HAProxy's own timeouts must pass
 
 MOST_CONNECTIONS = _CONNECTIONS_PER_ADDRESS + 50
 UP, DOWN = "http-app,SERVE_REPLICA::1,UP", "http-app,SERVE_REPLICA::1,DOWN"
@@ -50,7 +52,7 @@ UP, DOWN = "http-app,SERVE_REPLICA::1,UP", "http-app,SERVE_REPLICA::1,DOWN"
 
 @contextmanager
 def statistics(*rows: str) -> Iterator[int]:
-    """A page of HAProxy's statistics; yields its port."""
+    """Serve a page of HAProxy statistics, and yield the port."""
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -59,7 +61,7 @@ def statistics(*rows: str) -> Iterator[int]:
             self.wfile.write("\n".join(["# pxname,svname,status", *rows, ""]).encode())
 
         def log_message(self, *_: Any) -> None:
-            """Nothing."""
+            """Suppress the log."""
 
     with HTTPServer(("127.0.0.1", 0), Page) as server:
         thread = threading.Thread(target=server.serve_forever)
@@ -72,7 +74,7 @@ def statistics(*rows: str) -> Iterator[int]:
 
 
 def serving(running: int) -> Any:
-    """Serve, with one application of so many replicas."""
+    """Return a stand-in for Serve with one application of `running` replicas."""
     policy = SimpleNamespace(replica_states={"RUNNING": running})
     application = SimpleNamespace(deployments={"Policy": policy})
     return SimpleNamespace(status=lambda: SimpleNamespace(applications={"app": application}))
@@ -80,7 +82,9 @@ def serving(running: int) -> Any:
 
 @pytest.mark.parametrize(("running", "rows"), [(1, [UP]), (0, []), (0, [DOWN])])
 def test_it_reaches_all_that_run(running: int, rows: list[str]) -> None:
-    """An application may be down to no replica before HAProxy was asked: nobody waits for that."""
+    """An application may lose all replicas before HAProxy's statistics are read, which must not
+    block the start.
+    """
     with statistics(*rows) as port:
         wait_for_haproxy(serving(running), {"app": "/"}, port, time.monotonic() + 30)
 
@@ -93,8 +97,8 @@ def test_it_is_late_while_a_replica_that_runs_is_not_reached(running: int, rows:
 
 @contextmanager
 def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
-    """The URL of a HAProxy in front of an application with these servers; ADDRESS is one that
-    never answers.
+    """Yield the URL of a HAProxy in front of an application with these servers; ADDRESS never
+    answers.
     """
     port = free_port()
     config = folder / "haproxy.cfg"
@@ -123,7 +127,7 @@ def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
 
 
 def seconds(setting: str) -> float:
-    """A time as HAProxy writes it."""
+    """Return a time in HAProxy's notation in seconds."""
     number, unit = re.fullmatch(r"(\d+)(ms|s)", setting).groups()  # type: ignore[union-attr]
     return int(number) / (1000 if unit == "ms" else 1)
 
@@ -157,8 +161,8 @@ listen stats
 
 
 def binds(launcher: Path, config: Path, server: str) -> list[str]:
-    """The addresses at which HAProxy would listen with the settings that Serve writes for a
-    server of the backend.
+    """Return the addresses at which HAProxy would listen, with the settings that Serve writes when
+    `server` is in the backend.
     """
     config.write_text(SERVES_OWN.format(server=server))
     subprocess.run([launcher, "-f", config], check=True)
@@ -169,7 +173,7 @@ def binds(launcher: Path, config: Path, server: str) -> list[str]:
 def test_clients_are_refused_until_the_first_replica_runs_and_when_the_server_stops(
     begins_empty: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """openpi's client waits for a server whose port is closed, and ends at a handshake that is
+    """openpi's client waits for a server whose port is closed, but fails if the handshake is
     rejected or hangs.
     """
     monkeypatch.setenv(MARK, str(tmp_path))
@@ -179,7 +183,7 @@ def test_clients_are_refused_until_the_first_replica_runs_and_when_the_server_st
         open_port(tmp_path)
     assert set(binds(launcher, config, FALLBACK)) == {*own, *(public if begins_empty else [])}
     assert set(binds(launcher, config, REPLICA)) == {*own, *public}
-    # When the last replica has ended, clients get an answer that says so.
+    # When the last replica has ended, clients still get an answer that explains it.
     assert set(binds(launcher, config, FALLBACK)) == {*own, *public}
     close_port()  # the server stops
     assert set(binds(launcher, config, REPLICA)) == set(own)
@@ -195,7 +199,7 @@ def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: 
 @pytest.mark.parametrize(
     ("servers", "path", "body"),
     [
-        ([REPLICA, FALLBACK], "/app/healthz", None),  # frozen
+        ([REPLICA, FALLBACK], "/app/healthz", None),  # a frozen replica
         ([FALLBACK], "/app/healthz", None),
         ([FALLBACK], "/v1/metadata", None),
         ([FALLBACK], "/v1/act", b"{}"),
@@ -204,8 +208,8 @@ def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: 
 def test_without_a_replica_that_answers_haproxy_does(
     servers: list[str], path: str, body: bytes | None, tmp_path: Path
 ) -> None:
-    """Serve keeps requests until there is a replica: for ever, where it waits for a GPU that no
-    node has.
+    """Serve keeps requests until a replica runs, which may be forever if no node has the required
+    GPU.
     """
     with proxied(tmp_path, *servers) as url:
         with pytest.raises(urllib.error.HTTPError, match="503") as refused:
@@ -229,8 +233,8 @@ def test_a_replica_may_take_its_time_and_a_websocket_waits_for_one(
 
 
 def test_a_frozen_replica_is_out_of_the_way_when_its_clients_leave_it() -> None:
-    """Each would else come back to it by the hash, now and then, until its next calls had ended,
-    too.
+    """Otherwise the hash would send some clients back to the frozen replica, until their next calls
+    had also failed.
     """
     between = max(
         seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER),
@@ -250,7 +254,7 @@ def test_a_replica_that_does_not_answer_gets_no_more_requests(tmp_path: Path) ->
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
-            """Nothing."""
+            """Suppress the log."""
 
     def answered(url: str) -> bool:
         try:
@@ -279,20 +283,22 @@ def test_a_replica_that_does_not_answer_gets_no_more_requests(tmp_path: Path) ->
 
 @contextmanager
 def toggled(name: str) -> Iterator[tuple[int, threading.Event]]:
-    """A server that answers with its name while the event is set; yields its port and the event."""
+    """Run a server that answers with its name while the event is set, and yield its port and the
+    event.
+    """
     up, over = threading.Event(), threading.Event()
 
     class Named(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             while not up.is_set() and not over.is_set():
                 up.wait(0.1)
-            with suppress(OSError):  # it has gone meanwhile
+            with suppress(OSError):  # the client may have left in the meantime
                 self.send_response(200)
                 self.end_headers()
                 self.wfile.write(name.encode())
 
         def log_message(self, *_: Any) -> None:
-            """Nothing."""
+            """Suppress the log."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Named) as server:
         threading.Thread(target=server.serve_forever).start()
@@ -304,7 +310,7 @@ def toggled(name: str) -> Iterator[tuple[int, threading.Event]]:
 
 
 def server_of(url: str, session: str) -> str:
-    """The server that answers the session; "" if none does."""
+    """Return the name of the server that answers the session; "" if none does."""
     with suppress(OSError):
         request = urllib.request.Request(f"{url}/v1/act", headers={"x-session-id": session})
         with urllib.request.urlopen(request, timeout=1) as answer:
@@ -313,7 +319,7 @@ def server_of(url: str, session: str) -> str:
 
 
 def answer_to(url: str, request: str, address: str = "127.0.0.1") -> bytes:
-    """The answer to a request as text, from an address of this machine."""
+    """Return the answer to a request as text; the request comes from `address` of this machine."""
     port = int(url.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), 10, (address, 0)) as client:
         client.sendall(request.encode())
@@ -322,7 +328,7 @@ def answer_to(url: str, request: str, address: str = "127.0.0.1") -> bytes:
 
 @contextmanager
 def upgrading() -> Iterator[tuple[str, list[dict[str, str]]]]:
-    """A replica's line in HAProxy's settings, and the headers of the requests that reach the
+    """Yield a replica's line in HAProxy's settings, and the headers of the requests that reach the
     replica.
     """
     headers: list[dict[str, str]] = []
@@ -335,12 +341,12 @@ def upgrading() -> Iterator[tuple[str, list[dict[str, str]]]]:
             self.send_response(101)
             self.send_header("connection", "upgrade")
             self.send_header("upgrade", "websocket")
-            # For the key in UPGRADE.
+            # The answer to the key in UPGRADE.
             self.send_header("sec-websocket-accept", "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=")
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
-            """Nothing."""
+            """Suppress the log."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Upgrade) as server:
         threading.Thread(target=server.serve_forever).start()
@@ -387,7 +393,7 @@ def test_no_replica_is_offered_compression(tmp_path: Path) -> None:
     "more", ["Content-Length: 5\r\n\r\nhello", "Transfer-Encoding: chunked\r\n\r\n"]
 )
 def test_a_handshake_with_a_body_is_refused_at_once(more: str, tmp_path: Path) -> None:
-    """A replica would never answer it."""
+    """A replica would never answer such a handshake."""
     with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
         assert answer_to(url, HANDSHAKE + more).startswith(b"HTTP/1.1 400")
         assert not reached
@@ -398,7 +404,7 @@ def test_one_address_does_not_take_all_connections(tmp_path: Path) -> None:
     with upgrading() as (replica, _), proxied(tmp_path, replica) as url, ExitStack() as held:
         port = int(url.rpartition(":")[2])
         for _number in range(MOST_CONNECTIONS):
-            # HAProxy closes those beyond the limit, some before they are connected here.
+            # HAProxy closes connections over the limit, some of them before `connect` returns.
             with suppress(OSError):
                 client = held.enter_context(
                     socket.create_connection(("127.0.0.1", port), 10, ("127.0.0.2", 0))
@@ -420,7 +426,7 @@ def test_one_address_does_not_take_all_connections(tmp_path: Path) -> None:
 def test_a_session_returns_from_serves_own_proxy_but_not_from_a_replica_where_it_acts(
     other: str, tmp_path: Path
 ) -> None:
-    """A replica that thaws would get them from one that holds them."""
+    """Otherwise a replica that thaws would take sessions from the replica where they act."""
     sessions = [f"session-{number}" for number in range(10)]
     checked = "check inter 100ms fall 2 rise 2"
     with toggled("thawing") as (first, up), toggled(other) as (second, also_up):

@@ -1,5 +1,5 @@
-"""Which process builds the applications of a server, what it waits for, how many GPUs it gets,
-and how it ends.
+"""The start and stop of a server: which process builds its applications, what it waits for, and how
+many GPUs it needs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from vlagents_ray.serve.replica import replica
 
 
 class FakeClient:
-    """Serve's client: remembers what it was to deploy."""
+    """A stand-in for Serve's client that records the deployments."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.by_serve: list[ServeDeploySchema] = []
@@ -49,7 +49,7 @@ class FakeClient:
 
 
 def changed(app: dict[str, Any], **beside: Any) -> Deployment:
-    """A file with further keys of an application, and of the file."""
+    """Return a deployment with further keys of an application and of the file."""
     document = deployment("noop").model_dump(exclude_unset=True)
     document["applications"][0] |= app
     return Deployment(**document, **beside)
@@ -59,7 +59,9 @@ def changed(app: dict[str, Any], **beside: Any) -> Deployment:
 def test_a_server_on_its_own_ray_builds_its_applications_itself(
     ends_at_once: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For a file Serve starts a process that imports everything once more, which takes a second."""
+    """For a deployment file, Serve would start a process that imports everything again, which takes
+    a second.
+    """
     client = FakeClient(monkeypatch)
     two = together(
         {
@@ -90,8 +92,8 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
 def test_what_serve_must_apply_is_deployed_by_serve(
     config: Deployment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So that another deployment of the file changes it without new replicas; in a cluster of
-    others, all of it is.
+    """Then a later deployment of the file can change it without new replicas. In a cluster of
+    others, Serve deploys everything.
     """
     client = FakeClient(monkeypatch)
     deploy(client, config, is_own_ray=config != changed({}), ingress=True)
@@ -102,7 +104,7 @@ def test_what_serve_must_apply_is_deployed_by_serve(
 def test_a_proxy_that_serve_replaces_is_waited_for(
     monkeypatch: pytest.MonkeyPatch, deaths: int
 ) -> None:
-    """Serve kills one that does not start within some seconds."""
+    """Serve kills a proxy that does not start within some seconds."""
     asked: list[str] = []
 
     def get(refs: list[str], timeout: float) -> None:
@@ -126,7 +128,7 @@ def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch,
         wait_for_proxies([], list)
 
 
-ANYWHERE = "0.0.0.0"  # noqa: S104 - what is warned of
+ANYWHERE = "0.0.0.0"  # noqa: S104 - an address that causes a warning
 
 
 @pytest.mark.parametrize(
@@ -204,7 +206,9 @@ def test_a_replica_stands_on_each_gpu_unless_the_file_says_otherwise(
 def test_more_gpus_than_this_machine_has_are_refused_at_once(
     said: dict[str, Any], wanted: float, own: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cluster that others started may get more: there it is said, and waited for."""
+    """A cluster that others started may get more GPUs, so there the server prints a message and
+    waits.
+    """
     monkeypatch.setattr(server.session, "started_here", lambda: own)
     monkeypatch.setattr(ray, "cluster_resources", lambda: {"GPU": wanted})
     server._require_gpus(deployment("noop", **said))
@@ -224,7 +228,7 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
 
 
 class NoRay(Exception):
-    """A Ray would have been started."""
+    """The server would have started Ray."""
 
 
 @pytest.mark.parametrize("gpus", [0, 2])
@@ -284,11 +288,11 @@ def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
     assert ("resources: {num_gpus: 1}" in caplog.text) == (not given)
 
 
-# The end.
+# The stop of a server.
 
 
 def client_of_serve() -> SimpleNamespace:
-    """A client of a Serve that can be shut down."""
+    """Return a client of a Serve that can be shut down."""
     ending = SimpleNamespace(remote=lambda: None)
     controller = SimpleNamespace(graceful_shutdown=SimpleNamespace(options=lambda **_: ending))
     return SimpleNamespace(
@@ -324,7 +328,9 @@ def test_no_poll_that_a_proxy_loses_with_the_controller_is_printed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Where the proxy ends later than the controller, Ray prints it in the server's process."""
+    """If the proxy ends after the controller, Ray would print the failed poll in the server's
+    process.
+    """
     expression = None if skipped_before is None else re.compile(skipped_before)
     monkeypatch.setattr(stdout_deduplicator, "skip_re", expression)
     monkeypatch.setattr(stdout_deduplicator, "recent", {})
@@ -345,7 +351,7 @@ def test_no_poll_that_a_proxy_loses_with_the_controller_is_printed(
 def test_each_long_poll_of_a_controller_can_be_stopped_before_it_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ray would tell the user of a failed task, in one end of four."""
+    """Otherwise Ray would report a failed task to the user in one of four stops."""
     stopped: list[str] = []
     own = SimpleNamespace(stop=lambda: stopped.append("own"))
     shared = SimpleNamespace(

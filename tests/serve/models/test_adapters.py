@@ -1,5 +1,5 @@
-"""Sessions with different LoRA adapters are sessions of one model: one batch, one load, and
-their own identity.
+"""Sessions with different LoRA adapters share one model, one load and one batch, but have different
+identities.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CHOICES = {
 
 
 class Adapted(Agent):
-    """Acts by the name of its session's adapter, as a family with adapters does."""
+    """A policy that returns the name of its session's adapter, like a family with adapters."""
 
     shared = ("made", "settings")
 
@@ -58,7 +58,7 @@ class Adapted(Agent):
 
 @pytest.fixture
 def made() -> list[Adapted]:
-    """All agents that were made."""
+    """Return the list of all agents that are created."""
     return []
 
 
@@ -131,7 +131,7 @@ def test_adapters_are_settings_of_the_deployments_own_checkpoint_alone(
 
 def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adapted]) -> None:
     engine = serve()
-    engine.models.configure({"checkpoint": "/runs/a"})  # as it is
+    engine.models.configure({"checkpoint": "/runs/a"})  # the checkpoint in use
     engine.models.configure({"checkpoint": "/runs/c"})
     while told(engine, "s0", checkpoint="stack") and len(made) < 2:
         pass
@@ -174,7 +174,7 @@ def test_an_adapter_stands_alone(settings: dict[str, Any]) -> None:
 
 
 def of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that a deployment with adapters makes of its policy's."""
+    """Return the policy settings that a deployment with adapters derives from `settings`."""
     return CheckpointArgs(choices=CHOICES).of(lambda _: Agent(), settings).config
 
 

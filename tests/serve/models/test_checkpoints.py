@@ -1,5 +1,5 @@
-"""Sessions choose among the checkpoints of a deployment, which swaps its own: loading, sharing,
-making room.
+"""Sessions select among the checkpoints of a deployment, whose default checkpoint can be swapped:
+loading, sharing and eviction.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def serving(library: Library) -> Iterator[Callable[..., Engine]]:
 
 
 def holders(engine: Engine) -> dict[str | None, int]:
-    """How many sessions keep which checkpoint."""
+    """Return the number of sessions of each checkpoint."""
     return {model.checkpoint: model.sessions for model in engine.models._cache.loaded.values()}
 
 
@@ -66,7 +66,7 @@ def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., E
     assert reset(engine, "own") == "a/1"
     chosen = begin(engine, "chosen", checkpoint="b", seed=4).get(timeout=10)
     assert chosen.info == {"checkpoint": "b/2", "options": {"seed": 4}}, (
-        "the choice is not the policy's business"
+        "the policy does not receive the choice"
     )
     assert reset(engine, "step", checkpoint_step=30) == "a/30"
     for step in range(1, 20):
@@ -127,7 +127,7 @@ def test_loading_one_checkpoint_keeps_no_session_of_another_waiting(
     gate.set()
     assert [replies.get(timeout=10).error for replies in waiting] == [None] * 8
     assert act(engine, "chosen 0") == [2, 1]
-    assert library.loads["b/2"] == 1, "once for all who need it"
+    assert library.loads["b/2"] == 1, "loaded once for all sessions"
 
 
 def test_what_does_not_load_says_why_and_is_tried_again(
@@ -150,7 +150,7 @@ def test_the_least_recently_used_checkpoint_makes_room(
 ) -> None:
     engine = serving(choices=["b/2", "c/3"])
     reset(engine, "s", checkpoint="b")
-    reset(engine, "s")  # the own one is the last that was used
+    reset(engine, "s")  # the default checkpoint is now the last used
     reset(engine, "s", checkpoint="c")
     assert library.closed == ["b/2"]
     assert sorted(engine.models.describe()["loaded"]) == ["a/1", "c/3"]
@@ -159,7 +159,7 @@ def test_the_least_recently_used_checkpoint_makes_room(
 def test_memory_is_given_back(serving: Callable[..., Engine], library: Library) -> None:
     engine = serving(choices=["b/2"], loaded=1, batch_sizes=[4], max_batch_size=4)
     reset(engine, "s")
-    act(engine, "s")  # padding keeps agents, too
+    act(engine, "s")  # padding also keeps agents
     reset(engine, "s", checkpoint="b")
     assert library.closed == ["a/1"]
     assert set(library.alive) == {"b/2"}
@@ -188,7 +188,7 @@ def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     engine = serving(choices=["b/2", "c/3"], loaded=3)
-    size, total = 10, 25  # room for two
+    size, total = 10, 25  # room for two checkpoints
 
     def memory(_: object) -> dict[str, int]:
         reserved = size * len(library.alive)
@@ -210,8 +210,8 @@ def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
 def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ten clients, each with a checkpoint of its own, that begin one episode after the other for
-    ever.
+    """Ten clients, each with a different checkpoint, begin one episode after the other
+    without end.
     """
     monkeypatch.setattr(model_manager, "PATIENCE_S", 0.0)
     engine = serving(steps=True)
@@ -230,7 +230,7 @@ def test_ten_checkpoints_have_their_turns_with_room_for_two(
         assert reply.info["checkpoint"] == f"a/{client}"
         turns[client] += 1
         play(client)
-    assert len(library.alive) <= 3  # one of which may just be on its way out
+    assert len(library.alive) <= 3  # one of them may be in the middle of its eviction
 
 
 def test_a_reset_whose_time_is_over_is_told_and_nothing_is_loaded_for_it(
@@ -282,7 +282,7 @@ def test_a_reset_of_a_session_that_is_closed_and_begun_anew_does_not_touch_it(
     put = engine.queue.put
 
     def late(*tickets: PendingRequest) -> None:
-        """What is asked of the session comes just before its reset that waited."""
+        """Queue the other requests of the session just before its reset that waited."""
         monkeypatch.undo()
         others.extend(ask(engine, "s", op) for op in ("close", "reset"))
         put(*tickets)
@@ -354,7 +354,7 @@ def test_each_checkpoint_has_a_contract_of_its_own(
     two, three = ({"state": {"joints": np.zeros(n, np.float32)}} for n in (2, 3))
     chosen = {"checkpoint": "b"}
     assert ask(engine, "s", "reset", obs=two).get(timeout=10).error is None
-    # It is not loaded yet.
+    # This request arrives before checkpoint "b" is loaded.
     early = ask(engine, "t", "reset", obs=two, kwargs=chosen).get(timeout=10)
     assert isinstance(early.error, InvalidObservation)
     with pytest.raises(InvalidObservation):
@@ -369,7 +369,7 @@ def test_each_checkpoint_has_a_contract_of_its_own(
 def test_an_act_behind_a_reset_is_checked_against_the_checkpoint_that_the_reset_chose(
     serving: Callable[..., Engine], library: Library
 ) -> None:
-    """At its arrival it was checked against the checkpoint that its session had then."""
+    """When the act arrived, it was checked against the session's checkpoint at that time."""
     library.joints = {"a/1": 2, "b/2": 3}
     engine = serving(choices=["b/2"])
     two, three = (Obs(state={"joints": np.zeros(n, np.float32)}) for n in (2, 3))
@@ -408,7 +408,7 @@ def test_a_session_that_moves_takes_its_checkpoint_along(
     assert state is not None
     with pytest.raises(UnknownSession):
         elsewhere.moves.adopt("s", state, timeout_s=10)
-    assert elsewhere.models.describe()["loaded"] == ["a/1"], "it is not offered there"
+    assert elsewhere.models.describe()["loaded"] == ["a/1"], "the checkpoint is not offered there"
     with pytest.raises(UnknownSession, match="'b' is not loaded here"):
         there.moves.adopt("s", state)
     there.moves.adopt("s", state, timeout_s=10)
@@ -418,7 +418,7 @@ def test_a_session_that_moves_takes_its_checkpoint_along(
 
 
 class Stored(Agent):
-    """Reads a file."""
+    """A policy that reads a file."""
 
     def __init__(self, file: Path, weights: dict[str, str | None] | None = None) -> None:
         self.file, self.weights_id = file, weights
@@ -428,7 +428,7 @@ class Stored(Agent):
 
 
 class Computed(Agent):
-    """Has no files."""
+    """A policy without files."""
 
     def __init__(self, weights: dict[str, str | None] | None) -> None:
         self.weights_id = weights
@@ -437,7 +437,9 @@ class Computed(Agent):
 def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_reset(
     tmp_path: Path,
 ) -> None:
-    """Of files that `find_checkpoint` found, or what the agent says itself."""
+    """The digest is that of the files that `find_checkpoint` found, or the one that the agent
+    reports.
+    """
     file = tmp_path / "weights.pt"
     file.write_bytes(b"1")
     mine: dict[str, str | None] = {"digest": "mine", "revision": "c0ffee"}
@@ -468,7 +470,9 @@ def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_rese
 def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(
     weights: dict[str, str | None] | None, expected: dict[str, str | None]
 ) -> None:
-    """A robot is compared with them, whether or not the policy identifies its weights."""
+    """Clients compare a robot with these statistics, whether or not the policy identifies its
+    weights.
+    """
     agent = Computed(weights)
     agent.statistics = {"action": {"min": [0.0], "max": [1.0]}}
     engine = Engine(agent)
@@ -483,8 +487,8 @@ def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(
 
 
 def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Path) -> None:
-    """A replica that started after training had overwritten the checkpoint has others, by the
-    same settings.
+    """A replica that started after training had overwritten the checkpoint has other weights with
+    the same settings.
     """
     file = tmp_path / "weights.pt"
     versions = []
@@ -497,8 +501,8 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
     assert versions[0] == versions[1] != versions[2]
 
 
-# A deployment's own settings change while it runs: new episodes get the new ones, running ones end
-# on the old.
+# A deployment's default settings change while it runs: new episodes use the new settings, running
+# episodes end with the old ones.
 
 
 def swap(engine: Engine, checkpoint: str) -> None:
@@ -548,7 +552,7 @@ def test_a_checkpoint_that_does_not_load_leaves_the_old_one_in_place(
     assert act(engine, "old") == [1, 1]
     assert reset(engine, "new") == "a/1"
     engine.models.configure({"checkpoint": "a/{step}", "checkpoint_step": 1})
-    assert state(engine) is None, "it is forgotten with the old settings"
+    assert state(engine) is None, "the checkpoint was forgotten with the old settings"
     swapped(engine, "b/2")
     assert reset(engine, "new") == "b/2"
 
@@ -581,7 +585,7 @@ def test_with_room_for_one_sessions_end_so_that_the_new_one_can_load(
     swap(engine, "b/2")
     library.wait_for("b/2")
     assert library.closed == ["a/1"]
-    assert "a/1" not in library.alive, "two would not have been in memory together"
+    assert "a/1" not in library.alive, "two checkpoints would not have fit in memory together"
     with pytest.raises(UnknownSession):
         act(engine, "old")
     waiting = begin(engine, "old")
@@ -590,7 +594,9 @@ def test_with_room_for_one_sessions_end_so_that_the_new_one_can_load(
     assert reply.info["checkpoint"] == "b/2"
     swap(engine, "broken")
     wait_for(lambda: state(engine) is not None and state(engine)["state"] == "failed")
-    assert reset(engine, "s") == "b/2", "the old one is loaded again if the new one cannot be"
+    assert reset(engine, "s") == "b/2", (
+        "the old checkpoint is loaded again if the new one cannot be loaded"
+    )
     assert library.loads["b/2"] == 2
 
 
@@ -598,13 +604,13 @@ def test_with_room_for_one_sessions_end_so_that_the_new_one_can_load(
 def test_what_a_swap_overtakes_is_told_that_its_session_has_ended(
     serving: Callable[..., Engine], library: Library, op: str
 ) -> None:
-    """Clients begin such an episode again by themselves; a closed policy must not be asked."""
+    """Clients begin such an episode again automatically. A closed policy must not be called."""
     engine = serving()
     reset(engine, "s")
     [model] = engine.models._cache.loaded.values()
 
     class Overtaken:
-        """The lock, which the swap gets first."""
+        """A lock that the swap acquires first."""
 
         def __enter__(self) -> None:
             model.busy = threading.Lock()
@@ -654,13 +660,14 @@ def test_a_swap_without_room_takes_that_of_a_choice(
     gate = library.hold("b/2")
     swap(engine, "b/2")
     wait_for(lambda: engine.models._cache.draining != "")
-    # Its last episode is over: the room goes to the swap.
+    # The last episode of this choice is over, so the swap takes its room.
     again = begin(engine, "chosen", checkpoint="c")
     library.wait_for("b/2")
     assert reset(engine, "another") == "a/1"
     gate.set()
     wait_for(lambda: state(engine) is None)
-    for session in ("own", "another"):  # the last that kept the old one in memory
+    # these were the last sessions that kept the old checkpoint in memory
+    for session in ("own", "another"):
         ask(engine, session, "close").get(timeout=10)
     assert reset(engine, "own") == "b/2"
     assert again.get(timeout=10).error is None

@@ -1,4 +1,4 @@
-"""Batches of fixed sizes for compiled models."""
+"""Batches with fixed sizes for compiled models."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ SIZED: dict[str, Any] = {"max_batch_size": 8, "batch_sizes": SIZES}
 
 
 class Compiled(Agent):
-    """Runs batches of `SIZES` alone; its actions hold what was seen and the step."""
+    """A policy that runs only batches of `SIZES`. Its actions contain the observed value and the
+    step.
+    """
 
     broken = False  # the last row of each batch fails
 
@@ -53,7 +55,7 @@ class Compiled(Agent):
 
 
 class Picky(Compiled):
-    """Can be reset once in all."""
+    """A policy that can be reset only once in total."""
 
     made: ClassVar[list[int]] = []
 
@@ -68,7 +70,7 @@ class Picky(Compiled):
 
 
 class Pads(Compiled):
-    """Pads by itself."""
+    """A policy that pads its own batches."""
 
     def initialize(self) -> None:
         with current_report() as report:
@@ -94,13 +96,13 @@ def _whole() -> Iterator[None]:
 def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[..., Engine]) -> None:
     agent = Compiled()
     engine = serving(agent, **SIZED)
-    names = [f"s{i}" for i in range(11)]  # ten of them act: 8, and 2
+    names = [f"s{i}" for i in range(11)]  # ten of them act, in batches of 8 and 2
     for name in names:
         ask(engine, name, "reset")
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     busy, released = threading.Event(), threading.Event()
     submit(engine, "s0", Request("close"), lambda _: busy.set() or (released.wait(10) and None))
-    assert busy.wait(10)  # the policy's thread is in there while all come
+    assert busy.wait(10)  # the policy's thread is busy while all requests arrive
     for name in names[1:]:
         submit(engine, name, Request("act", Obs(info={"value": int(name[1:])})), replies.put)
     released.set()
@@ -124,12 +126,12 @@ def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(
         reply = ask(engine, "second", "act", value=7)
         assert (reply.act.action.tolist(), reply.act.info["name"]) == ([7, step], "second")
         assert reply.timing["batch_size"] == 1
-        # The row beside it began as the first session did.
+        # The padding row began with the first session's reset.
         assert agent.batches[-1] == ["second", "first"]
         assert agent.seen == [7, 7]
     assert len(engine.sessions) == 2
     reply = ask(engine, "first", "act")
-    assert reply.act.action[1] == 1  # whose own session has not acted with it
+    assert reply.act.action[1] == 1  # the first session itself has not acted before
 
 
 def test_nobody_hears_of_paddings_failure(serving: Callable[..., Engine]) -> None:
@@ -147,7 +149,7 @@ def test_without_padding_the_batch_runs_as_it_is(serving: Callable[..., Engine])
     ask(engine, "a", "reset")
     for _ in range(3):
         assert ask(engine, "a", "act").error is None
-    assert len(Picky.made) == 2  # it is tried once
+    assert len(Picky.made) == 2  # padding is tried once
 
 
 def test_a_policy_that_pads_gets_the_batch_as_it_is(serving: Callable[..., Engine]) -> None:
@@ -160,7 +162,7 @@ def test_a_refused_first_reset_is_not_what_padding_begins_with(
     serving: Callable[..., Engine],
 ) -> None:
     engine = serving(Compiled(), **SIZED)
-    # Lacks the `env` that the policy needs.
+    # This reset lacks the `env` that the policy needs.
     refused = answered(engine, "bad", Request("reset", Obs(), "bad"))
     assert isinstance(refused.error, PolicyFailed)
     ask(engine, "good", "reset")

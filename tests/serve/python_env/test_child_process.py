@@ -1,4 +1,4 @@
-"""A policy behind an engine, in a separate process: as if it were in this one."""
+"""A policy in a child process behind an engine behaves like a policy in the engine's process."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def engine() -> Iterator[Engine]:
 
 @pytest.fixture(scope="module")
 def other(engine: Engine) -> Iterator[Engine]:
-    """Another replica of the same policy."""
+    """Yield another replica of the same policy."""
     other = Engine(agent())
     other.start()
     yield other
@@ -104,7 +104,7 @@ def ask(engine: Engine, session: str, op: Any, value: float = 0.0, **fields: Any
 
 
 def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
-    """The replies to requests that are put at once."""
+    """Return the replies to requests that are queued at the same time."""
     replies: list[Reply] = []
     over = threading.Event()
 
@@ -142,7 +142,7 @@ def test_the_steps_of_a_long_start_there_are_reported_here() -> None:
         with loading_report(steps.append) as report:
             one.initialize()
         one.reset(observation(), "a task")
-        assert isinstance(one.act(observation()), Act), "as an `Agent` by itself"
+        assert isinstance(one.act(observation()), Act), "the same result as `Agent` itself"
     finally:
         one.close()
     assert steps == ["compiling 1 rows (1 of 2)", "compiling 2 rows (2 of 2)"]
@@ -168,7 +168,7 @@ def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
     pid = info(ask(one, "a", "reset"))["pid"]
     assert one.health.ready
     os.kill(pid, signal.SIGSTOP)
-    # Else it may answer once more.
+    # Otherwise the child may answer once more.
     wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)
     replies: list[Reply] = []
     submit(one, "a", Request("act", observation()), replies.append)
@@ -236,7 +236,7 @@ def test_what_the_replica_drops_the_child_forgets() -> None:
 
 @pytest.fixture
 def preparing() -> Iterator[Engine]:
-    """A policy in a child process that prepares observations and whose batches are slow; its
+    """Yield an engine with slow batches whose policy prepares observations in a child process; its
     sessions "a" to "d" have acted.
     """
     engine = Engine(agent("Preparing"), EngineSettings(max_batch_size=2))
@@ -253,7 +253,9 @@ def preparing() -> Iterator[Engine]:
 def while_acting(
     engine: Engine, requests: list[tuple[str, Request]]
 ) -> list[queue.SimpleQueue[Reply]]:
-    """Queue requests while a long batch of another session runs; where their replies will come."""
+    """Queue requests during a long batch of another session, and return the queues of their
+    replies.
+    """
     first = asked(engine, "a", Request("act", observation(batch_s=0.5)))
     wait_for(lambda: engine.queue.depth() == 0)
     later = [asked(engine, name, request) for name, request in requests]
@@ -313,7 +315,7 @@ def test_a_session_that_ends_takes_its_stored_observations_along(preparing: Engi
     assert info(ask(preparing, "d", "reset"))["alive"] == 1
     child.call([Request("close", session=stored.session)])
     wait_for(lambda: info(ask(preparing, "d", "reset"))["alive"] == 0, 10)
-    del stored  # the child does not know it any more, and continues
+    del stored  # the child no longer has this value; this is no error
     wait_for(child._dropped.empty)
     assert info(ask(preparing, "c", "act"))["value"] == 0.0
 
@@ -323,7 +325,7 @@ def test_a_row_with_the_observation_of_another_session_sends_it(preparing: Engin
     prepares = ability(sessions[0], Prepares)
     obs = observation(5.0)
     obs.prepared = prepares.prepare(obs)
-    acts = sessions[0].act_batch([obs, obs], sessions)  # as of a row that pads a batch
+    acts = sessions[0].act_batch([obs, obs], sessions)  # like a row that pads a batch
     assert [act.info["value"] for act in acts] == [5.0, 5.0]
 
 
@@ -347,7 +349,7 @@ def test_an_observation_that_is_acted_on_again_is_sent_again(
 def test_the_memory_of_the_childs_gpu_is_the_replicas(
     preparing: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert preparing.models.gpu_memory() == {}, "the child has no GPU either"
+    assert preparing.models.gpu_memory() == {}, "the child has no GPU"
     both = Engine(agent())
     both.start()
     try:
@@ -478,10 +480,10 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
     with pytest.raises(VLAgentsError) as error:
         one.start()
     assert said in str(error.value)
-    with pytest.raises(PolicyFailed) as seen:  # by the operator
+    with pytest.raises(PolicyFailed) as seen:  # the message for the operator
         one.health.check()
     assert said in str(seen.value)
-    with pytest.raises(PolicyFailed) as told:  # what its clients are told
+    with pytest.raises(PolicyFailed) as told:  # the message for clients
         one.health.require_ready()
     assert said not in str(told.value)
     assert sys.executable not in str(told.value)
@@ -509,7 +511,7 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
 
 
 ABILITIES = [value for value in vars(abilities).values() if isinstance(value, type)]
-# Those whose values can be sent, and one that only this test knows.
+# The abilities whose values can be sent, and one that is defined only in this test.
 SENT = [
     protocol
     for protocol in (*ABILITIES, Dances)
@@ -521,7 +523,7 @@ SENT = [
 
 @pytest.fixture(scope="module")
 def able() -> Iterator[Engine]:
-    """A policy in a child process with all abilities whose values can be sent."""
+    """Yield a policy in a child process with all abilities whose values can be sent."""
     engine = Engine(agent("Able", protocols=[name_of(protocol) for protocol in SENT]))
     engine.start()
     yield engine
@@ -564,7 +566,7 @@ def test_a_policy_without_an_ability_has_none_in_its_process(
     assert session is not None
     found = ability(session, protocol)
     assert (found is not None) == (protocol in (Observes, HasWeightsId))
-    assert ability(session, Prepares) is None, "the policy prepares nothing"
+    assert ability(session, Prepares) is None, "the policy prepares no observations"
 
 
 def test_an_ability_of_the_loaded_policy_is_used_while_it_acts(able: Engine) -> None:
@@ -608,7 +610,7 @@ def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engin
 
 
 def learner(policy: str = "Gain", **config: Any) -> tuple[Engine, ChildConnection]:
-    """A trained policy in a child process."""
+    """Yield a trained policy in a child process."""
     one = in_child(policy, **config)
     served = Engine(one)
     served.start()

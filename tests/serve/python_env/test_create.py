@@ -1,5 +1,5 @@
-"""`vlagents-ray venv create`, but for what it downloads: tests/integration/test_environments.py
-uses what it makes.
+"""`vlagents-ray venv create` without downloads. tests/integration/test_environments.py uses real
+environments.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from vlagents_ray.serve.python_env.create import create, find_python, make_envir
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What uv is told in the place of installing, with the text of overrides and constraints;
-    nothing is installed.
+    """Return a growing list of uv's arguments, with the text of overrides and constraints. Nothing
+    is installed.
     """
     told: list[str] = []
 
@@ -40,7 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     real = making._uv
     monkeypatch.setattr(making, "_uv", uv)
-    # Those of this environment would be another call.
+    # The plug-ins of this environment would add another call of uv.
     monkeypatch.setattr(making, "plugin_distributions", list)
     return told
 
@@ -68,7 +68,7 @@ def test_it_holds_this_package_with_the_same_ray_and_the_requirements(
 def test_a_plugin_on_the_path_of_modules_is_installed_from_its_checkout(
     asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a PYTHONPATH: its metadata are those that setuptools wrote beside its sources."""
+    """A plug-in may be on PYTHONPATH; setuptools wrote its metadata next to its sources."""
     checkout = tmp_path / "checkout"
     metadata = checkout / "some_plugin.egg-info" / "PKG-INFO"
     metadata.parent.mkdir(parents=True)
@@ -116,7 +116,7 @@ OWN = "{}.{}".format(*sys.version_info[:2])
 
 
 def interpreter(path: Path, says: str) -> Path:
-    """Something that is run as a Python, and says that."""
+    """Write a shell script in place of a Python interpreter."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"#!/bin/sh\n{says}\n")
     path.chmod(0o755)
@@ -135,7 +135,7 @@ class TestThePythonThatRequirementsName:
 
     def test_is_this_one_or_one_that_runs_and_is_that_version(self, tmp_path: Path) -> None:
         assert find_python(OWN) == sys.executable
-        # As a shim of pyenv's without a version.
+        # A shim of pyenv for a version that is not installed.
         interpreter(tmp_path / "one" / "python3.97", "exit 127")
         in_uv = interpreter(
             tmp_path / "uv" / "cpython-3.97.0-linux" / "bin" / "python3.97", "echo 3.97"
@@ -277,7 +277,7 @@ def test_a_gpu_is_found_on_linux_and_wsl_and_none_on_a_jetson(
             "exit 9",
             "580.65.06",
         ),
-        (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2, with two GPUs
+        (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2 with two GPUs
         (None, "exit 9", None),
         (None, None, None),
     ],

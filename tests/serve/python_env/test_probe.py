@@ -1,4 +1,4 @@
-"""What a deployment file may say of an environment, and what is wrong with the one that it
+"""The settings of an environment in a deployment file, and the errors of the environment that it
 names.
 """
 
@@ -26,7 +26,7 @@ from vlagents_ray.serve.python_env.probe import check_policy, probe, with_proces
 
 @pytest.fixture
 def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """An environment with nothing in it, and nothing in the working directory."""
+    """An empty environment, and an empty working directory."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONPATH", raising=False)
     return str(create(tmp_path / "bare"))
@@ -45,8 +45,8 @@ def args(**environment: Any) -> EnvironmentArgs:
 def test_an_interpreter_that_is_a_link_stays_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A virtual environment's is a link to the one that it was made with, which knows nothing of
-    the environment.
+    """The interpreter of a virtual environment is a link to its base interpreter, which would not
+    find the environment's packages.
     """
     link = tmp_path / "python"
     link.symlink_to(sys.executable)
@@ -177,7 +177,7 @@ def test_an_environment_without_this_package_or_with_another_version_of_it(bare:
 def test_the_policy_is_built_where_it_will_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its module is only to be found there."""
+    """The policy's module exists only in its own environment."""
     python = layered(tmp_path / "env", "six==1.15.0")
     [packages] = python.parents[1].glob("lib/python*/site-packages")
     (packages / "only_there.py").write_text(
@@ -213,7 +213,7 @@ def test_the_policy_is_built_where_it_will_run(
     }
     Path("deployment.yaml").write_text(yaml.safe_dump({"applications": [document]}))
     [app] = read_deployment("deployment.yaml").applications
-    assert app.args["environment"]["python"] == str(python), "Ray is to see no relative path"
+    assert app.args["environment"]["python"] == str(python), "Ray must not receive a relative path"
 
 
 def test_an_interpreter_that_does_not_answer_in_time_is_named_without_its_script(

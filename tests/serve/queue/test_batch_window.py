@@ -1,5 +1,5 @@
-"""A batch waits for a group that is coming back: in simulated time, with the queue's own
-bookkeeping.
+"""A batch waits for a group of sessions that will return soon. The tests use simulated time and the
+queue's own bookkeeping.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ Delay = Callable[[], float]
 
 
 def fixed(size: int) -> float:
-    """A policy for which a batch is mostly worth the wait, s."""
+    """Return a batch's duration in s, of a policy for which waiting for a full batch mostly pays
+    off.
+    """
     return 0.020 + 0.001 * size
 
 
@@ -40,7 +42,7 @@ def ticket(
 
 
 class AllButClosed(AnySession):
-    """A table in which every session exists, except "closed"."""
+    """A table in which every session exists except "closed"."""
 
     def __contains__(self, session_id: object) -> bool:
         return session_id != "closed"
@@ -48,14 +50,14 @@ class AllButClosed(AnySession):
 
 @dataclass
 class World:
-    """Clients that come back so long after each answer, a policy, and the queue between them."""
+    """Clients with a given delay after each answer, a policy, and the queue between them."""
 
     delays: list[Delay]
     patience: float
     cost: Callable[[int], float] = fixed
     priorities: dict[int, Priority] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
-    # How long, and how long the batch before took.
+    # (duration of each wait, duration of the batch before it)
     waits: list[tuple[float, float]] = field(default_factory=list)
     robots_waited: float = 0.0
 
@@ -67,7 +69,7 @@ class World:
             0.0,
         )
         order = itertools.count()
-        # A cold start, one by one.
+        # At the cold start, clients arrive one by one.
         coming = [(0.003 * i, next(order), i) for i in range(len(self.delays))]
         heapq.heapify(coming)
 
@@ -105,13 +107,15 @@ class World:
         return self
 
     def mean(self) -> float:
-        """Of the sizes of batches, when all has settled."""
+        """Return the mean size of the batches in the second half of the run."""
         half = self.sizes[len(self.sizes) // 2 :]
         return sum(half) / len(half)
 
 
 def soon(seed: int) -> Delay:
-    """As a simulation that asks again at once: the way there and back, and its own frame."""
+    """Return the delay of a simulation that calls again at once: the round trip and the time of one
+    simulation step.
+    """
     choose = random.Random(seed)
     return lambda: 0.001 + choose.uniform(0, 0.001)
 
@@ -124,12 +128,16 @@ def test_a_group_comes_together_and_stays(clients: int) -> None:
 
 
 def large_model(size: int) -> float:
-    """A policy of which one batch saves as much over two as a robot may wait, s."""
+    """Return a batch's duration in s, of a policy for which one batch instead of two saves as much
+    time as a robot may wait.
+    """
     return 0.040 + 0.011 * size
 
 
 def robot(seed: int, least: float = 0.003, most: float = 0.012) -> Delay:
-    """As one of several robots of a process, which encodes their images in turns."""
+    """Return the delay of one of several robots in a process, which encodes their images one after
+    the other.
+    """
     choose = random.Random(seed)
     return lambda: choose.uniform(least, most)
 
@@ -191,11 +199,13 @@ def test_nobody_waits_where_batches_save_nothing() -> None:
 def answered_together(
     *names: str, patience: float = 0.1, robots: str = "", back_s: float = 0.002
 ) -> tuple[BatchWindow, FairQueue]:
-    """Three batches of 100 ms, the last over at 2.0; in between all were back after `back_s`."""
+    """Simulate three batches of 100 ms, the last of which ends at 2.0; after each of the others,
+    all sessions returned after `back_s`.
+    """
     returning = BatchWindow(patience, SIZE, AllButClosed())
     priorities = {name: Priority.ROBOT if name in robots else Priority.SIMULATION for name in names}
     tickets = [ticket(name, 0.0, priorities[name]) for name in names]
-    for end in (0.0, 1.0, 2.0):  # the first shows that the policy is slow
+    for end in (0.0, 1.0, 2.0):  # the first batch shows that the policy is slow
         returning.record_start(tickets)
         returning.record_end(end, 0.1)
         tickets = [ticket(name, end + back_s, priorities[name]) for name in names]
@@ -251,7 +261,8 @@ def test_a_robot_that_came_for_the_first_time_ends_the_wait_of_robots() -> None:
 
 
 def test_robots_do_not_wait_without_patience_or_for_longer_than_a_batch_saves() -> None:
-    for patience, back_s in ((0.0, 0.002), (0.1, 0.06)):  # half of the last batch is 0.05
+    # half of the last batch's duration is 0.05 s
+    for patience, back_s in ((0.0, 0.002), (0.1, 0.06)):
         returning, waiting = answered_together(
             "a", "b", patience=patience, robots="ab", back_s=back_s
         )

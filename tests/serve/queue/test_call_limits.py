@@ -1,5 +1,5 @@
-"""When a policy makes its replica unhealthy: by a call that does not return, an accelerator, or
-all of its batches.
+"""The reasons that make a replica unhealthy: a policy's call that does not return, a failed
+accelerator, or failures of all batches.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 
 
 class Hanging(Agent):
-    """Does not return from what it is told to hang in, until `over`."""
+    """A policy that hangs in the requested call until `over` is set."""
 
     shared = ("over",)
 
@@ -97,7 +97,7 @@ def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
 
 
 def request_of(op: Any, **kwargs: Any) -> Request:
-    """A request of a client, or the call of `observe` by another process."""
+    """Return a request of a client, or the call of `observe` by another process."""
     if op == "observe":
         call, obs = AbilityCall.from_arguments(Observes, "observe", (Obs(),), {})
         return Request("call", obs, kwargs=asdict(call))
@@ -115,7 +115,7 @@ def ask(engine: Engine, session: str, op: Any, **kwargs: Any) -> Reply:
 
 
 def hang(engine: Engine, op: str) -> queue.SimpleQueue[Reply]:
-    """Begin a call of that kind, past its warm-up, that does not return."""
+    """Begin a call of that kind that does not return, after its warm-up."""
     ask(engine, "good", "reset")
     for session in ("a", "b"):
         ask(engine, session, "reset")
@@ -153,11 +153,11 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
         engine.health.check()
     engine.notice_hung()
     engine.notice_hung()
-    # The hanging call must not be repeated elsewhere, where it would hang again. A call that had
-    # not begun may be.
+    # The hanging call must not be repeated at another replica, which would also hang. A call that
+    # has not begun may be repeated.
     assert isinstance(begun.get(timeout=10).error, OutcomeUnknown)
     assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
-    late: queue.SimpleQueue[Reply] = queue.SimpleQueue()  # it was checked just before
+    late: queue.SimpleQueue[Reply] = queue.SimpleQueue()  # this request was checked just before
     engine.queue.put(pending("good", Request("act", Obs()), late.put))
     engine.notice_hung()
     assert isinstance(late.get(timeout=10).error, PolicyUnavailable)
@@ -165,7 +165,7 @@ def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_a
         put(engine, "good", "act")
     assert engine.stats.collect().hung == {op: 1}
     assert caplog.text.count("not returned from") == 1
-    assert "self.over.wait" in caplog.text  # where it hangs
+    assert "self.over.wait" in caplog.text  # the line at which the call hangs
     agent.over.set()
     wait_for(lambda: not engine.calls.under_way)
     engine.notice_hung()
@@ -193,7 +193,7 @@ def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(
 def test_a_slow_policy_has_ten_times_its_longest_call(clock: Clock) -> None:
     call = PolicyCall(PolicyCalls(LIMITS, clock), "act")
     limits = []
-    for took_s in (300.0, 40.0, 50.0, 0.0):  # the first one compiled
+    for took_s in (300.0, 40.0, 50.0, 0.0):  # the first call included compilation
         limits.append(call.limit_s)
         with call:
             clock.now += took_s
@@ -220,7 +220,7 @@ def test_an_engine_whose_policy_hangs_ends_all_the_same(
 ) -> None:
     engine = Engine(agent)
     engine.start()
-    # Which waits for the batch, but not for ever.
+    # Without this, `stop` would wait for the batch, although not forever.
     monkeypatch.setattr(engine, "stop", lambda **_: None)
     monkeypatch.setattr("vlagents_ray.serve.models.model_manager._CLOSE_S", 0.05)
     ask(engine, "bad", "reset", hangs_at="act")
@@ -266,7 +266,7 @@ def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_han
 
 
 class Forking(Agent):
-    """Forks in each call; the child `ends` in the same way as a call that succeeds, or raises
+    """A policy that forks in each call. The child `ends` like a successful call, or raises
     SystemExit.
     """
 
@@ -277,7 +277,7 @@ class Forking(Agent):
         self.ends = ends
 
     def _fork(self) -> None:
-        with warnings.catch_warnings():  # of Python: the process has threads
+        with warnings.catch_warnings():  # Python warns because the process has threads
             warnings.simplefilter("ignore", DeprecationWarning)
             child = os.fork()
         if child:
@@ -306,7 +306,9 @@ class Forking(Agent):
 def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(
     op: str, ends: str
 ) -> None:
-    """It would go on with the clients' sockets and an older state of their sessions."""
+    """Otherwise the child would continue with the clients' sockets and with an older state of their
+    sessions.
+    """
     agent = Forking(ends)
     engine = Engine(agent)
     engine.start()
@@ -322,19 +324,19 @@ def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(
     assert {child.returncode for child in ended} == {1}
 
 
-# A policy whose accelerator has failed, or that fails batch after batch.
+# A policy whose accelerator has failed, or whose batches all fail.
 
 
 ASSERT = "CUDA error: device-side assert triggered"
 
 
 class Failing(Agent):
-    """Raises the error that a call is to raise."""
+    """A policy that raises the error set for a call."""
 
     shared = ("errors",)
 
     def __init__(self) -> None:
-        # By op; an empty one would not be shared.
+        # Errors by operation; an empty dict would not be shared.
         self.errors: dict[str, Exception] = {"none": ValueError()}
 
     def _raise(self, op: str) -> None:
@@ -361,7 +363,7 @@ class Failing(Agent):
 def failing(
     serving: Callable[..., Engine],
 ) -> tuple[Engine, Failing, Callable[[Any], Exception | None]]:
-    """An engine, its policy, and how it is asked."""
+    """Return an engine, its policy, and a function that sends requests."""
     policy = Failing()
     engine = serving(policy)
     return engine, policy, lambda op: answered(engine, "a", request_of(op)).error

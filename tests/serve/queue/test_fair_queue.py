@@ -1,4 +1,4 @@
-"""Whose turn it is, and what of the waiting requests the policy gets."""
+"""The order in which waiting requests are passed to the policy."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def test_a_large_bundle_delays_others_by_no_more_than_a_batch() -> None:
 def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(
     connected: bool, named: bool
 ) -> None:
-    """Many sessions of another key, whose sender has the robot's name, delay the robot by no
-    more than a batch.
+    """Many sessions of another key, whose connection has the same name as the robot's, delay the
+    robot by at most one batch.
     """
     keys, engine = ChangingKeys(), Engine(Gain())
     waiting = FairQueue()
@@ -137,7 +137,7 @@ def test_robots_without_end_do_not_starve_simulations() -> None:
             assert served[-1][0].startswith("r")
     order = [name for batch in served for name in batch]
     assert {"s0", "s1"} <= set(order)
-    # A robot is served in between, even if a batch has one slot.
+    # A robot is served in between, even if a batch has only one row.
     assert order.index("s1") - order.index("s0") == 2
 
 
@@ -231,7 +231,7 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     quiet = BatchQueue(1, sessions=AnySession(), idle_s=0.05)
     quiet.bind()
     before_s, began = quiet.load_s()[0], time.perf_counter()
-    assert quiet.next() == ([], []), "its thread is told that nothing came for long"
+    assert quiet.next() == ([], []), "the queue's thread returns after a long time without requests"
     assert 0.05 <= quiet.load_s()[0] - before_s <= time.perf_counter() - began
     quiet.poller.close()
 
@@ -256,7 +256,9 @@ def test_each_request_counts_while_it_waits(queue: Callable[[int], BatchQueue]) 
 
 
 def behind(session: str, *, arrived: float = 0.0) -> PendingRequest:
-    """The request of a robot that is about to run out of rows, but came too late to be admitted."""
+    """Return the request of a robot that is about to run out of rows, but was not admitted because
+    it arrived too late.
+    """
     request = ticket(session, priority=Priority.ROBOT, arrived=arrived)
     request.needed = arrived
     request.waits_behind_others = True

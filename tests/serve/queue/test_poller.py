@@ -1,4 +1,4 @@
-"""Which thread polls the local endpoints while the policy runs, and what happens between two
+"""The thread that polls the local endpoints while the policy runs, and the events between two
 batches.
 """
 
@@ -22,7 +22,7 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue import batch_queue
 from vlagents_ray.serve.queue.poller import Poller
 
-SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
+SLOW_S = 0.02  # the shortest batch that the queue considers slow
 
 
 class _Policy(Agent):
@@ -45,8 +45,8 @@ NAMES = ("a", "b", "c", "d", "e", "f", "r", "robot", "heard", "other")
 
 
 class Slow:
-    """A policy that takes at least `SLOW_S`, and then waits at a gate while that is closed; and
-    what serves it.
+    """A policy whose batches take at least `SLOW_S`, and then wait while the gate is closed, with
+    its engine and queue.
     """
 
     def __init__(self, size: int = 2, patience: float = 0.0) -> None:
@@ -54,7 +54,7 @@ class Slow:
         self.open = threading.Event()
         self.open.set()
         self.busy = threading.Event()
-        self.answered_by: dict[str, str] = {}  # the thread, by session
+        self.answered_by: dict[str, str] = {}  # name of the answering thread, by session
         self.engine = Engine(_Policy(self), EngineSettings(max_batch_size=size, patience=patience))
         self.queue = self.engine.queue
 
@@ -65,7 +65,7 @@ class Slow:
             assert answered(self.engine, name, reset).error is None
 
     def put(self, *sessions: str, priority: PriorityName = "simulation") -> None:
-        """A request of each session, together."""
+        """Queue one request of each session at the same time."""
 
         def done(session: str) -> Callable[[Reply], None]:
             def note(reply: Reply) -> None:
@@ -82,11 +82,13 @@ class Slow:
         )
 
     def called(self, *events: str) -> bool:
-        """Have these happened?"""
+        """Return whether these events have happened."""
         return set(events) <= set(self.events)
 
     def learn(self, *sessions: str) -> None:
-        """Let the queue see that the policy is slow, and that these come back together, at once."""
+        """Let the queue measure that the policy is slow, and that these sessions return together
+        immediately.
+        """
         for _ in range(3):
             self.events.clear()
             self.put(*sessions)
@@ -94,7 +96,7 @@ class Slow:
         self.events.clear()
 
     def hold(self, *sessions: str) -> None:
-        """A batch of these is under way until `open` is set."""
+        """Begin a batch of these sessions, which runs until `open` is set."""
         self.open.clear()
         self.busy.clear()
         self.put(*sessions)
@@ -153,11 +155,11 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(
 def test_nobody_listens_beside_a_lone_session(
     slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unless a batch is long, as each may be on a busy machine."""
+    """The second thread polls only if a batch is long, which any batch may be on a busy machine."""
     monkeypatch.setattr(batch_queue, "_LONG_BATCH_S", 60.0)
     one, lent = slow(), list[str]()
     one.start()
-    # On a busy machine the resets of the other sessions are slow enough for a second thread.
+    # On a busy machine the resets of the other sessions are slow enough for the second thread.
     one.learn("robot")
     monkeypatch.setattr(one.queue.poller, "hand_to_reader", lambda: lent.append("lent"))
     one.learn("robot")
@@ -177,7 +179,7 @@ def test_another_thread_listens_beside_a_long_batch_of_a_lone_session(
     assert heard.wait(60)
     one.open.set()
     wait_for(lambda: one.called("answer robot"))
-    one.put("robot")  # the policy's thread polls again
+    one.put("robot")  # now the policy's thread polls again
     theirs.close()
     one.engine.close()
     ours.close()
@@ -204,7 +206,7 @@ def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(
     wait_for(lambda: ran[2:] == [("0.2", "policy-reader")])
     one.open.set()
     wait_for(lambda: one.called("answer a", "answer b"))
-    # Set before the reader is lent the poller again.
+    # The timer is set before the reader thread polls again.
     one.queue.poller.call_soon(lambda: set_timers(0.5))
     one.hold("a", "b")
     wait_for(lambda: len(ran) == 4)
@@ -269,7 +271,7 @@ def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) ->
     assert one.answered_by["r"] == "policy"
 
 
-ENDLESS = 1e6  # times the batch before: what waits, waits until something ends it
+ENDLESS = 1e6  # times the duration of the last batch: a request waits until an event ends the wait
 
 
 def test_a_batch_waits_for_the_rest_of_its_group_or_the_end(slow: Callable[..., Slow]) -> None:
@@ -290,7 +292,7 @@ def test_a_batch_waits_for_the_rest_of_its_group_or_the_end(slow: Callable[..., 
 
 
 def test_who_was_unwatched_a_moment_ago_is_not_called(caplog: pytest.LogCaptureFixture) -> None:
-    """By the call before, for whom both were ready."""
+    """The callback that runs first removes the other socket, although both are ready."""
     poller = Poller()
     pairs = [socket.socketpair() for _ in range(2)]
     called: list[int] = []
@@ -331,7 +333,7 @@ def test_a_file_whose_callback_failed_is_not_polled_again(caplog: pytest.LogCapt
 def test_only_other_threads_wake_the_queue(
     slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A request that the queue's own thread has read finds it awake."""
+    """The queue's own thread is awake when it reads a request."""
     one = slow()
     ours, theirs = socket.socketpair()
     woken: list[str] = []
@@ -378,7 +380,8 @@ def test_no_descriptor_and_no_thread_is_left() -> None:
 def test_who_wakes_a_closed_poller_writes_into_no_other_file() -> None:
     poller = Poller()
     poller.close()
-    ours, theirs = socket.socketpair()  # may have got the numbers of what was closed
+    # these may have the same descriptor numbers as the closed sockets
+    ours, theirs = socket.socketpair()
     poller.wake()
     ours.setblocking(False)
     theirs.setblocking(False)

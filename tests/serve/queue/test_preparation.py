@@ -1,5 +1,5 @@
-"""Observations are prepared on other threads than the policy's, and the policy computes the same
-actions.
+"""Observations are prepared on other threads than the policy's, with the same actions as without
+preparation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ Answer = queue.SimpleQueue[Reply]
 
 
 class Preparing(Agent):
-    """Answers with what was prepared: the session's instruction, and the thread that did it."""
+    """A policy that returns the prepared value: the session's instruction and the thread of the
+    preparation.
+    """
 
     shared = ("gates",)
 
@@ -55,7 +57,7 @@ class Preparing(Agent):
 
 
 class Serving:
-    """An engine whose policy is slow, and acts on a request until a test opens the gate."""
+    """An engine with a slow policy that acts on a request until a test opens the gate."""
 
     def __init__(self, sessions: int) -> None:
         self.agent = Preparing()
@@ -65,7 +67,7 @@ class Serving:
         for name in self.names:
             prepared(self.submit(name, "reset", instruction=name))
         self.agent.gates["prepare"].set()
-        for name in self.names[:2]:  # after which it is known that the policy is slow
+        for name in self.names[:2]:  # after these acts the queue considers the policy slow
             prepared(self.submit(name, "act"))
         self.agent.gates["prepare"].clear()
         held = threading.Event()
@@ -80,7 +82,7 @@ class Serving:
 
 
 def prepared(answer: Answer) -> Any:
-    """What the policy got with the observation."""
+    """Return the prepared value that the policy received with the observation."""
     reply = answer.get(timeout=30)
     assert reply.error is None, reply.error
     return None if reply.act is None else reply.act.info["prepared"]
@@ -114,7 +116,7 @@ def test_the_next_batch_is_prepared_while_the_policy_acts(
 
 
 def test_the_policy_prepares_itself_what_has_not_begun(serving: Callable[[int], Serving]) -> None:
-    one = serving(16)  # which is more than there are threads
+    one = serving(16)  # more sessions than threads
     begun = [threading.Event() for _ in one.names[1:]]
     answers = [
         one.submit(name, "act", begun=event)
@@ -142,10 +144,10 @@ def test_an_error_of_a_preparation_is_that_of_its_request_alone(
     error = answer.get(timeout=30).error
     assert isinstance(error, PolicyFailed)
     assert "the policy raised ValueError (test_preparation.py:" in str(error)
-    assert "not an observation" not in str(error)  # only logged
+    assert "not an observation" not in str(error)  # the message is only logged
     assert "not an observation" in caplog.text
     assert [prepared(other).partition(":")[0] for other in others] == one.names[1:-1]
-    prepared(one.submit(one.names[-1], "act"))  # its session continues
+    prepared(one.submit(one.names[-1], "act"))  # the session continues
 
 
 def test_what_was_prepared_for_the_episode_before_is_not_used(
@@ -155,7 +157,7 @@ def test_what_was_prepared_for_the_episode_before_is_not_used(
     one.agent.gates["prepare"].set()
     again = one.submit("s1", "reset", instruction="another")
     answer = one.submit("s1", "act", begun=begun)
-    assert begun.wait(30), "prepared for the episode that goes on"
+    assert begun.wait(30), "prepared for the episode that continues"
     one.agent.gates["act"].set()
     assert prepared(again) is None
     assert prepared(answer) is None

@@ -1,4 +1,4 @@
-"""The pace of a replica's robots, and which of them it admits."""
+"""The pace of a replica's robots, and the robots that the replica admits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OF_50, OF_8 = RobotNeed(10.0, 50), RobotNeed(10.0, 8)
 
 
 class Robots:
-    """The robots of a replica, and its clock."""
+    """The robots of a replica, and their simulated clock."""
 
     def __init__(self, *plans: RobotPlan) -> None:
         self.plans = list(plans)
@@ -25,7 +25,7 @@ class Robots:
         )
 
     def read(self) -> list[bool | None]:
-        """Let the pace read the plans again, and return which robots are admitted."""
+        """Let the pace read the plans again, and return the admitted robots."""
         self.now += 1.0
         self.pace.load()
         return [plan.is_admitted for plan in self.plans]
@@ -46,7 +46,9 @@ def test_the_oldest_robots_are_admitted_where_there_is_no_room() -> None:
     number = admitted.count(True)
     assert admitted == [True] * number + [False] * (600 - number)
     load = replica_load(PI0, {OF_50: number}, 16).load
-    assert 0.95 * USABLE < load < USABLE, "some room is left, so that none comes and goes"
+    assert 0.95 * USABLE < load < USABLE, (
+        "some capacity stays free, so that no robot is admitted and removed in turn"
+    )
 
 
 def test_a_robot_that_needs_less_is_admitted_beside_others_that_need_too_much() -> None:
@@ -85,7 +87,7 @@ def test_a_reset_is_answered_by_the_robots_that_are_admitted() -> None:
     robots.read()
     assert robots.pace.check(OF_50)["in_time"] is False
     del robots.plans[:300]
-    assert robots.pace.check(OF_50)["in_time"] is True, "those that are late already do not count"
+    assert robots.pace.check(OF_50)["in_time"] is True, "robots that are already late do not count"
 
 
 def test_a_robot_that_held_still_executes_its_plan_from_the_answer_on() -> None:
@@ -137,7 +139,7 @@ def test_a_robot_that_is_not_admitted_asks_when_its_rows_have_run_out() -> None:
 def test_the_robots_of_one_key_do_not_make_those_of_another_wait(
     hog: RobotNeed, first: bool
 ) -> None:
-    """However many they are, whatever they say that they need, and whenever they came."""
+    """The number of robots, their declared needs and their order of arrival do not matter."""
     theirs, ours = stated(hog, 2000, "hog/"), stated(OF_8, 8, "lab/")
     robots = Robots(*theirs)
     robots.read()
@@ -150,7 +152,7 @@ def test_the_robots_of_one_key_do_not_make_those_of_another_wait(
         assert all(plan.is_admitted for plan in ours)
     admitted = sum(plan.is_admitted is True for plan in theirs)
     servable = hog.interval_s(2 * PI0.cost_s(1)) > 0
-    assert (0 < admitted < 2000) if servable else admitted == 0, "what is left is theirs"
+    assert (0 < admitted < 2000) if servable else admitted == 0, "they get the remaining capacity"
 
 
 def test_what_one_key_does_not_need_is_for_the_others() -> None:
@@ -172,7 +174,7 @@ def test_robots_that_have_gone_without_a_word_or_are_paused_do_not_count() -> No
     assert all(plan.is_admitted for plan in here)
     assert robots.pace.load().in_time
 
-    gone[0].heard = robots.now  # it continues
+    gone[0].heard = robots.now  # this robot continues
     robots.read()
     assert gone[0].is_admitted
     assert {plan.is_admitted for plan in gone[1:]} == {None}

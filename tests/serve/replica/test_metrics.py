@@ -1,4 +1,4 @@
-"""The series that a replica exports."""
+"""The metrics that a replica exports."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vlagents_ray.serve.models.loaded_model import GpuWork
 from vlagents_ray.serve.replica import metrics
 from vlagents_ray.serve.replica.metrics import Exporter
 
-SERIES = 29  # those with values of a replica without a GPU, whatever its number of robots
+SERIES = 29  # number of metrics with values in a replica without a GPU, for any number of robots
 
 
 def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +96,7 @@ def test_the_ticks_of_a_robot_that_is_always_in_time_are_exported(
     def series(_tags: object, _kind: object, name: str, *_: object, **__: object) -> Any:
         def increment(value: float = 1.0, _tags: object = None) -> None:
             if value <= 0:
-                raise ValueError(f"value must be >0, got {value}")  # as Ray's counters do
+                raise ValueError(f"value must be >0, got {value}")  # like Ray's counters
             written[name] = value
 
         def observe(value: float, _tags: object = None) -> None:
@@ -133,7 +133,8 @@ def test_the_number_of_series_does_not_grow_with_the_robots(
 
     monkeypatch.setattr(metrics, "series", series)
     monkeypatch.setattr(metrics, "_PAUSE_S", 0.0)
-    monkeypatch.setattr(CudaGraph, "replays", 0)  # other tests of this process may have some
+    # other tests of this process may have replayed graphs
+    monkeypatch.setattr(CudaGraph, "replays", 0)
     engine = Engine(Noop.from_config({}), EngineSettings(threaded=False))
     engine.start()
     exporter = Exporter(engine, {})

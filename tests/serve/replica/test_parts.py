@@ -1,4 +1,4 @@
-"""Parts of a replica: settings, order of opening and closing, observers, routes, facts, calls
+"""Parts of a replica: settings, order of opening and closing, observers, routes, facts, and calls
 between replicas.
 """
 
@@ -62,7 +62,7 @@ class Counter(ReplicaPart, Observer):
 
 
 class Plain(ReplicaPart):
-    """Has nothing but its name, and facts that fail."""
+    """A part that has only a name, and whose facts fail."""
 
     def describe(self) -> dict[str, Any]:
         raise RuntimeError("no facts")
@@ -74,7 +74,7 @@ class Failing(ReplicaPart):
 
 
 class Totals(ReplicaPart):
-    """Adds up a number of each replica."""
+    """A part that adds up a number of each replica."""
 
     sibling_methods: ClassVar[dict[str, float | None]] = {
         "in_thread": 5.0,
@@ -110,7 +110,7 @@ class Neighbour:
 
 
 class Periodic(ReplicaPart):
-    """Prepares for the loaded policy, and then works until it is cancelled or fails."""
+    """A part that prepares for the loaded policy, and then works until it is cancelled or fails."""
 
     Config: ClassVar[type[PartConfig]] = CountConfig
 
@@ -130,16 +130,16 @@ class Periodic(ReplicaPart):
 
 
 class EndsAtOnce(Periodic):
-    """Fails in its periodic work."""
+    """A part whose periodic work fails."""
 
 
 class NoPart:
-    """Has no settings."""
+    """A class that is not a part, since it has no settings."""
 
 
 @pytest.fixture
 def context(monkeypatch: pytest.MonkeyPatch) -> PartContext:
-    """What parts use of a replica, where no plug-in has parts that are on by default."""
+    """Return the parts' view of a replica, without plug-ins whose parts are on by default."""
     monkeypatch.setattr(registry, "_entry_points", lambda _: {})
     events.clear()
     return PartContext(Engine(Noop()), "app#replica", "node", dict)
@@ -181,7 +181,7 @@ def test_a_part_prepares_for_the_loaded_policy_and_works_until_it_is_cancelled(
         await parts.before_ready()
         working = asyncio.ensure_future(parts.run())
         await asyncio.wait({working}, timeout=0.1)
-        assert not working.done(), "the error of one part has ended the work of the others"
+        assert not working.done(), "the error of one part ended the work of the other parts"
         working.cancel()
         await asyncio.gather(working, return_exceptions=True)
 
@@ -232,7 +232,7 @@ def test_a_class_that_is_no_part_and_an_unknown_name_are_errors() -> None:
 
 @pytest.fixture
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Registers a part that is on by default and one that is not, and no others."""
+    """Register one part that is on by default and one that is not, and no others."""
     entries = {
         "counter": RegistryEntry(f"{HERE}:Counter", by_default=True),
         "plain": RegistryEntry(f"{HERE}:Plain"),
@@ -265,7 +265,7 @@ def test_a_part_may_be_on_by_default_and_null_turns_it_off(
 
 @pytest.fixture
 def totals(context: PartContext) -> Totals:
-    """The part of a replica beside two others, one of which has no such part."""
+    """Return the part of a replica next to two other replicas, one of which lacks this part."""
     with_part = open_parts(args(Totals={}), replace(context, replica="longer name"))
     without_part = open_parts(args(), context)
 
@@ -308,7 +308,7 @@ def test_other_replicas_call_only_the_methods_that_a_part_names(context: PartCon
 
 
 class OfEverybody(Counter):
-    """Has one page, by the path in its settings."""
+    """A part with one public page, whose path is in its settings."""
 
     def routes(self) -> list[BaseRoute]:
         return [

@@ -1,4 +1,4 @@
-"""How many replicas measured load needs, on loads made up for it."""
+"""The number of replicas for a measured load, with constructed loads."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def context_of(
     now: float = 0.0,
     state: dict[str, Any] | None = None,
 ) -> AutoscalingContext:
-    """What Serve passes to the policy where each replica of those that report has this
-    utilisation, queue and number of sessions.
+    """Return the context that Serve passes to the policy. Each reporting replica has its entry of
+    `utilisation`, and the same queue and number of sessions.
     """
     replicas = [ReplicaID(str(i), POLICY) for i in range(len(utilisation))]
     return AutoscalingContext(
@@ -75,7 +75,7 @@ def context_of(
 
 
 def requested(policy: MeasuredLoad, utilisation: list[float], **load: Any) -> int:
-    """The decision of the first call."""
+    """Return the decision of the first call."""
     number, _ = policy(context_of(utilisation, **load))
     return number
 
@@ -99,7 +99,9 @@ def test_sessions_count_only_if_a_target_is_set() -> None:
 
 
 def test_robots_that_state_their_needs_get_the_replicas_for_them() -> None:
-    """They keep replicas busy however few they are, so that utilisation says nothing of them."""
+    """Such robots keep replicas busy however few they are, so utilisation says nothing about their
+    needs.
+    """
     policy = MeasuredLoad()
     assert requested(policy, [1.0], sessions=4, slo_robots=4, slo_load=0.6) == 1
     assert requested(policy, [1.0], sessions=16, slo_robots=16, slo_load=2.1) == 3
@@ -128,7 +130,7 @@ def test_measured_load_waits_for_its_delay_and_robots_with_slos_do_not() -> None
     assert at(107.0, **busy) == 2
     assert at(108.0, utilisation=[0.1], sessions=5.0) == 1, "a break"
     assert at(109.0, **busy) == 1
-    assert at(110.0, **busy, slo_robots=4, slo_load=2.1) == 3, "one states nothing"
+    assert at(110.0, **busy, slo_robots=4, slo_load=2.1) == 3, "one robot declares no needs"
     assert at(116.0, **busy) == 2
 
 
@@ -143,8 +145,8 @@ def test_sessions_wait_until_all_replicas_have_reported() -> None:
 
 
 def test_robots_that_have_just_moved_request_no_replica_and_keep_theirs() -> None:
-    """While they move, and until Serve has noticed that their replica was killed, two replicas
-    count them.
+    """Two replicas count a robot while it moves, and until Serve has noticed that its replica was
+    killed.
     """
     robots: dict[str, Any] = {"sessions": 8.0, "slo_robots": 8.0, "slo_load": 0.8}
     assert requested(MeasuredLoad(), [1.0, 1.0], **robots, moved_load=0.3) == 2
@@ -155,7 +157,7 @@ def test_robots_that_have_just_moved_request_no_replica_and_keep_theirs() -> Non
 
 
 def test_around_a_target_the_number_stays() -> None:
-    """A load that hovers around what needs two replicas, as measured after each decision."""
+    """The load varies around the limit for two replicas, and is measured after each decision."""
     policy, replicas, changes = MeasuredLoad(target_utilisation=0.7), 1, 0
     for step in range(200):
         load = 0.7 + (0.05 if step % 2 else -0.05)
@@ -166,7 +168,7 @@ def test_around_a_target_the_number_stays() -> None:
 
 
 def test_hidden_load_is_found_in_a_few_steps() -> None:
-    """A replica cannot be busier than always: four times too much needs more than one decision."""
+    """Utilisation cannot exceed 1, so a load of four times the capacity needs several decisions."""
     replicas, steps = 1, []
     for _ in range(10):
         replicas = requested(MeasuredLoad(), [min(1.0, 4.0 / replicas)] * replicas, sessions=1)
@@ -178,13 +180,13 @@ def test_hidden_load_is_found_in_a_few_steps() -> None:
 def test_nothing_is_taken_away_before_all_have_reported() -> None:
     assert requested(MeasuredLoad(), [0.3], running=2, target=2, sessions=1) == 2
     assert requested(MeasuredLoad(), [], running=1, target=1) == 1
-    # The second one is still loading.
+    # The second replica is still loading.
     assert requested(MeasuredLoad(), [1.0], running=1, target=2) == 2
 
 
 def test_only_an_unused_application_may_have_no_replica() -> None:
     assert requested(MeasuredLoad(), [0.0]) == 0
-    assert requested(MeasuredLoad(), [8e-7]) == 0  # what an idle replica measures
+    assert requested(MeasuredLoad(), [8e-7]) == 0  # the measured utilisation of an idle replica
     assert requested(MeasuredLoad(), [0.0], sessions=1) == 1
     assert requested(MeasuredLoad(), [0.0], requests=1.0) == 1
 

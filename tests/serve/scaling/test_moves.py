@@ -1,7 +1,7 @@
-"""Sessions that begin, act, move, get new weights and end, in any order, for a policy in this
-process and in a child.
+"""Sessions begin, act, move, get new weights and end in any order, with a policy in this process or
+in a child process.
 
-After each answer, every session is at one replica, in the state and with the weights that its
+After each answer, every session is at exactly one replica, with the state and the weights that its
 client expects.
 """
 
@@ -41,7 +41,7 @@ _NUMBERS = itertools.count()
 
 @dataclass
 class _Session:
-    """What the client of a session expects."""
+    """The state that the client of a session expects."""
 
     acts: int
     version: int
@@ -66,7 +66,7 @@ def ask(
     caller: Caller | NoKey = NoKey.OPEN,
     **fields: Any,
 ) -> Reply:
-    """As a plain HTTP client."""
+    """Send a request like a plain HTTP client."""
     return begin(served, at, op, name, caller, **fields).get(timeout=30)
 
 
@@ -123,10 +123,10 @@ class Moves(RuleBasedStateMachine):
         if reply.error is not None:
             raise reply.error
         drawn = np.random.default_rng(3).random(session.acts + 1)[-1]
-        assert reply.act.action[2] == np.float32(drawn), "an act was lost or came twice"
+        assert reply.act.action[2] == np.float32(drawn), "an act was lost or executed twice"
         version = reply.act.info["policy"]["version"]
         assert version == session.version
-        assert reply.act.action[0] == version, "it acts with other weights than it states"
+        assert reply.act.action[0] == version, "the session acts with other weights than it reports"
         session.acts, session.step = session.acts + 1, reply.step
 
     @rule(name=st.sampled_from(_NAMES))
@@ -138,7 +138,7 @@ class Moves(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(_NAMES))
     def offer(self, name: str) -> None:
-        """The session's replica gives it away, as when it stops."""
+        """The replica of the session hands it over, like a replica that stops."""
         at = self._place(name)
         if at is None:
             return
@@ -149,7 +149,7 @@ class Moves(RuleBasedStateMachine):
 
     @rule(mode=st.sampled_from(["keep", "next_episode"]), pin=st.booleans(), missed=st.booleans())
     def push(self, mode: PushMode, pin: bool, missed: bool) -> None:
-        """New weights; a replica that has `missed` the commit gets them from the other one."""
+        """Push new weights. A replica that `missed` the commit gets them from the other replica."""
         number, options = self.newest + 1, PushOptions(mode=mode, pin=pin)
         first, second = (engine.weights for engine in self.served.engines)
         for updates in (first, second):
@@ -226,8 +226,8 @@ def test_sessions_survive_any_order_of_moves_pushes_and_rests(served: Replicas) 
 def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(
     served: Replicas,
 ) -> None:
-    """The child process of its first replica last acted for it with older weights, which the
-    other child may hold.
+    """The child process of the first replica last acted for this session with older weights, which
+    the other replica's child may still have.
     """
     number = served.engines[0].weights.number + 1
     follows = {"weights": "follow"}
@@ -236,7 +236,7 @@ def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(
     for engine in served.engines:
         engine.weights.stage(number, gains(float(number)), options)
         engine.weights.commit(number, options)
-    # The weights are in use at that replica.
+    # The new weights are in use at the second replica.
     assert ask(served, 1, "reset", "beside", kwargs=follows).error is None
     reply = ask(served, 1, "act", "moving")
     for name in ("moving", "beside"):
@@ -249,8 +249,8 @@ def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(
 def test_sessions_move_with_weights_that_no_other_session_uses(
     served: Replicas, stops: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other replica has freed them. It gets them once for all sessions, and frees them with
-    the last session.
+    """The other replica has freed these weights. It fetches them once for all sessions, and frees
+    them with the last session.
     """
     fetched: list[str] = []
     weights = HeldSessions.weights
@@ -301,7 +301,7 @@ def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there(
                 assert ask(served, 0, "reset", f"s{number}", caller).error is None
             else:
                 assert ask(served, 0, "reset", f"s{number}", caller).error is None
-                # Both at once.
+                # Both requests are sent at once.
                 answers = [begin(served, 1, "act", f"s{number - n}", caller) for n in (0, 1)]
                 errors = [answer.get(timeout=30).error for answer in answers]
                 if number == 1:
@@ -310,7 +310,7 @@ def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there(
                     assert all(isinstance(error, TooManyRequests) for error in errors)
                     for n in (0, 1):
                         assert ask(served, 0, "act", f"s{number - n}", caller).error is None, (
-                            "it stayed where it was"
+                            "the session stayed at its replica"
                         )
                         assert ask(served, 0, "close", f"s{number - n}", caller).error is None
         assert len(served.engines[1].sessions) == 2
@@ -319,7 +319,7 @@ def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there(
 
 
 class Guarded(Agent):
-    """Requires that the lock of the model is held in each of its methods."""
+    """A policy that requires the lock of the model in each of its methods."""
 
     held: Callable[[], bool] = staticmethod(lambda: True)
 

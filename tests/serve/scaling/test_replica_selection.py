@@ -1,4 +1,6 @@
-"""Which replica a session goes to, and when it is sent to another one."""
+"""The selection of a replica for a new session, and the decision to move a session to another
+replica.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ def load(replica: str, sessions: int, node: str = "n1", *, accepts: bool = True)
     return ReplicaLoad(replica, sessions, accepts, node, f"boot of {node}", ("v", "f"))
 
 
-def chosen(loads: list[ReplicaLoad], place: ClientLocation = ClientLocation()) -> str | None:  # noqa: B008 - frozen
+def chosen(loads: list[ReplicaLoad], place: ClientLocation = ClientLocation()) -> str | None:  # noqa: B008 - a frozen dataclass
     replica = choose_replica(loads, place)
     return None if replica is None else replica.replica
 
@@ -57,12 +59,14 @@ def test_a_client_that_reaches_one_machine_only_is_sent_nowhere_else() -> None:
     assert chosen([load("far", 0, "far")], place) is None
     nowhere = replace(load("a", 0), node="", boot_id="")
     assert chosen([nowhere], ClientLocation(must_be_near=True)) is None, (
-        "it does not know where it is"
+        "the replica does not know its location"
     )
 
 
 def test_a_new_session_goes_to_the_replica_whose_robots_need_least() -> None:
-    """Ten robots with chunks of 50 rows need less than eight with chunks of 8 rows."""
+    """Ten robots with chunks of 50 rows need less capacity than eight robots with chunks of
+    8 rows.
+    """
     long_chunks = replace(load("a", 10), robots=10, load=0.02)
     short_chunks = replace(load("b", 8), robots=8, load=0.15)
     assert chosen([long_chunks, short_chunks]) == "a"
@@ -80,7 +84,7 @@ def test_sessions_whose_needs_are_unknown_count_as_the_mean_robot() -> None:
 
 
 def test_clients_that_come_at_once_go_where_robots_need_least() -> None:
-    """Until they state what they need, each counts as the mean robot."""
+    """Until a robot declares its needs, it counts as an average robot."""
     loads = [
         replace(load("a", 10), robots=10, load=0.1),
         replace(load("b", 10), robots=10, load=0.3),
@@ -96,10 +100,10 @@ def test_clients_that_come_at_once_go_where_robots_need_least() -> None:
     ("mine", "others", "leaving", "expected"),
     [
         (12, [0], 0, 6),
-        (12, [0], 6, 0),  # they are on their way
+        (12, [0], 6, 0),  # these sessions are already moving
         (7, [5], 0, 0),
         (8, [4], 0, 2),
-        (2, [0], 0, 0),  # one more than the mean is not worth a move
+        (2, [0], 0, 0),  # one more than the mean does not justify a move
         (3, [0], 0, 1),
         (1, [0, 0, 0, 0], 0, 0),
         (50, [40, 42], 0, 0),
@@ -125,20 +129,22 @@ def test_robots_that_need_much_move_although_the_numbers_are_equal() -> None:
     slow = replace(load("b", 4), robots=4, load=0.2)
     assert fast.needs_are_known
     assert excess_load(fast, [slow]) == pytest.approx(0.5)
-    assert excess_load(fast, [slow], leaving=0.3) == 0.0  # one is on its way
+    assert excess_load(fast, [slow], leaving=0.3) == 0.0  # one robot is already moving
     assert excess_load(slow, [fast]) == 0.0
     alone = replace(load("a", 1), robots=1, load=0.9)
-    assert excess_load(alone, [replace(load("b", 0))]) == 0.0, "a robot is not divided"
+    assert excess_load(alone, [replace(load("b", 0))]) == 0.0, "a single robot cannot be divided"
 
 
 def test_needs_are_known_only_if_those_of_all_sessions_are() -> None:
     assert load("a", 0).needs_are_known
     assert not replace(load("a", 4), robots=3, load=0.5).needs_are_known
-    assert not replace(load("a", 4), robots=4, load=0.0).needs_are_known, "its costs are unknown"
+    assert not replace(load("a", 4), robots=4, load=0.0).needs_are_known, (
+        "the costs of the policy are unknown"
+    )
 
 
 def test_moving_load_never_makes_another_surplus() -> None:
-    """Equal robots are spread as equal sessions are."""
+    """Equal robots are distributed like equal sessions."""
     for mine in range(2, 40):
         for other in range(mine + 1):
             pair = [
@@ -166,7 +172,7 @@ def test_a_connection_is_told_once_each_time_it_is_marked() -> None:
 
 
 class Counting(Agent):
-    """Counts its acts."""
+    """A policy that counts its acts."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.count = 0
@@ -178,11 +184,11 @@ class Counting(Agent):
 
 
 class Beside:
-    """Neighbours that hold what they are told to hold; counts how often they were asked."""
+    """Other replicas with given loads; counts the queries."""
 
     def __init__(self, *loads: ReplicaLoad) -> None:
         self.held, self.asked = list(loads), 0
-        self.asked_again: list[str] = []  # replicas that are asked again at once
+        self.asked_again: list[str] = []  # names of replicas that were queried again at once
 
     async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
         self.asked += 1
@@ -249,7 +255,7 @@ def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
         agents_of_one[0].reset_batch([Obs(), Obs()], [None, None], agents_of_one)
     mine, _ = balance(first, load("b", 0))
     asyncio.run(mine.compare())
-    assert first.drain_list._marked == set(), "a surplus of one moment moves nobody"
+    assert first.drain_list._marked == set(), "a momentary surplus moves no session"
     asyncio.run(mine.compare())
     served.prefer = 1
     for step in range(1, 5):
@@ -293,7 +299,7 @@ def test_a_replica_that_announces_itself_is_compared_with_at_once() -> None:
     mine, neighbours = balance(engine, load("b", 4))
 
     async def join() -> float:
-        """Let a replica join; return how long the next comparison took to come, s."""
+        """Add a replica, and return the time until the next comparison in s."""
         await mine.compare()
         comparing = asyncio.ensure_future(mine.run())
         await asyncio.sleep(0.1)

@@ -1,4 +1,4 @@
-"""What Serve's Python proxy does with a request when no replica runs."""
+"""The handling of a request by Serve's Python proxy while no replica runs."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def choose(
     *,
     choice_s: float,
 ) -> tuple[Any, list[str]]:
-    """What a proxy's wait of `wait_s` gives where Serve's own choice takes `choice_s`; what
-    became of that choice.
+    """Return the result of the proxy's choice with a wait of `wait_s`, when Serve's own choice
+    takes `choice_s`, and the fate of that choice.
     """
     became: list[str] = []
 

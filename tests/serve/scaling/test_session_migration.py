@@ -1,5 +1,5 @@
-"""Sessions that move: never two of one, nor none, and never an older state in place of a newer
-one. No Ray.
+"""Moves of sessions between replicas, without Ray: a session never exists twice, is never lost, and
+an older state never replaces a newer one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from vlagents_ray.serve.weights import Rest
 
 
 class Counting(Agent):
-    """Says what it obeys and how often it has acted; waits at a gate where it is told to."""
+    """A policy that returns its instruction and its number of acts, and waits at a gate if the
+    observation requests it.
+    """
 
     gate = threading.Event()
     entered: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -71,7 +73,7 @@ def replicas() -> Iterator[Callable[[int], Replicas]]:
 def begin(
     engine: Engine, op: Any, name: str = "robot-1", wait: bool = False, **fields: Any
 ) -> queue.SimpleQueue[Reply]:
-    """As a plain HTTP client; where the answer will come."""
+    """Send a request like a plain HTTP client, and return the queue of the answer."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     obs = Obs(info={"wait": True} if wait and op == "act" else {})
     if wait and op == "reset":
@@ -93,15 +95,15 @@ def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
 
 
 def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
-    """As another replica asks."""
+    """Call a method of a replica like another replica does."""
     work = getattr(HeldSessions, method)(replicas.migrators[number].sessions, *args)
     return asyncio.run_coroutine_threadsafe(work, replicas._loop).result(20)
 
 
 @contextlib.contextmanager
 def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], threading.Event]]:
-    """Have a step of taking over a session wait for the event, and put something into the queue
-    when it begins.
+    """Delay a step of taking over a session until the event is set. The queue receives an item when
+    the step begins.
     """
     begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine.moves, step)
 
@@ -117,7 +119,7 @@ def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], th
 
 
 def cut_off(replicas: Replicas) -> None:
-    """No replica hears of the others."""
+    """Prevent all communication between the replicas."""
 
     async def nobody() -> Sequence[Peer]:
         return []
@@ -168,8 +170,8 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(
 def test_a_reset_that_comes_late_ends_no_newer_episode(
     replicas: Callable[[int], Replicas], first: str
 ) -> None:
-    """The newer episode survives, whichever of the two the replica comes to first; acts of the
-    late one are rejected.
+    """The newer episode survives, whichever of the two resets the replica handles first. Acts of
+    the late episode are rejected.
     """
     served = replicas(2)
     cut_off(served)
@@ -224,13 +226,13 @@ def test_where_a_session_is_reset_the_others_forget_it(replicas: Callable[[int],
 def test_an_act_after_a_reset_is_of_the_new_episode_at_every_replica(
     replicas: Callable[[int], Replicas],
 ) -> None:
-    """Also at a replica that still has the old episode, for a client that sends no step and acts
+    """This also holds at a replica with the old episode, for a client that sends no step and acts
     at once.
     """
     served = replicas(3)
     for number in range(12):
         ask(served.engines[number % 3], "reset", instruction=f"episode {number}")
-        # The first has the old episode.
+        # The replica with the old episode acts first.
         acting = [served.engines[(number + further) % 3] for further in (2, 1, 0)]
         assert [obeys(engine) for engine in acting] == [
             (f"episode {number}", acts) for acts in (1, 2, 3)
@@ -257,7 +259,9 @@ def test_a_reset_at_the_only_replica_does_not_wait_for_further_resets_to_announc
 def test_a_reset_is_answered_if_its_replica_stops_meanwhile(
     replicas: Callable[[int], Replicas], gather_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before and after it has asked the other replicas, one of which does not answer."""
+    """The replica stops before or after it has queried the other replicas, one of which does not
+    answer.
+    """
     monkeypatch.setattr(session_migration, "_GATHER_S", gather_s)
     monkeypatch.setattr(session_migration, "_OTHERS_S", 60.0)
     served = replicas(2)
@@ -322,7 +326,7 @@ def test_a_session_whose_export_takes_too_long_stays(
 def test_a_release_that_the_policy_has_begun_is_answered_however_long_it_takes(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise the session would be at no replica."""
+    """Otherwise the session would exist at no replica."""
     served = replicas(2)
     a, b = served.engines
     ask(a, "reset", instruction="episode 1")
@@ -351,7 +355,7 @@ def test_a_release_that_the_policy_has_begun_is_answered_however_long_it_takes(
 def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(
     replicas: Callable[[int], Replicas],
 ) -> None:
-    """The session has acted at its replica after that sent its state."""
+    """The session has acted at its replica after the replica sent its state."""
     served = replicas(2)
     a, b = served.engines
     first = ask(a, "reset", instruction="episode 1").step
@@ -365,7 +369,7 @@ def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(
         return state
 
     held.copy = slow_copy  # type: ignore[method-assign]
-    given_up = begin(b, "act", step=first + 7)  # no state fits it
+    given_up = begin(b, "act", step=first + 7)  # no state has this step
     assert copied.wait(20)
     second = ask(a, "act", step=first).step
     joined = begin(b, "act", step=second)
@@ -395,9 +399,9 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
     state = serve(served, 0, "copy", "robot-1")
     assert serve(served, 1, "take_over", "robot-1", "0") is True
     assert serve(served, 0, "release", "robot-1", state.version, "late") is False
-    assert serve(served, 1, "take_over", "robot-1", "0") is False  # it is no longer there
+    assert serve(served, 1, "take_over", "robot-1", "0") is False  # the session is no longer there
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 1, 0]
-    assert obeys(c) == ("episode 1", 1)  # fetched from there
+    assert obeys(c) == ("episode 1", 1)  # fetched from the second replica
     with pytest.raises(UnknownSession, match="newer"):
         b.moves.adopt("robot-1", state)
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
@@ -420,7 +424,7 @@ def test_a_slow_replica_that_was_given_a_session_is_waited_for(
     with slow(b, "prepare") as (begun, release):
         given = threading.Thread(target=served.hand_over, args=[0])
         given.start()
-        wait_for(lambda: len(c.sessions) == 10 and begun.qsize() > 3)  # of several at a time
+        wait_for(lambda: len(c.sessions) == 10 and begun.qsize() > 3)  # several sessions at a time
         release.set()
         given.join(20)
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 10, 10]
@@ -456,9 +460,9 @@ def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_sess
     monkeypatch.setattr(old, "release", released)
     monkeypatch.setattr(old, "versions_of", answered)
     try:
-        # Upon which a client begins its episode again.
+        # After this error a client begins its episode again.
         assert isinstance(ask(b, "act").error, UnknownSession)
-        assert [len(engine.sessions) for engine in (a, b)] == [1, 0], "the copy waits all the same"
+        assert [len(engine.sessions) for engine in (a, b)] == [1, 0], "the copy still waits"
     finally:
         ends.set()
     wait_for(lambda: [len(engine.sessions) for engine in (a, b)] == [0, 1])
@@ -485,7 +489,7 @@ def test_no_search_asks_a_replica_that_was_silent_a_moment_ago(
     assert isinstance(ask(a, "act", "robot-b").error, UnknownSession)
     at_fault.clear()
 
-    assert obeys(a, "robot-c") == ("at c", 1), "those that answer are asked at once"
+    assert obeys(a, "robot-c") == ("at c", 1), "replicas that answer are queried at once"
     if silent_s:
         assert isinstance(ask(a, "act", "robot-b").error, UnknownSession)
         assert "robot-b" in b.sessions
@@ -521,9 +525,9 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
         async def late(timed: bool) -> list[Reply]:
             request = Request("act", Obs(), deadline_ms=50)
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN, has_left=None)
-            if timed:  # as HTTP and the proxied WebSocket
+            if timed:  # like HTTP and the proxied WebSocket
                 return await ask_of(sender, [request])
-            # As shared memory and the replica's own port.
+            # Like shared memory and the replica's own port.
             answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
             send(sender, [request], answers.put)
             await asyncio.sleep(0.1)
@@ -547,7 +551,7 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
 
         async def go() -> None:
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN, has_left=None)
-            # Without a deadline.
+            # This request has no deadline.
             asked = asyncio.create_task(ask_of(sender, [Request("act", Obs())]))
             await asyncio.to_thread(begun.get, timeout=20)
             asked.cancel()
@@ -573,7 +577,7 @@ def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(
         )
         return reply
 
-    # On a busy machine a deadline may be over before the policy begins.
+    # On a busy machine the deadline may pass before the policy begins.
     while Counting.entered.empty():
         reply = asyncio.run(late(True))
     assert isinstance(reply.error, OutcomeUnknown)
@@ -601,11 +605,11 @@ def test_made_up_sessions_keep_no_other_from_moving(
     sender = Sender(b, "websocket", "x", connected=True, caller=NoKey.OPEN, has_left=None)
     send(
         sender, [Request("reset", Obs()), *made_up], answers.put
-    )  # its own session comes first, without which it may not act
+    )  # the message begins with a reset of its own session, without which it may not act
     assert obeys(b) == ("episode 1", 1)
     replies = answers.get(timeout=20)
     assert sum(isinstance(reply.error, UnknownSession) for reply in replies) == 400
-    assert len(questions) < 40, "each search asked by itself"
+    assert len(questions) < 40, "each search sent separate queries"
 
 
 def test_who_looks_for_too_many_sessions_is_refused_alone(

@@ -1,4 +1,4 @@
-"""What a replica makes of the answers and the errors of other replicas' actors."""
+"""The handling of answers and errors of other replicas' actors."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ def test_a_part_of_another_replica_has_its_own_time_limit(monkeypatch: pytest.Mo
 
 
 def test_a_replica_that_still_loads_delays_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the one that replaces a killed replica does: it answers nothing, and has no session."""
+    """A replica that replaces a killed one is still loading: it answers no calls, and has no
+    sessions.
+    """
     Cluster(monkeypatch, loading="no answer")
 
     async def never(actor: str) -> bool:
@@ -94,7 +96,7 @@ def test_a_replica_that_still_loads_delays_no_search(monkeypatch: pytest.MonkeyP
 
 
 class Cluster:
-    """Named actors that answer as a test says; those that have no answer never return."""
+    """Named actors whose answers a test sets. Actors without an answer never return."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **answers: Any) -> None:
         self.answers = {self.name(replica): answer for replica, answer in answers.items()}
@@ -206,7 +208,7 @@ def test_of_many_replicas_those_near_a_client_and_some_others_are_asked(
     cluster = Cluster(monkeypatch, **loads)
     others = SiblingReplicas()
     asyncio.run(others.some_loads())
-    assert len(cluster.asked) == 100, "it does not know yet where they are"
+    assert len(cluster.asked) == 100, "the location of the replicas is not known yet"
     drawn = set()
     for _ in range(30):
         answers = asyncio.run(others.some_loads([ClientLocation("node7")]))
@@ -218,8 +220,8 @@ def test_of_many_replicas_those_near_a_client_and_some_others_are_asked(
 
 
 def test_a_replica_is_called_once_it_is_initialized(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Serve would log a traceback for a call before; by any method, and again after it was
-    replaced.
+    """Before that, Serve would log a traceback for a call. This holds for all methods, and again
+    after the replica was replaced.
     """
     cluster = Cluster(monkeypatch, a=load("a"), b=load("b"))
     cluster.initialized = {cluster.name("a")}

@@ -1,4 +1,6 @@
-"""What the robots of a replica need, as it reports that to autoscaling and to other replicas."""
+"""The capacity that a replica's robots need, as it is reported to autoscaling and to other
+replicas.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ class Replica:
         self.engine = Engine(Chunks(), clock=lambda: self.now)
 
     def reset(self, session: str, step: int | None = None) -> None:
-        """Begin an episode of a robot, which knows the `step` of an earlier one if it resumes."""
+        """Begin an episode of a robot. If the robot resumes, it sends the `step` of an earlier
+        episode.
+        """
         request = Request("reset", Obs(), kwargs={SLO: FRESH}, step=step)
         assert answered(self.engine, session, request).error is None
 
@@ -77,8 +81,8 @@ def test_the_load_is_kept_for_a_moment_while_the_sessions_stay(
 def test_robots_that_came_from_another_replica_are_counted_apart_for_a_while(
     replica: Replica,
 ) -> None:
-    """That one may count them as well, until it is known that they have left, or that it has
-    ended.
+    """The other replica may also count these robots, until it is known that they have left or that
+    the replica has ended.
     """
     replica.reset("new")
     replica.reset("resumed", step=17)

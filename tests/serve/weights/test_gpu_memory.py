@@ -1,6 +1,4 @@
-"""The memory that pushes of weights need on a GPU of a fake torch, and the streams of their
-copies.
-"""
+"""The memory that pushes of weights need on a simulated GPU, and the streams of their copies."""
 
 from __future__ import annotations
 
@@ -20,11 +18,11 @@ from vlagents_ray.weights.trainable import are_apart, copy, fingerprint, portabl
 
 pytestmark = pytest.mark.torch
 
-SIZE = 100_000  # elements of a value
-MODEL = 4 * 4 * SIZE  # bytes: four values, one of which has two names
+SIZE = 100_000  # number of elements in a value
+MODEL = 4 * 4 * SIZE  # bytes of four values, one of which has two names
 KEEP, PARTIAL = PushOptions("keep"), PushOptions(partial=True, allow_same=True)
-PART = 4 * 10_000  # bytes that operations on a version need beside it
-WORDS = 500  # words of a piece of a value, for the fingerprint
+PART = 4 * 10_000  # bytes that operations on a version need in addition
+WORDS = 500  # number of words in a piece of a value, for the fingerprint
 
 
 @pytest.fixture
@@ -40,7 +38,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
 
 
 class Module(torch.nn.Module):
-    """Four values on a GPU, the first of which is tied to a fifth name."""
+    """Four values on a GPU; the first has a second name."""
 
     def __init__(self, cuda: FakeCuda) -> None:
         super().__init__()
@@ -50,7 +48,7 @@ class Module(torch.nn.Module):
 
 
 class OnGpu(TrainableAgent):
-    """Holds its parameters on a GPU."""
+    """A policy with its parameters on a GPU."""
 
     trainable: ClassVar[str | None] = "module"
 
@@ -64,7 +62,7 @@ class OnGpu(TrainableAgent):
 
 
 class SelfLoading(OnGpu):
-    """Loads parameters by itself."""
+    """A policy with its own method for loading parameters."""
 
     def load_parameters(self, values: Any) -> None:
         super().load_parameters(values)
@@ -89,7 +87,7 @@ class Pushed:
 
     def begin(self, *, follows: bool, session: Robot | None = None) -> Robot:
         session = session or Robot()
-        session.weights = None  # as an engine does before a reset
+        session.weights = None  # like an engine before a reset
         self.sessions = [*{session: None, **dict.fromkeys(self.sessions)}]
         self.weights.begin(session, follows=follows)
         return session
@@ -106,7 +104,7 @@ class Pushed:
         return int(number)
 
     def peak(self) -> int:
-        """The largest memory since the last call, bytes."""
+        """Return the peak memory since the last call, in bytes."""
         peak, self.cuda.memory.peak = self.cuda.memory.peak, self.cuda.memory.allocated
         return peak
 
@@ -118,10 +116,10 @@ def test_a_push_needs_the_model_twice_and_gives_one_back(cuda: FakeCuda) -> None
         pushed.push(number)
         assert pushed.act(session) == number
         assert 2 * MODEL <= pushed.peak() <= 2 * MODEL + 2 * PART
-        if number > 1:  # the loaded checkpoint, which is pinned, is in the memory of the host
+        if number > 1:  # the loaded checkpoint is pinned, and has moved to host memory
             assert cuda.memory.allocated == MODEL
     assert cuda.emptied == 0, (
-        "torch keeps the memory for the next push: its return would wait for the GPU"
+        "torch keeps the memory for the next push, since freeing it would wait for the GPU"
     )
     assert pushed.act(pushed.begin(follows=False)) == 0
     assert pushed.act(session) == 4
@@ -136,7 +134,7 @@ def test_sessions_with_two_versions_swap_them_in_their_memory(cuda: FakeCuda) ->
     for _ in range(3):
         assert [pushed.act(one) for one in (old, new)] == [0, 1]
     assert pushed.peak() <= 2 * MODEL + 2 * PART
-    assert len(cuda.transfers) == before, "none of the two is copied to the host"
+    assert len(cuda.transfers) == before, "neither of the two is copied to the host"
     pushed.begin(follows=True, session=old)
     pushed.push(2, PushOptions("keep", pin=True))
     assert [pushed.act(one) for one in (old, new)] == [2, 2]
@@ -180,7 +178,7 @@ def test_no_push_waits_for_an_act(
 ) -> None:
     pushed = Pushed(cuda, kind(cuda))
     session = pushed.begin(follows=True)
-    for number in (1, 2):  # the second one has moved the loaded checkpoint to the host, once
+    for number in (1, 2):  # the second push moved the loaded checkpoint to the host, once
         pushed.push(number)
         assert pushed.act(session) == number
     names = [*values, *(["tied"] if "a" in values else [])]

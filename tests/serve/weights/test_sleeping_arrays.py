@@ -1,4 +1,4 @@
-"""JAX weights of a policy that sleeps, with a fake of JAX whose arrays are on a GPU."""
+"""JAX weights of a policy that sleeps, with a simulation of JAX whose arrays are on a GPU."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Gpu:
 
 
 class OnGpu(TrainableAgent):
-    """Acts with two arrays on the GPU, and a number on the host."""
+    """A policy with two arrays on the GPU and a number on the host."""
 
     trainable: ClassVar[str | None] = "tree"
 

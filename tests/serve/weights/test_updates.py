@@ -1,5 +1,5 @@
-"""New weights in one replica: two phases, when sessions change, and nothing changed by what is
-rejected.
+"""New weights in one replica: the two phases of a push, the time at which sessions change, and
+rejected pushes without effect.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Served:
         return self.ask(session, Request("reset", Obs(), kwargs=options, priority=priority))
 
     def act(self, session: str) -> tuple[int, float]:
-        """The version that acted, and the gain in its action."""
+        """Act, and return the version that acted and the gain in its action."""
         act = self.ask(session, Request("act", Obs())).act
         return act.info["policy"]["version"], float(act.action[0])
 
@@ -57,7 +57,7 @@ class Served:
         return reply
 
     def push(self, number: int, mode: versions.PushMode = "next_episode") -> str:
-        """A version whose gain is its number."""
+        """Push a version whose gain is its number."""
         digest = self.learn.stage(number, gains(number), PushOptions(mode))
         self.learn.commit(number, PushOptions(mode))
         return digest
@@ -69,11 +69,13 @@ AGENTS = pytest.mark.parametrize(
 
 
 class Lazy(Doubled):
-    """Has no parameters before its first act, as torch's lazy layers take their sizes from it."""
+    """A policy without parameters before its first act, like torch's lazy layers, which infer their
+    sizes from it.
+    """
 
     def initialize(self) -> None:
         super().initialize()
-        self.size = np.zeros(1, np.int64)  # that of the layer, once it is known
+        self.size = np.zeros(1, np.int64)  # the size of the layer, once it is known
 
     def shared_objects(self) -> list[Any]:
         return [*super().shared_objects(), self.size]
@@ -124,7 +126,7 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
     assert served.act("new") == (5, 5.0), "running episodes change at once"
     act = served.ask("new", Request("act", Obs())).act
     assert act.info["policy"] == {"version": 5, "fingerprint": digest}
-    assert digest == fingerprint(gains(5)), "of what the agent holds"
+    assert digest == fingerprint(gains(5)), "a copy of the agent's values"
 
 
 @AGENTS
@@ -193,7 +195,7 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
         PushOptions("now")  # type: ignore[arg-type]
     served.learn.drop(1)
     served.push(1)
-    served.learn.commit(1, PushOptions("keep"))  # as when its reply was lost
+    served.learn.commit(1, PushOptions("keep"))  # as if its reply had been lost
     with pytest.raises(
         Overloaded,
         match="expected a version above 1, the newest here, got 1, as another push was faster",
@@ -251,7 +253,7 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(
 
 
 class Slow(Doubled):
-    """Acts as slowly as π0 with eight rows on a GPU."""
+    """A policy as slow as π0 with eight rows on a GPU."""
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         time.sleep(ACT_S)
@@ -273,7 +275,7 @@ def test_a_few_bytes_are_staged_within_20_ms_beside_slow_acts(
     robot.start()
     staged_s = []
     for number in range(1, 10):
-        time.sleep(1.3 * ACT_S)  # so that pushes begin at other times of an act
+        time.sleep(1.3 * ACT_S)  # so that pushes begin at different times of an act
         begun_s = time.perf_counter()
         served.learn.stage(number, gains(number), PushOptions("keep"))
         staged_s.append(time.perf_counter() - begun_s)
