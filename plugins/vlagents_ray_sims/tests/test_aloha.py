@@ -1,4 +1,4 @@
-"""ALOHA by its protocol, rendered through EGL: pictures, episodes, and when one is solved."""
+"""Tests of ALOHA and its protocol, rendered through EGL: images, episodes and success."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_observations_rewards_and_actions_are_gym_alohas_to_the_bit() -> None:
         expected, _ = theirs.reset(seed=7)
         obs, _ = ours.reset(seed=7)
         beyond = STILL.action.copy()
-        beyond[2] = 1.5  # out of gym-aloha's action space, as the elbow's first angle is
+        beyond[2] = 1.5  # outside gym-aloha's action space, like the elbow's first angle
         for _ in range(3):
             np.testing.assert_array_equal(obs.cameras["top"], expected["pixels"]["top"])
             joined = np.concatenate([obs.state[part] for part in PARTS])

@@ -1,5 +1,5 @@
-"""CALVIN as it is known without its simulator: scenes, contract, hash, and what a wrong checkout
-is told.
+"""Tests of CALVIN that need no simulator: scenes, contract, hash, and the errors for a wrong
+checkout.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ def test_the_contract_and_the_protocol_are_known_before_the_simulator_is_made() 
 
 
 def test_the_hash_that_places_the_blocks_is_pyhashs() -> None:
-    """FNV-1 from 0, not from its usual basis: pyhash's own documentation has this number."""
+    """The hash is FNV-1 with the initial value 0 instead of the usual one. The expected number is
+    from pyhash's documentation.
+    """
     assert fnv1_32("hello world") == 2805756500
 
 

@@ -1,4 +1,6 @@
-"""On which device robosuite and LIBERO draw: with fakes of other machines' devices."""
+"""Tests of the device on which robosuite and LIBERO render, with fakes of other machines'
+devices.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The experts of simulators: those that are installed here are solved, and what an expert lacks
-is named.
+"""Tests of the experts: they solve the tasks of installed simulators, and errors name missing
+inputs.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def test_without_the_simulators_state_the_expert_says_what_it_wants(
 
 
 def seen(*, tool: tuple[float, float, float] = (0.3, 0.0, 0.5), turn: float = 0.0) -> Obs:
-    """The tool's place, and a cuboid half a metre in front, turned about the vertical."""
+    """Return an observation with the tool's position, and a cuboid half a metre in front, turned
+    about the vertical.
+    """
     cuboid = np.array([0.5, 0.0, 0.03, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)])
     state = {"tquat": np.array([*tool, 1.0, 0.0, 0.0, 0.0], np.float32)}
     return Obs(state=state, info={"objects": {"PickTask_box_joint": cuboid}})

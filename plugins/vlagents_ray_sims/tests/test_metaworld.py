@@ -1,4 +1,4 @@
-"""Meta-World as it really runs: every test here renders through EGL."""
+"""Tests of Meta-World with its simulator; each test renders through EGL."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def test_each_task_gives_what_its_contract_states(task: str) -> None:
 
 
 def test_the_image_stands_upright() -> None:
-    """Above is the plain grey background; the nearest corner below shows the white floor."""
+    """The plain grey background is at the top of the image; the bottom left corner shows the white
+    floor.
+    """
     with MetaWorld("drawer-open-v3", width=60, height=60) as env:
         image = env.reset(seed=0)[0].cameras["corner2"].astype(int)
     assert image.shape == (60, 60, 3)
@@ -102,7 +104,7 @@ def test_a_command_moves_the_hand_along_its_axis(reach: MetaWorld) -> None:
         for _ in range(10):
             obs, *_ = reach.step(Act(action))
         moved = obs.state["xyz"] - start
-        assert 0.03 < moved[i] <= 0.1 + 1e-3  # at most 0.01 m a step
+        assert 0.03 < moved[i] <= 0.1 + 1e-3  # at most 0.01 m per step
         assert np.abs(np.delete(moved, i)).max() < 0.02
 
 
@@ -112,7 +114,7 @@ def test_fifty_initial_states_are_those_of_mt1() -> None:
         assert env.init_states == 50
         for index in (0, 7, 49):
             goal = env.reset(seed=index, options={"init_state": index})[0].info["sim_state"][36:39]
-            drawn = pickle.loads(tasks[index].data)["rand_vec"]  # noqa: S301 - Meta-World's own, of this process
+            drawn = pickle.loads(tasks[index].data)["rand_vec"]  # noqa: S301 - Meta-World's own pickle, made by this process
             np.testing.assert_array_equal(goal, drawn[3:])
         again = env.reset(seed=99, options={"init_state": 7})[0].info["sim_state"]
         np.testing.assert_array_equal(

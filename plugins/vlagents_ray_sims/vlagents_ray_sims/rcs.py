@@ -1,8 +1,8 @@
 """RCS, the Robot Control Stack, in MuJoCo, and DuoBench, a benchmark for two arms that uses it.
 
-Both need a separate Python environment, which `vlagents-ray venv create rcs` makes: their packages
-conflict with the simulators of this package's extras, and the licence of RCS is AGPL-3. See
-docs/benchmarks/other.md.
+Both need a separate Python environment, which `vlagents-ray venv create rcs` creates: their
+packages conflict with the simulators of this package's extras, and the licence of RCS is AGPL-3.
+See docs/benchmarks/other.md.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class RcsTask:
 
     id: str  # Gymnasium's id of the scene
     module: str | None  # the module that registers the scene; None selects the id's namespace
-    protocol: BenchmarkProtocol | None = None  # None: the user has to set `max_steps`
-    control_mode: ControlMode = "joints"  # the default of an action's control mode
+    protocol: BenchmarkProtocol | None = None  # step limit; None if the user has to set `max_steps`
+    control_mode: ControlMode = "joints"  # the default control mode of actions
     control_hz: float = 30.0
-    instruction: str = ""  # used if the simulator's info has no instruction
-    # Adds the task to the config of a scene that has none; None if it has one.
+    instruction: str = ""  # instruction that is used if the simulator's info has none
+    # Adds the task to the config of a scene without a task; None if the scene has a task.
     add_task: Callable[[Any], None] | None = None
 
 
@@ -61,8 +61,8 @@ RCS_TASKS = {
             success="the cuboid's middle is 7.8 cm or more above the robot's base, and the gripper "
             "is neither open nor closed",
             metric="success_once",
-            begins="the cuboid's place in a square of 20 cm, 50 cm in front of the robot, and its "
-            "turn: the seed's",
+            begins="the seed draws the cuboid's position in a square of 20 cm, 50 cm in front of "
+            "the robot, and the cuboid's rotation",
             ends_on_success=True,
         ),
         control_mode="tquat",
@@ -80,7 +80,7 @@ _DUOBENCH = BenchmarkProtocol(
     control="joints",
     success="the task's last stage has been reached; stages are not lost again",
     metric="success_once",
-    begins="where the objects are: the seed's",
+    begins="the seed draws the positions of the objects",
     ends_on_success=True,
 )
 _DUOBENCH_NAMES = (
@@ -109,11 +109,11 @@ _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
 @dataclass(frozen=True, slots=True)
 class _Assets:
-    """Where a package reads its assets."""
+    """The folder from which a package reads its assets."""
 
     variable: str  # the environment variable that names the folder
     home_folder: str  # the folder in the home folder that is used if the variable is not set
-    further_steps: str = ""  # how to complete a download that `import` has made
+    further_steps: str = ""  # instruction for completing a download that `import` has begun
 
 
 _ASSETS = {
@@ -121,14 +121,14 @@ _ASSETS = {
     "duobench": _Assets(
         "DUOBENCH_PREFIX",
         ".duobench",
-        f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would "
-        "fetch all again",
+        f", then make {_REQUIRED} there as an empty file: DuoBench 0.1.2 does not contain it, and "
+        f"each import would download all assets again",
     ),
 }
 
 
 def missing_packages(*packages: str) -> str | None:
-    """Return why packages cannot be imported here without a download; None if they can.
+    """Return the reason why packages cannot be imported here without a download; None if they can.
 
     Args:
         packages: Names of packages, "rcs" or "duobench".
@@ -148,7 +148,7 @@ def missing_packages(*packages: str) -> str | None:
         prefix = Path(os.environ.get(assets.variable) or default_folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
-                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set "
+                f"{package}'s assets are not in {prefix}: {_REQUIRED} is missing; set "
                 f"{assets.variable} to the folder that holds its `assets`, or fetch them once by "
                 f"`python -c 'import {package}'`{assets.further_steps}"
             )
@@ -182,7 +182,7 @@ def scene_creator(task: RcsTask, name: str) -> Any:
     gymnasium = require("gymnasium")
     if task.id not in gymnasium.registry:
         raise UnknownEnv(
-            f"{name}: Gymnasium knows no {task.id!r}; set `module` to what registers it"
+            f"{name}: Gymnasium knows no {task.id!r}; set `module` to the module that registers it"
         )
     entry_point = gymnasium.registry[task.id].entry_point
     if not hasattr(entry_point, "create_env"):
@@ -217,8 +217,8 @@ class Rcs(SimulatorEnv):
     Action: for each arm, its command in `control_mode` and then its gripper, which closes at 0.5
     and below.
 
-    The simulator reports success, which ends the episode. The seed determines where the objects
-    are.
+    The simulator reports success, which ends the episode. The seed determines the positions of the
+    objects.
     """
 
     suite = "rcs"
@@ -311,9 +311,9 @@ class Rcs(SimulatorEnv):
     def _select_cameras(
         self, config: Any, cameras: Sequence[str] | None, height: int, width: int
     ) -> None:
-        """Leave only these cameras of a scene in its config, all if None, with images of a size.
-
-        The configs of the cameras are copied, so that the scene's own keep their size.
+        """Leave only these cameras in the config of a scene (all if None), with images of this
+        size. The configs of the cameras are copied, so that the scene's own configs keep their
+        size.
         """
         scene_cameras = config.camera_cfgs or {}
         require_cameras(self._name, cameras or (), scene_cameras)
@@ -362,7 +362,7 @@ class Rcs(SimulatorEnv):
         raw, info = self._env.reset(seed=seed)
         self._instruction = str(info.get("instruction", ""))
         if not self.instruction:
-            raise ConfigError(f"{self._name} states no instruction; set the option `instruction`")
+            raise ConfigError(f"{self._name} has no instruction; set the option `instruction`")
         return self._observe(raw), {"success": bool(info.get("success", False))}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
@@ -372,7 +372,8 @@ class Rcs(SimulatorEnv):
                 f"expected a task that reports success, got none from {self._name}: "
                 "name a scene that has a task"
             )
-        # Entries of arms have the names of the arms; the other entries are the task's.
+        # The entries of arms are keyed by the names of the arms; the other entries belong to the
+        # task.
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
@@ -394,7 +395,7 @@ def _free_joints(model: Any) -> list[str]:
 
 
 class DuoBench(Rcs):
-    """DuoBench's eleven tasks of two FR3 arms, "left" and "right", named without "duobench/".
+    """DuoBench's eleven tasks of two FR3 arms, "left" and "right", whose names omit "duobench/".
 
     Action: (16,). The first eight values are the left arm's seven joints, rad, and its gripper, and
     the last eight are those of the right arm. The reward is the fraction of the task's stages that
@@ -439,11 +440,13 @@ class Arms:
             for name in self.names:
                 if name in self._grippers:
                     self.state[self._key(name, "gripper")] = StateSpec(1)
-        # Whether `Obs.gripper` can report the gripper.
+        # Whether `Obs.gripper` can contain the gripper.
         self.has_gripper = self.single and bool(self._grippers)
 
     def action_spec(self, *, delta: bool) -> ActionSpec:
-        """Return the contract's description of an action, relative to the arm's pose if `delta`."""
+        """Return the contract's description of an action; if `delta`, it is relative to the arm's
+        pose.
+        """
         space, rotation = _COMMANDS[self._mode]
         return ActionSpec(
             dim=sum(self._sizes.values()) + len(self._grippers),
@@ -474,8 +477,8 @@ class Arms:
             observation: Robot -> name of a reading -> values.
 
         Returns:
-            The state, whose values are (D,) float32, and the gripper of a single arm in [0, 1],
-            1 = open. The second is None if there are several arms, or if the arm has no gripper.
+            The state, whose values are (D,) float32, and the gripper of a single arm in [0, 1], 1 =
+            open. The gripper is None if there are several arms, or if the arm has no gripper.
         """
         state = {}
         for name in self.names:

@@ -29,7 +29,7 @@ Split = Literal["target", "pretrain"]
 ActionOrder = Literal["base_first", "arm_first"]
 
 # RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version
-# 1.0.1. They are 1.5 times as long as in 1.0.0.
+# 1.0.1. These horizons are 1.5 times as long as in 1.0.0.
 ATOMIC_SEEN: Mapping[str, int] = {
     "CloseBlenderLid": 900,
     "CloseFridge": 900,
@@ -94,7 +94,7 @@ _KITCHENS: Mapping[str, str] = {
 }
 
 REGISTRIES = ("objaverse", "lightwheel")  # sets of objects from which RoboCasa draws
-# Folder of assets -> RoboCasa's name of the download that fills it.
+# RoboCasa's names of the downloads, by the folder of assets that each fills.
 DOWNLOAD_TYPES = {
     "textures": "tex",
     "fixtures/stoves": "fixtures_lw",
@@ -124,7 +124,8 @@ def protocol(task: str, split: Split) -> BenchmarkProtocol:
         "base",
         success="RoboCasa's own check of the task holds after a step",
         metric="success_once",
-        begins=f"{_KITCHENS[split]}, and where everything stands and lies in it: the seed's",
+        begins=f"{_KITCHENS[split]}; the seed draws the positions of all furniture and objects in "
+        f"it",
         # As in openpi's evaluation. GR00T's evaluation checks success after each chunk of 16 steps.
         ends_on_success=True,
         episodes=50,
@@ -207,10 +208,11 @@ class RoboCasa(RobosuiteEnv):
         with (
             failing(self._name, "import robocasa"),
             importing_robosuite("robocasa"),
-            contextlib.redirect_stdout(io.StringIO()),  # advice about packages that are not needed
+            # Suppresses advice about packages that are not needed.
+            contextlib.redirect_stdout(io.StringIO()),
             warnings.catch_warnings(),
         ):
-            warnings.simplefilter("ignore")  # warnings of upstream code
+            warnings.simplefilter("ignore")  # suppresses warnings of upstream code
             simulator: Any = require("robocasa")
         self._versions = {
             "robocasa": simulator.__version__,
@@ -226,7 +228,7 @@ class RoboCasa(RobosuiteEnv):
                 camera_names=list(images),
                 camera_heights=height or SIZE,
                 camera_widths=width or SIZE,
-                renderer="mujoco",  # for the reason given in `Robosuite`
+                renderer="mujoco",  # done for the reason given in `Robosuite`
             )
             # Set before the first reset, which loads the model.
             env.use_camera_obs = env.has_offscreen_renderer = bool(images)
@@ -282,7 +284,7 @@ class RoboCasa(RobosuiteEnv):
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         obs, _ = super()._begin(seed, state)
         episode = self._env.get_ep_meta()
-        self._instruction = str(episode["lang"])  # mentions objects of this kitchen
+        self._instruction = str(episode["lang"])  # the instruction mentions objects of this kitchen
         return obs, {"layout": int(episode["layout_id"]), "style": int(episode["style_id"])}
 
     @classmethod

@@ -32,7 +32,7 @@ class RobosuiteEnv(SimulatorEnv):
     quaternions xyzw of objects.
     """
 
-    # Names in the contract's state -> robosuite's names, where they differ.
+    # robosuite's names by the names in the contract's state, where the names differ.
     _raw: Mapping[str, str] = {}
 
     def _use(self, simulator: Any) -> None:
@@ -47,7 +47,7 @@ class RobosuiteEnv(SimulatorEnv):
             if hasattr(self._env, "rng"):
                 seeded_generator = np.random.default_rng(seed)
                 self._env.rng.bit_generator.state = seeded_generator.bit_generator.state
-            # A reset frees the rendering resources of the last episode, in the current context.
+            # A reset frees the rendering resources of the previous episode, in the current context.
             self._renderer.make_current()
             self._renderer.open = True
             raw = self._env.reset()
@@ -72,14 +72,14 @@ class RobosuiteEnv(SimulatorEnv):
         poses = {}
         for name, value in raw.items():
             is_pose = name.endswith(("_pos", "_quat"))
-            # Names with "to" are relative poses, as of the cube to the hand.
+            # Names with "to" are relative poses, for example of the cube to the hand.
             is_object = not {"robot0", "robot1", "to"} & set(name.split("_"))
             if is_pose and is_object:
                 poses[name] = np.asarray(value, np.float64)
         return poses
 
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
-        """Convert an observation of robosuite; without `look` it gets no images."""
+        """Convert an observation of robosuite; without `look` it has no images."""
         contract = self.contract
         cameras = list(contract.cameras or {}) if look else []
         state = {}
@@ -104,8 +104,8 @@ class CameraRenderer:
     """Renders the cameras while `open` is set; otherwise they return black images and cost nothing.
 
     robosuite renders each camera for every observation: 14 times between the beginning of a reset
-    and the policy's first observation. It samples the observation of a step, images included, after
-    the first 2 ms of the step's 50 ms.
+    and the policy's first observation. In a step it samples the observation, including the images,
+    after the first 2 of 50 ms.
     """
 
     def __init__(self, domain: Any) -> None:
@@ -113,19 +113,22 @@ class CameraRenderer:
         self.open = True
         self._domain = domain
         self._create_sensors = domain._create_camera_sensors
-        domain._create_camera_sensors = self._sensors  # called again in each reset
+        # robosuite calls this function again in each reset.
+        domain._create_camera_sensors = self._sensors
 
     def make_current(self) -> None:
-        """Activate this simulator's OpenGL context; the process may have others."""
+        """Activate this simulator's OpenGL context; the process may have other contexts."""
         sim = self._domain.sim
-        # Missing after a failed reset.
+        # There is no context after a failed reset.
         if sim is not None and sim._render_context_offscreen is not None:
             sim._render_context_offscreen.gl_ctx.make_current()
 
     def _sensors(
         self, cam_name: str, cam_w: int, cam_h: int, **options: Any
     ) -> tuple[list[Any], list[str]]:
-        """Create the sensor of a camera as robosuite does, and let it render only while open."""
+        """Create the sensor of a camera as robosuite does, and let it render only while `open` is
+        set.
+        """
         [sensor], names = self._create_sensors(cam_name, cam_w=cam_w, cam_h=cam_h, **options)
 
         @functools.wraps(sensor)  # keeps robosuite's attributes
@@ -173,7 +176,7 @@ def importing_robosuite(env: str) -> Iterator[None]:
     egl_device, visible_gpus = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
     if visible_gpus == "" and egl_device is None and os.environ.get("MUJOCO_GL") == "egl":
         raise EnvFailed(
-            f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}"
+            f"{env} finds no EGL device that renders in software, and has no GPU; {EGL_CURE}"
         )
     replaced: dict[str, str] = {}
     if egl_device is not None and visible_gpus:
@@ -203,7 +206,7 @@ class RobosuiteTask:
     """A task of robosuite, with robomimic's observations and step limit."""
 
     instruction: str
-    max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans
+    max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans, in steps
     cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
     size: int = 84  # px, of each image
     arms: tuple[str, ...] = ("robot0",)
@@ -220,7 +223,7 @@ class RobosuiteTask:
             control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
             success="robosuite's own check of the task holds after a step",
             metric="success_once",
-            begins="where the objects lie, and noise on the arm's joints: the seed's",
+            begins="the seed draws the positions of the objects, and noise on the arm's joints",
             ends_on_success=True,
             episodes=50,
         )
@@ -249,7 +252,7 @@ class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
     Observation: the cameras have robosuite's names, and their images are upright. `state` has
-    robomimic's names. It contains for each arm:
+    robomimic's names. For each arm it contains:
 
     - `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw: the hand's pose in the world frame.
     - `robot0_gripper_qpos` (2,) m: the positions of the fingers.
@@ -296,11 +299,11 @@ class Robosuite(RobosuiteEnv):
         self._instruction = instruction or self._task.instruction
 
         with importing_robosuite("robosuite"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of upstream code
+            warnings.simplefilter("ignore")  # Suppress warnings of upstream code.
             simulator = require("robosuite")
         if task not in simulator.ALL_ENVIRONMENTS:
             raise ConfigError(
-                f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; "
+                f"{self._name}: robosuite {simulator.__version__} has no such task, but 1.5 has; "
                 f"{self.cure}"
             )
 
@@ -314,7 +317,7 @@ class Robosuite(RobosuiteEnv):
                 ignore_done=True,
                 has_renderer=False,
                 has_offscreen_renderer=bool(images),
-                # After a reset, the renderer of robosuite 1.5 is left to garbage collection.
+                # After a reset, robosuite 1.5 leaves the renderer to garbage collection.
                 renderer="mujoco",
                 use_camera_obs=bool(images),
                 camera_names=list(images) or "agentview",

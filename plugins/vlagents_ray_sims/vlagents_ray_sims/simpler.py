@@ -1,8 +1,8 @@
 """SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
 Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
-https://arxiv.org/abs/2405.05941. The setting is visual matching: a photograph of the real scene is
-the background of the simulated robot and objects, and the initial configurations are a fixed list.
+https://arxiv.org/abs/2405.05941. The setting is visual matching: the simulated robot and objects
+are rendered on a photograph of the real scene, and the initial configurations are a fixed list.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TWINS: dict[str, str] = {
     "PutSpoonOnTableClothInScene-v1": _WITHIN.format(0.02),
     "StackGreenCubeOnYellowCubeBakedTexInScene-v1": _TOUCHING,
 }
-# ManiSkill's name of a download -> the folder in `data/` that it fills.
+# The folders in `data/`, by ManiSkill's name of the download that fills them.
 _DATA = {"bridge_v2_real2sim": "tasks/bridge_v2_real2sim_dataset", "widowx250s": "robots/widowx"}
 _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for name in _DATA)
 
@@ -42,7 +42,8 @@ _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for
 # The protocol of SIMPLER's own script for ManiSkill 3, real2sim_eval_maniskill3.py.
 PROTOCOL: dict[str, Any] = {
     "setting": "visual matching",
-    "success": "at the end",  # in the last state; success at any step is also reported
+    # Success is judged in the last state; success at any step is also reported.
+    "success": "at the end",
     "metric": "success_at_end",
     "initial_states": "by episode id",
     "control_mode": "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos",
@@ -57,9 +58,9 @@ PROTOCOL: dict[str, Any] = {
 class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
-    Observation: the camera "3rd_view_camera", (480, 640, 3), a size that the paper's policies
-    received and resized themselves. `state` contains the arm's `joints` (6,) rad, and `tquat` and
-    `xyzrpy`, the pose of the gripper's link in the robot's base frame. `gripper` is its opening.
+    Observation: the camera "3rd_view_camera", (480, 640, 3), the size that the paper's policies
+    received and resized. `state` contains the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`,
+    the pose of the gripper's link in the robot's base frame. `gripper` is its opening.
     `info["sim_state"]` is for scripted experts only. It contains, as (13,) float32 in the base
     frame, the positions, m, of the object, the target, the gripper and the commanded gripper, and
     the object's yaw, rad.
@@ -69,9 +70,9 @@ class Simpler(SimulatorEnv):
     1 open, 0 closed. The changes are relative to the last command, not to the measured pose. As in
     SIMPLER's script, the controller reads the rotation as a rotation vector.
 
-    The initial state is `options["init_state"]`, SIMPLER's episode id. Without that option it is
-    the seed modulo `init_states`; the seed has no other effect. The env continues after success,
-    and never reports `terminated`.
+    The initial state is `options["init_state"]`, SIMPLER's episode id. Without that option the
+    episode id is the seed modulo `init_states`; the seed has no other effect. The env continues
+    after success, and never reports `terminated`.
     """
 
     suite, known = "simpler", tuple(TWINS)
@@ -124,7 +125,8 @@ class Simpler(SimulatorEnv):
         self._user_instruction = instruction
 
         # ManiSkill keeps the photographs, and the objects that they must not hide, in class
-        # variables. A second twin of this process would otherwise use those of the first one.
+        # variables. Without this, a second environment of this process would use the photographs
+        # and objects of the first one.
         twins: Any = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
         twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
 
@@ -215,7 +217,9 @@ def _command(action: np.ndarray) -> np.ndarray:
 
 
 def _missing_assets(folder: Path) -> str | None:
-    """Return which assets `folder` lacks, with the cure; None if it has all of them."""
+    """Return a message about the assets that `folder` lacks, with the cure; None if it has all of
+    them.
+    """
     missing = [name for name in _DATA.values() if not (folder / "data" / name).is_dir()]
     if not missing:
         return None

@@ -475,7 +475,7 @@ def read_actions(text: str, limits: MessageLimits = DEFAULT_LIMITS) -> dict[str,
     if any(step.keys() != steps[0].keys() for step in steps):
         raise MalformedMessage(
             "vlagents: expected the same robots in each step of `acts`, got others than "
-            "{shown(list(steps[0]))}"
+            f"{shown(list(steps[0]))}"
         )
 
     actions = {}

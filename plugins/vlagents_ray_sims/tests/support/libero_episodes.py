@@ -1,4 +1,4 @@
-"""Short episodes of LIBERO, and what two of them are compared by."""
+"""Short episodes of LIBERO, and the fingerprint with which two of them are compared."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def begin(env: Libero, state: int = 0, seed: int = 0) -> Obs:
 
 
 def play(env: Libero, state: int = 0, between: Callable[[], object] = lambda: None) -> list[Obs]:
-    """The observations of three moving steps."""
+    """Return the first observation, and those after three steps with motion."""
     seen = [begin(env, state)]
     for i in range(3):
         between()

@@ -1,8 +1,8 @@
-"""Simple bodies in place of assets that tests do not have: of RCS's two-arm scene, and all of
+"""Simple bodies in place of assets that tests do not have: those of RCS's two-arm scene, and all of
 DuoBench's.
 
-They have the names and the sizes, in metres, that DuoBench's `transfer_cube` goes by, and no more:
-what is proved with them is how its code is driven, not how its objects behave.
+They have only the names and the sizes, in metres, on which DuoBench's `transfer_cube` depends.
+Tests with them check how DuoBench's code is called, not how its objects behave.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _RCS = {
     "cameras/zed_mini/zed_mini.xml": _CAMERA,
 }
 _DUOBENCH = {
-    "scenes/empty_world/scene.xml": _TABLE,  # the file by which RCS knows that there are assets
+    "scenes/empty_world/scene.xml": _TABLE,  # the file with which RCS checks that there are assets
     "scenes/vention_table/vention_world.xml": _TABLE,
     "objects/transfer_gate/white_long_box.xml": _OBJECT.format(
         name="white_long_box", shape='box" size="0.015 0.015 0.02'
@@ -84,13 +84,17 @@ _DUOBENCH = {
 
 
 def write_rcs(source: Path, prefix: Path) -> None:
-    """The assets in `source`, those of one arm, with what the scene of two needs besides."""
+    """Copy the assets of one arm in `source`, and add the assets that the scene with two arms
+    needs.
+    """
     shutil.copytree(source, prefix, copy_function=shutil.copyfile)
     _write(_RCS, prefix)
 
 
 def write_duobench(prefix: Path) -> None:
-    """Every file that `import duobench` looks for: empty, but for those of `transfer_cube`."""
+    """Write every file that `import duobench` checks for; all are empty except those of
+    `transfer_cube`.
+    """
     spec = importlib.util.find_spec("duobench")
     assert spec is not None
     assert spec.origin is not None
@@ -102,7 +106,7 @@ def _write(files: dict[str, str], prefix: Path) -> None:
     for name, text in files.items():
         path = prefix / "assets" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.parent.chmod(0o755)  # copied from a folder that nobody may write into
+        path.parent.chmod(0o755)  # the folder is a copy of a read-only folder
         if path.exists():
             path.chmod(0o644)
         path.write_text(text.strip())

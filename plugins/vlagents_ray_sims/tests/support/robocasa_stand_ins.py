@@ -1,9 +1,9 @@
 """A plain kitchen in place of RoboCasa's assets, about 10 GB that tests do not have.
 
 RoboCasa's package has its scenes, its counters, cabinets and drawers; textures, appliances and
-objects are a download. Here textures are of one colour, the appliances are boxes without doors or
-knobs, every object is a box, and all kitchens are one. What is proved with it is how RoboCasa's
-code is driven, seeded and read, not how its kitchens look or its objects behave.
+objects are a download. Here each texture has one colour, appliances are boxes without doors or
+knobs, every object is a box, and all kitchens are the same. Tests with this kitchen check how
+RoboCasa's code is called, seeded and read, not how its kitchens look or its objects behave.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ fridge_bottom_freezer: default
 
 
 def write_package(folder: Path) -> Path:
-    """Write a copy of the installed robocasa with these assets into `folder`, for the beginning
+    """Write a copy of the installed robocasa with these assets into `folder`, for the first entry
     of `sys.path`.
     """
     spec = importlib.util.find_spec("robocasa")
@@ -85,7 +85,8 @@ def write_package(folder: Path) -> Path:
     for name, rgba in _APPLIANCES.items():
         _write_box(assets / "fixtures" / name, "0.4 0.4 0.9", "main", rgba)
     for name in _folders(installed / "models" / "objects" / "kitchen_objects.py"):
-        for number, rgba in enumerate(("0.2 0.7 0.2", "0.7 0.7 0.2")):  # two: one for each split
+        # Two objects, one for each split.
+        for number, rgba in enumerate(("0.2 0.7 0.2", "0.7 0.7 0.2")):
             _write_box(
                 assets / "objects" / name / f"plain_{number}", "0.03 0.03 0.02", "bbox", rgba
             )
@@ -96,8 +97,8 @@ def write_package(folder: Path) -> Path:
 
 
 def _folders(categories: Path) -> set[str]:
-    """The folders of all categories of objects, e.g. "objaverse/apple", which their table names
-    where they differ.
+    """Return the folders of all categories of objects, e.g. "objaverse/apple". RoboCasa's table of
+    categories lists folders whose names differ from the category.
     """
     found = set()
     for category in ast.walk(ast.parse(categories.read_text())):

@@ -1,4 +1,4 @@
-"""A scene of two arms, as a user would register one: RCS's own FR3, twice, 80 cm apart."""
+"""A scene with two arms, as a user would register it: RCS's own FR3, twice, 80 cm apart."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import rcs
 from rcs.envs.configs import EmptyWorldFR3
 from rcs.envs.tasks import PickTaskConfig
 
-SIDES = {"left": 0.4, "right": -0.4}  # m, along y
+SIDES = {"left": 0.4, "right": -0.4}  # position along y, m
 
 
 class TwoArms(EmptyWorldFR3):
-    """The right arm has a cuboid to pick up; success is of RCS's own pick task."""
+    """A scene in which the right arm picks up a cuboid; success is that of RCS's own pick task."""
 
     robot_prefix_template = "robot{robot_name}_"
     gripper_prefix_template = "gripper{robot_name}_"

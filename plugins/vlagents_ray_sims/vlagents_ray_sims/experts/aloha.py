@@ -1,4 +1,4 @@
-"""An expert for ALOHA's two tasks, from the simulator's state."""
+"""A scripted expert for ALOHA's two tasks, which reads the simulator's state."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task
 
 _SHOULDER = 0.12705  # height of the shoulder's axis over the table, m
-# From the shoulder to the elbow when all joints are at 0: forward and up, m.
+# Vector from the shoulder to the elbow when all joints are at 0: forward and up, m.
 _UPPER = np.array([0.05955, 0.3])
 _FOREARM = 0.3  # from the elbow to the wrist's axis, m
 _HAND = 0.2  # from the wrist's axis to the middle between the fingers' pads, m
 # Position of the base, x and y, m, and the direction along x that the arm faces.
 _BASES = {"left": (-0.469, 0.5, 1.0), "right": (0.469, 0.5, -1.0)}
 _OPEN, _CLOSED = 1.0, 0.0
-_TILT = math.radians(60)  # pitch of a hand that grasps from above: it does not hit the other hand
+# Pitch of a hand that grasps from above; at this pitch it does not hit the other hand.
+_TILT = math.radians(60)
 _SIM_STATE_SIZES = {"transfer_cube": 7, "insertion": 14}  # the length of `info["sim_state"]`
 
 
@@ -28,9 +29,9 @@ _SIM_STATE_SIZES = {"transfer_cube": 7, "insertion": 14}  # the length of `info[
 class HandPose:
     """Target of the fingers' pads, and orientation of the hand."""
 
-    xyz: tuple[float, float, float]  # m, in the world frame
-    pitch: float  # rad, from the horizontal downwards
-    roll: float = 0.0  # rad, about the hand's own axis
+    xyz: tuple[float, float, float]  # position, m, in the world frame
+    pitch: float  # pitch, rad, from the horizontal downwards
+    roll: float = 0.0  # roll, rad, about the hand's own axis
     gripper: float = _OPEN
 
 
@@ -77,7 +78,7 @@ def joints(arm: str, pose: HandPose) -> list[float]:
 
 
 Waypoints = list[tuple[int, HandPose]]
-"""The poses of a hand, each with the step at which the hand has to be there."""
+"""The poses of a hand, each with the step at which the hand has to reach it."""
 
 
 class AlohaExpert:
@@ -93,7 +94,7 @@ class AlohaExpert:
             raise ContractMismatch(
                 f"expected an env with an expert, one of {envs}, got {env_name!r}"
             )
-        # Arm -> the steps and the commands, (7,), between which the arm moves.
+        # For each arm: the steps and the commands, (7,), between which the arm moves.
         self._commands: dict[str, list[tuple[int, np.ndarray]]] = {}
         self._step = 0
 
@@ -119,7 +120,7 @@ class AlohaExpert:
 
 
 def _transfer(objects: np.ndarray) -> dict[str, Waypoints]:
-    """Return waypoints for both arms: the right hand lifts the cube, and the left hand takes it.
+    """Return waypoints for both arms: the right hand lifts the cube, and the left hand grasps it.
 
     The hands meet in the middle, where the left hand is rolled by 90 degrees.
 
@@ -146,7 +147,8 @@ def _insertion(objects: np.ndarray) -> dict[str, Waypoints]:
     """
     peg_x, peg_y = objects[:2]
     socket_x, socket_y = objects[7:9]
-    # The peg is grasped 2 cm lower than the socket, so that its hand is 2 cm higher.
+    # The peg is grasped 2 cm lower than the socket, so the peg's hand is 2 cm higher when the two
+    # meet.
     return {
         "right": [*_grasp(peg_x, peg_y, 10), *_join(1.0, 0.22)],
         "left": [*_grasp(socket_x, socket_y, 10), *_join(-1.0, 0.2)],
@@ -162,7 +164,7 @@ def _join(side: float, height: float) -> Waypoints:
 
 
 def _grasp(x: float, y: float, delay_steps: int) -> Waypoints:
-    """Return waypoints above the object, at it, and with closed fingers."""
+    """Return waypoints above the object, at the object, and at the object with closed fingers."""
     return [
         (70 + delay_steps, HandPose((x, y, 0.12), _TILT)),
         (110 + delay_steps, HandPose((x, y, 0.02), _TILT)),

@@ -24,8 +24,8 @@ from vlagents_ray_sims.experts.osc_pose import (
     yaw_of,
 )
 
-_LIFT_M = 0.2  # an object is lifted by at least this, to pass over other objects
-_DOWNWARDS_M = 0.08  # an object that is moved to a lower target is lifted by this
+_LIFT_M = 0.2  # minimum height by which an object is lifted, to pass over other objects, m
+_DOWNWARDS_M = 0.08  # height by which an object is lifted that is moved to a lower target, m
 _CLEAR_M = 0.12  # height of a carried object above its target
 _LEAVE_M = 0.15
 _HANDLE_M = 0.121  # from the middle of a drawer to the outer side of its handle
@@ -89,15 +89,17 @@ _TURNING = (
     PickPhase("release", OPEN, 8, waits=True),
     PickPhase("leave", OPEN, 30),
 )
-# Kind of a predicate -> the phases that meet it.
+# For each kind of predicate: the phases that fulfil it.
 _MOTIONS = {"on": _PLACING, "in": _PLACING, "turnon": _TURNING, "close": _CLOSING}
-# The order in which predicates are met: an object is put into a drawer before the drawer is closed.
+# The order in which predicates are fulfilled: an object is put into a drawer before the drawer is
+# closed.
 _ORDER = ("turnon", "on", "in", "close")
 _STATE_KEYS = {"goal", "unmet", "positions", "quaternions"}
 
 
 class LiberoExpert(PickExpert):
-    """Meets the predicates of the goal one after the other, and then repeats those still unmet.
+    """Fulfils the predicates of the goal one after the other, and then repeats the unmet
+    predicates.
 
     It cannot open drawers or microwaves: `reset` raises `ContractMismatch` for such goals.
     """
@@ -107,8 +109,8 @@ class LiberoExpert(PickExpert):
     def __init__(self, env_name: str) -> None:
         super().__init__(env_name, _PLACING)
         self._predicate: list[str] = []
-        self._tries: dict[str, int] = {}  # object -> the number of attempts
-        self._lifted_from = 0.0  # m, height of the object before it was lifted
+        self._tries: dict[str, int] = {}  # the number of attempts for each object
+        self._lifted_from = 0.0  # height of the object before it was lifted, m
 
     def reset(self, obs: Obs, instruction: str) -> None:
         kinds = {predicate[0] for predicate in self._state(obs)["goal"]}
@@ -129,7 +131,7 @@ class LiberoExpert(PickExpert):
             self._aim(hand, obs)
 
     def _choose(self, obs: Obs) -> None:
-        """Select the predicate to meet next: the one whose object was tried least often."""
+        """Select the next predicate: the one whose object has had the fewest attempts."""
 
         def rank(predicate: list[str]) -> tuple[int, int]:
             kind, name, *_ = predicate

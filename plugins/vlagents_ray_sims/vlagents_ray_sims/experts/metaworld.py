@@ -1,4 +1,4 @@
-"""Meta-World's own oracles, from the simulator's state."""
+"""A scripted expert that runs Meta-World's own oracles on the simulator's state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task, require
 
-# Hand (3,), gripper (1,) and objects (14,), the same values of the step before, and goal (3,).
+# Hand (3,), gripper (1,) and objects (14,); the same values at the previous step; and goal (3,).
 _SIZE = 39
 
 

@@ -1,4 +1,4 @@
-"""Experts for robosuite's controller OSC_POSE, which pick an object from above.
+"""Scripted experts for robosuite's controller OSC_POSE, which pick an object from above.
 
 This module has the base class and the expert for robosuite's tasks. Experts read the positions of
 the objects from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad per unit,
@@ -29,7 +29,7 @@ OPEN, CLOSED = -1.0, 1.0
 _ARRIVED_M = 0.008  # distance to the target at which the hand has arrived
 OVER_M = 0.12  # height of the hand above the grasp when approaching it
 UP = np.array([0.0, 0.0, 1.0])
-_UNITS_PER_RAD = 2.0  # commands all of the remaining rotation
+_UNITS_PER_RAD = 2.0  # units of the action per rad, which command all of the remaining rotation
 _MAX_TURN = 0.3  # largest command of a rotation, units
 
 
@@ -40,20 +40,23 @@ class PickPhase:
     name: str
     gripper: float
     steps: int
-    waits: bool = False  # waits `steps` for the fingers, independent of the hand
+    # Whether the phase waits `steps` for the fingers, whatever the position of the hand.
+    waits: bool = False
 
 
 class PickExpert(ABC):
     """Moves the hand through a sequence of poses; each pose is computed when its phase begins."""
 
     units_per_m: ClassVar[float] = 10.0
-    """Units of the action for each metre of the remaining distance; 20 command all of it."""
+    """Units of the action for each metre of the remaining distance; 20 units command all of the
+    distance.
+    """
 
     def __init__(self, name: str, phases: Sequence[PickPhase]) -> None:
         self._name, self._phases = name, phases
-        # Orientation of the hand at the reset, (3, 3), in which the fingers close along y.
+        # Orientation of the hand at the reset, (3, 3), at which the fingers close along the y axis.
         self._first: np.ndarray | None = None
-        self._phase, self._spent = 0, 0  # index of the phase, and its steps up to now
+        self._phase, self._spent = 0, 0  # index of the phase, and number of its steps so far
         # Target position of the hand in this phase, (3,) m, and its orientation, (3, 3).
         self._target, self._target_orientation = np.zeros(3), np.eye(3)
 
@@ -86,8 +89,8 @@ class PickExpert(ABC):
         turn = np.clip(remaining_rotation * _UNITS_PER_RAD, -_MAX_TURN, _MAX_TURN)
         return Act(np.concatenate([move, turn, [phase.gripper]]).astype(np.float32))
 
-    def _finished(self, hand: np.ndarray, obs: Obs) -> None:  # noqa: B027 - an expert of one object has nothing to do
-        """Begin other phases after the last one."""
+    def _finished(self, hand: np.ndarray, obs: Obs) -> None:  # noqa: B027 - an expert for one object has nothing to do
+        """Begin further phases after the last phase."""
 
     def _turn(self, yaw: float) -> None:
         """Turn the hand so that its fingers close across the direction `yaw`, rad.
@@ -114,10 +117,10 @@ class Handling:
 
     name: str  # robosuite's name of the object
     handle_m: float = 0.0  # from the object's origin to the grasp, along its own x axis
-    # Whether the fingers close across that axis, and the object is turned to the nearest right
+    # Whether the fingers close across the x axis, and the object is turned to the nearest right
     # angle before it is placed.
     aligned: bool = False
-    lift_m: float = 0.12  # to pass over other objects
+    lift_m: float = 0.12  # height by which the object is lifted, to pass over other objects
     # Height of the object's origin above the target when the hand opens; None if the object is
     # only lifted.
     release_m: float | None = None
@@ -143,7 +146,9 @@ _PLACE = (
 
 
 class RobosuiteExpert(PickExpert):
-    """Grasps the task's object from above, lifts it, and moves it to its target, if it has one."""
+    """Grasps the task's object from above, lifts it, and moves it to its target, if the task has
+    one.
+    """
 
     units_per_m = 20.0
 
@@ -182,7 +187,8 @@ class RobosuiteExpert(PickExpert):
             self._target = hand + handling.lift_m * UP
         elif phase in ("carry", "lower"):
             placed_yaw = round(yaw / (math.pi / 2)) * math.pi / 2 if handling.aligned else yaw
-            # From the object to the hand, once the object has that yaw.
+            # Vector from the object to the hand, after the object is turned to the nearest right
+            # angle.
             grip = rotation(np.array([0.0, 0.0, placed_yaw - yaw])) @ (hand - position)
             height = handling.lift_m if phase == "carry" else handling.release_m or 0.0
             self._target = self._read(obs, "target_pos", 3) + grip + height * UP

@@ -1,4 +1,4 @@
-"""An expert for RCS's pick task, from the pose of the cuboid."""
+"""A scripted expert for RCS's pick task, which reads the pose of the cuboid."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RcsPick:
 
     _STEP_M = 0.02  # largest change of the commanded position in a step
     _OVER_M = 0.12  # height of the tool above the cuboid's middle before it goes down
-    _ARRIVED_M = 0.006  # distance to its target at which the tool has arrived
+    _ARRIVED_M = 0.006  # distance to the target at which the tool has arrived
     _GRASP_STEPS = 12  # steps until the fingers have closed
     _LIFT_M = 0.2  # height of the target above the grasp; success needs about 5 cm
 
@@ -40,7 +40,9 @@ class RcsPick:
         self._grasp_position = self._cuboid(obs)[:3]
 
     def act(self, obs: Obs) -> Act:
-        """Begin the next phase if the last one is over, and move towards the phase's target."""
+        """Begin the next phase if the current phase is over, and move towards the phase's
+        target.
+        """
         tool, cuboid = _tool(obs), self._cuboid(obs)
         position, orientation = cuboid[:3], cuboid[3:]
         over = position + np.array([0.0, 0.0, self._OVER_M])
@@ -87,7 +89,7 @@ def _tool(obs: Obs) -> np.ndarray:
 def _yaw(wxyz: np.ndarray) -> float:
     """Return a lying cuboid's rotation about the vertical, rad.
 
-    Half a turn makes no difference to a cuboid, so that the result is in [-pi/2, pi/2].
+    Half a turn makes no difference to a cuboid, so the result is in [-pi/2, pi/2].
     """
     yaw = 2 * math.atan2(wxyz[3], wxyz[0])
     return math.remainder(yaw, math.pi)

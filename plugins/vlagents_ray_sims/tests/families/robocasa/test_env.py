@@ -1,4 +1,6 @@
-"""RoboCasa's tasks as they really run, in a plain kitchen in place of its assets (stand_ins.py)."""
+"""Tests of RoboCasa's tasks with RoboCasa's own code, in a plain kitchen in place of its assets
+(robocasa_stand_ins.py).
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,12 @@ from vlagents_ray_sims.robocasa import (
 
 STILL = (0.0,) * 11 + (-1.0,)
 MOVE = np.array([0.9, -0.8, 0.7, 0.2, 1.0, 0.5, -0.5, -0.3, 0, 0, 0.3, 1], np.float32)
-BREAKAWAY = 0.25  # m/s or rad/s; the friction of the base's joints holds slower commands
+BREAKAWAY = 0.25  # m/s or rad/s; the friction of the base's joints stops slower motions
 
 
 @pytest.fixture(scope="module", autouse=True)
 def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder with a robocasa that has stand-ins as its assets, which this process imports."""
+    """Yield the folder of a robocasa with stand-ins as its assets, which this process imports."""
     assert "robocasa" not in sys.modules
     folder = write_package(tmp_path_factory.mktemp("robocasa"))
     sys.path.insert(0, str(folder))
@@ -49,10 +51,12 @@ def drive(kitchen: Path) -> Iterator[RoboCasa]:
 
 
 class Driver(Agent):
-    """Drives the base in a straight line to where the task wants it, and turns it."""
+    """Drives the base in a straight line to the task's goal, and turns it to the goal's
+    orientation.
+    """
 
     def __init__(self, env: RoboCasa) -> None:
-        self._env = env._env  # the goal is nowhere else
+        self._env = env._env  # only the simulator knows the goal
 
     def act(self, obs: Obs) -> Act:
         yaw = 2 * np.arctan2(obs.state["base_rotation"][2], obs.state["base_rotation"][3])
@@ -139,7 +143,8 @@ def test_the_last_number_opens_and_closes_the_gripper_and_success_is_robocasas_c
         obs, info = env.reset(seed=3)
         assert "drawer" in env.instruction
         assert obs.info["sim_state"]["drawer_obj_pos"].shape == (3,)
-        for command, wider in ((1.0, False), (0.0, True)):  # 0 to 1, as well as -1 to 1
+        # Commands in [0, 1] work like commands in [-1, 1].
+        for command, wider in ((1.0, False), (0.0, True)):
             before = obs.gripper
             for _ in range(8):
                 obs, reward, done, _, info = env.step(
@@ -147,7 +152,8 @@ def test_the_last_number_opens_and_closes_the_gripper_and_success_is_robocasas_c
                 )
             assert (obs.gripper > before) is wider
         assert (reward, done, info["success"]) == (0.0, False, False)
-        env._env.drawer.open_door(env._env, min=1.0, max=1.0, partial_open=False)  # sets the joint
+        # Sets the drawer's joint.
+        env._env.drawer.open_door(env._env, min=1.0, max=1.0, partial_open=False)
         assert env.step(Act(np.array(STILL, np.float32)))[1:] == (
             1.0,
             True,
@@ -186,7 +192,7 @@ def test_the_table_of_tasks_and_the_downloads_are_robocasas(kitchen: object) -> 
     from robocasa.utils.dataset_registry import TARGET_TASKS
     from robocasa.utils.dataset_registry_utils import get_task_horizon
 
-    longer = 1.5 if robocasa.__version__ == "1.0.0" else 1  # 1.0.1 lengthened all horizons
+    longer = 1.5 if robocasa.__version__ == "1.0.0" else 1  # version 1.0.1 lengthened all horizons
     ours = {
         "atomic_seen": ATOMIC_SEEN,
         "composite_seen": COMPOSITE_SEEN,

@@ -1,4 +1,4 @@
-"""robosuite's tasks as they really run, in LIBERO's environment, which brings robosuite 1.4."""
+"""Tests of robosuite's tasks in LIBERO's Python environment, which contains robosuite 1.4."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def test_what_it_shows_is_robosuites_own_to_the_bit(lift: Robosuite) -> None:
 
 
 def test_a_reset_frees_the_last_episodes_renderer_at_once(lift: Robosuite) -> None:
-    """One that is freed later, by a garbage collection, takes buffers from the renderer that is
-    in use then.
+    """A renderer that a later garbage collection frees would free buffers of the renderer that is
+    in use at that time.
     """
     lift.reset(seed=1)
     last = weakref.ref(lift._env.sim._render_context_offscreen)
@@ -89,7 +89,7 @@ def test_an_episode_is_its_seeds_and_what_nobody_looks_at_is_not_rendered(lift: 
     where = [obs.info["sim_state"]["cube_pos"] for obs in begins]
     np.testing.assert_array_equal(where[0], where[2])
     assert not np.array_equal(where[0], where[1])
-    np.testing.assert_array_equal(np.random.get_state()[1], drawn)  # noqa: NPY002 - nobody else's generator
+    np.testing.assert_array_equal(np.random.get_state()[1], drawn)  # noqa: NPY002 - the process's own generator must not change
 
 
 def test_the_expert_lifts_the_cube_and_doing_nothing_does_not() -> None:
@@ -115,7 +115,8 @@ def test_a_description_states_versions_protocol_and_what_deviates_from_it(lift: 
 def test_errors_say_what_is_wanted() -> None:
     if version("robosuite").startswith("1.4"):
         with pytest.raises(
-            ConfigError, match=r"robosuite 1\.4.* has no such task, 1\.5 has.*venv create robosuite"
+            ConfigError,
+            match=r"robosuite 1\.4.* has no such task, but 1\.5 has.*venv create robosuite",
         ):
             Robosuite("ToolHang")
     with pytest.raises(EnvFailed, match=r"Lift failed to make.*eagle"):
