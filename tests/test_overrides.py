@@ -93,7 +93,7 @@ ERRORS: dict[str, tuple[str, str]] = {
     ),
     "removed, but it is not there": (
         "~gian",
-        "expected a key that is set, .*'gain', .* got 'gian'; did you mean 'gain'",
+        "expected an existing key, .*'gain', .* got 'gian'; did you mean 'gain'",
     ),
     "removed from a section that is not there": ("~bach.max_size", "did you mean 'batch'"),
     "removed from a list that is shorter": (
@@ -109,7 +109,7 @@ ERRORS: dict[str, tuple[str, str]] = {
     "an entry with a sign": ("envs.-1=x", "entry of a list, 0 to 1, got '-1'"),
     "below a number": (
         "gain.a=1",
-        "--set gain.a=1: 'a' goes below 'gain', which has a value already: 0.5",
+        "--set gain.a=1: expected a mapping or a list at 'gain', to set 'a' in it, got 0.5",
     ),
 }
 
@@ -125,7 +125,7 @@ def test_settings_are_changes_of_nothing() -> None:
         "a": {"b": 1, "c": [1, 2]},
         "d": "x",
     }
-    with pytest.raises(ConfigError, match="of which there is none"):
+    with pytest.raises(ConfigError, match="but there is none"):
         parse_settings(["~a"], "--set")
 
 

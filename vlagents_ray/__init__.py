@@ -1,7 +1,5 @@
 """vlagents_ray: Vision-Language-Action models served with Ray, for robots and for evaluation.
-
-This is the light install: it needs numpy, simplejpeg and websockets, and loads neither ray nor
-torch.
+Importing this package needs only numpy, simplejpeg and websockets, and loads neither ray nor torch.
 """
 
 from importlib import import_module
@@ -65,8 +63,8 @@ _HOMES = ("errors", "contract", "interface", "images.codecs", "client", "ray_too
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use, so that the command can handle Ctrl-C before numpy is
-    loaded.
+    """Import a public name on first use, so that the command `vlagents-ray` can handle Ctrl-C while
+    numpy is being loaded.
     """
     if name in __all__:
         for home in _HOMES:

@@ -1,5 +1,5 @@
-"""Run the command `vlagents-ray` as `python -m vlagents_ray`, where the console script is not on
-the path.
+"""Run the command `vlagents-ray` as `python -m vlagents_ray`, for shells whose PATH lacks the
+console script.
 """
 
 from vlagents_ray.cli import main

@@ -14,8 +14,8 @@ declaration. A server finds out with `ability` what a loaded agent can do:
 A wrapper has the abilities of its inner agent, without naming them (`Forwards`): `ability` then
 returns the inner agent, or an object that changes the observations before it passes them on. A
 plug-in may define further protocols; they pass through wrappers and child processes in the same
-way. So the annotations of a protocol must be types that exist at run time, and an argument that is
-an observation must be annotated as `Obs`.
+way. Therefore the annotations of a protocol must be types that exist at run time, and an argument
+that is an observation must be annotated as `Obs`.
 """
 
 from __future__ import annotations
@@ -63,27 +63,27 @@ __all__ = [
 T = TypeVar("T")
 
 
-# ----- Marks: what a protocol says about its values.
+# ----- Marks: properties of the arguments and results of a protocol.
 
 
 class InProcess(Protocol):
     """Marks abilities whose arguments or results are objects of the policy's process, such as
     references to weights.
 
-    They do not pass to another process. A child process uses them itself.
+    Such values are not sent to another process: if the policy runs in a child process, only that
+    child process calls these abilities.
     """
 
 
 class Speculative(Protocol):
-    """Marks abilities that a server may use on an observation before its turn to be acted on: on
-    any thread, although the observation may then never be acted on.
-
-    A wrapper changes such an observation twice, for the ability and for the action. So these
-    abilities pass only through wrappers that are `Wrapper.repeatable`.
+    """Marks abilities that a server may call, on any thread, with an observation that waits for its
+    call of `act`. That call may never follow. A wrapper changes such an observation twice, for the
+    ability and for `act`. Therefore only wrappers that are `Wrapper.repeatable` forward these
+    abilities.
     """
 
 
-# ----- Abilities of the copy of a session.
+# ----- Abilities of the agent's copy for one session.
 
 
 @runtime_checkable
@@ -93,8 +93,9 @@ class Observes(Protocol):
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history without computing an action.
 
-        When a session is resumed on another replica, it is `reset` with its first observation, and
-        this is then called with the last observations on which it had acted.
+        When a session is resumed on another replica, a server calls `reset` with the session's
+        first observation, and then this method with the last observations for which the policy had
+        computed actions.
 
         Args:
             obs: The observation.
@@ -103,19 +104,19 @@ class Observes(Protocol):
 
 @runtime_checkable
 class Prepares(InProcess, Speculative, Protocol):
-    """The policy computes a part of an action before its turn, while other sessions are acted
-    on.
+    """The policy computes a part of an action in advance, while the server computes actions of
+    other sessions.
     """
 
     def prepare(self, obs: Obs) -> Any:
         """Compute values that depend only on one observation and the instruction, such as resized
         images and tokens.
 
-        A server may call this on a session's copy while other sessions, or an earlier request of
-        this one, are acted on, on several threads at once, and sets `obs.prepared` to the result
-        before `act`. The call is optional: `act` computes the same if `obs.prepared` is None. An
-        error fails the request of that observation. Define this if it takes a noticeable part of
-        the time of `act`.
+        A server may call this on a session's copy, on several threads at once, while it computes
+        actions of other sessions or of an earlier request of the same session. It sets
+        `obs.prepared` to the result before it calls `act`. The call is optional: `act` computes the
+        same if `obs.prepared` is None. An error fails the request of that observation. Define this
+        if it takes a noticeable part of the time of `act`.
 
         Args:
             obs: The observation to act on next; it must not be changed.
@@ -129,7 +130,7 @@ class Prepares(InProcess, Speculative, Protocol):
 
 @runtime_checkable
 class Interruptible(Protocol):
-    """The agent has a plan, which a robot may be kept from executing."""
+    """The agent has planned actions, and can drop them if the robot did not execute them."""
 
     def interrupt(self) -> None:
         """Drop the planned actions: the robot was stopped or moved, and did not execute the last
@@ -152,12 +153,12 @@ class ContinuesPlans(Protocol):
 @runtime_checkable
 class BeginsWithPlan(Protocol):
     """The policy was trained to begin a chunk with the first rows of the plan that is being
-    executed, and states in its `Act` with how many it began (`GIVEN`).
+    executed, and returns the number of these rows in its `Act` (`GIVEN`).
     """
 
     longest_prefix: int
-    """The most rows of the plan with which a chunk begins; 0 if chunks continue plans in another
-    way, such as guidance, or not at all.
+    """The largest number of rows of the plan with which a chunk begins; 0 if chunks continue plans
+    in another way, such as guidance, or not at all.
     """
 
 
@@ -171,62 +172,65 @@ class Trainable(InProcess, Protocol):
         """Return references to the values that a learner trains, by name.
 
         Raises:
-            NotTrainable: The agent has none with these settings.
+            NotTrainable: The agent has no trainable parameters with these settings.
         """
 
     def load_parameters(self, values: Mapping[str, Any]) -> None:
-        """Act with these values from now on; a server calls this between two batches.
+        """Replace the parameters, for all later actions; a server calls this between two batches.
 
         Args:
             values: A value for each name of `parameters`, of the same shape, type and device. They
                 have been checked, and do not change later; the agent must not change them either.
 
         Raises:
-            NotTrainable: The agent has none with these settings.
+            NotTrainable: The agent has no trainable parameters with these settings.
         """
 
 
 @runtime_checkable
 class Sleeps(InProcess, Protocol):
-    """The policy has memory on an accelerator that it can free for a learner, besides that of its
-    parameters.
+    """The policy uses memory on an accelerator besides its parameters, and can free this memory for
+    a learner.
     """
 
     def sleep(self) -> None:
-        """Free the memory of an accelerator that is not that of `parameters`, such as of CUDA
+        """Free all memory on an accelerator except that of `parameters`, such as the memory of CUDA
         graphs, until `wake`.
 
-        A server calls this when a learner needs the memory, and moves the parameters to the host
-        itself.
+        A server calls this when a learner needs the memory. The server moves the parameters to the
+        host itself.
         """
 
     def wake(self) -> None:
-        """Allocate again what `sleep` freed; torch tensors of `parameters` are the same objects at
-        other addresses.
+        """Allocate the memory that `sleep` freed; torch tensors of `parameters` are still the same
+        objects, but at other addresses.
         """
 
 
 @runtime_checkable
 class DefersLoading(InProcess, Protocol):
-    """The policy can postpone a part of its loading while others act, which that would delay."""
+    """The policy can postpone a part of its loading, which would delay the actions of other
+    policies on the same GPU.
+    """
 
     def load_deferred(self) -> bool:
-        """Do one part of what loading has postponed, as long as no other policy needs to act.
+        """Do one part of the postponed loading.
 
-        A server that loads this policy beside others calls this between two batches, when no
-        request has come for some seconds.
+        A server that loads this policy next to others calls this between two batches, when no
+        policy has received a request for some seconds.
 
         Returns:
-            Whether a part is left.
+            Whether more parts are left.
         """
 
 
 @runtime_checkable
 class ChecksHealth(InProcess, Protocol):
-    """The policy detects that it can never act again."""
+    """The policy detects when it can never compute an action again."""
 
     def check_health(self) -> None:
-        """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
+        """Raise an exception if this agent can never compute an action again, e.g. after the loss
+        of its GPU.
 
         A server calls this every few seconds, also while a batch runs, and replaces the replica if
         it raises.
@@ -235,28 +239,28 @@ class ChecksHealth(InProcess, Protocol):
 
 @runtime_checkable
 class HasWeightsId(Protocol):
-    """The policy identifies its weights, which come from elsewhere than its files."""
+    """The policy identifies its weights, for weights that are not loaded from checkpoint files."""
 
     weights_id: dict[str, Any] | None
-    """{"digest": …, "revision": …}, which identify the weights loaded by `initialize`, and more
-    for metadata.
+    """{"digest": …, "revision": …}, which identify the weights that `initialize` loaded, and
+    further entries for the server's metadata.
 
-    A server reports them, and an evaluation separates results of different digests. For a policy
-    without, the digest is that of the files that `initialize` found by
+    A server reports them, and an evaluation separates results of different digests. If a policy
+    lacks this attribute, the digest is computed from the files that `initialize` found with
     `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
 
 @runtime_checkable
 class HasStatistics(Protocol):
-    """The policy has the ranges of the numbers in its training."""
+    """The policy has the ranges of states and actions in its training data."""
 
     statistics: dict[str, Any] | None
     """Ranges as in LeRobot's `stats.json`, {"action": {"min": …, "max": …}, …}.
 
-    They are in the robot's units; None stands for a number that is not known. "parts" names the
-    parts of the state in their order. A server's metadata have them among the `weights`, and
-    `vlagents-ray robot` compares them with the robot before its first motion.
+    They are in the robot's units; None stands for an unknown number. "parts" lists the parts of the
+    state in order. A server returns the ranges in its metadata, under `weights`, and `vlagents-ray
+    robot` compares them with the robot before its first motion.
     """
 
 
@@ -268,8 +272,8 @@ class HasCheck(InProcess, Protocol):
     """The agent checks its actions before it returns them."""
 
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None
-    """The check that every action from `act` has passed, given the action and the previous one,
-    (D,) each.
+    """The check that every action from `act` has passed; it is called with the action and the
+    previous action, (D,) each.
     """
 
 
@@ -283,23 +287,23 @@ class HasControl(InProcess, Protocol):
 
 @runtime_checkable
 class CountsTicks(InProcess, Protocol):
-    """The agent counts the ticks at which its policy was to act, and those without an action in
-    time.
+    """The agent counts the ticks at which it needed an action of its policy, and the ticks without
+    one in time.
     """
 
     timeliness: Any
     """The `vlagents_ray.chunking.timeliness.Timeliness` of the episode, which a reset replaces. The
-    control loop adds the ticks at which it did not call `act`, as it was busy.
+    control loop adds the ticks at which it was too busy to call `act`.
     """
 
 
 @runtime_checkable
 class ReadsSlo(InProcess, Protocol):
-    """The policy's server compares what a robot needs with what it can do."""
+    """The policy's server reports whether it can meet a robot's service level objective (SLO)."""
 
     reads_slo: bool
-    """Whether `reset` accepts the option `slo`, the fields of a `vlagents_ray.slo.Slo`, and answers
-    with an entry `slo` of its info: {"load": …, "in_time": …, "reason": …}.
+    """Whether `reset` accepts the option `slo`, a dict with the fields of a `vlagents_ray.slo.Slo`,
+    and returns an entry `slo` in its info: {"load": …, "in_time": …, "reason": …}.
     """
 
 
@@ -308,12 +312,12 @@ class ReadsSlo(InProcess, Protocol):
 
 @runtime_checkable
 class Forwards(InProcess, Protocol):
-    """The agent acts in place of another one, whose abilities are also its own: a wrapper, or the
-    proxy of a process.
+    """The agent stands in for another agent and has the same abilities: a wrapper, or the proxy of
+    an agent in another process.
     """
 
     def forwarded(self, protocol: type[T]) -> T | None:
-        """Return an object that has the other agent's ability, or None if that lacks it.
+        """Return an object that has the other agent's ability, or None if the other agent lacks it.
 
         Args:
             protocol: The protocol of the ability.
@@ -321,7 +325,7 @@ class Forwards(InProcess, Protocol):
 
 
 def ability(agent: Agent, protocol: type[T]) -> T | None:
-    """Return the object whose methods are an ability of an agent.
+    """Return the object that implements an ability of an agent.
 
     It takes about ten microseconds: call it when a session begins, not at each action.
 
@@ -330,9 +334,8 @@ def ability(agent: Agent, protocol: type[T]) -> T | None:
         protocol: The protocol of the ability.
 
     Returns:
-        The agent, if it has all members of the protocol and none of them is None; otherwise, for
-        an agent that acts in place of another one, what it forwards. None if the agent lacks the
-        ability.
+        The agent, if it has all members of the protocol and none of them is None; otherwise the
+        result of its method `forwarded`, if it has one. None if the agent lacks the ability.
     """
     if has_members(agent, protocol):
         return cast(T, agent)
@@ -342,8 +345,8 @@ def ability(agent: Agent, protocol: type[T]) -> T | None:
 
 
 def has_members(agent: object, protocol: type) -> bool:
-    """Return whether an object itself has all members of a protocol. Properties are not
-    evaluated, since one of a remote agent may wait for its server.
+    """Return whether an object itself has all members of a protocol. Properties are not evaluated,
+    since a property of a remote agent may wait for its server.
     """
     return all(inspect.getattr_static(agent, name, None) is not None for name in members(protocol))
 
@@ -368,17 +371,18 @@ def is_marked(protocol: type, mark: type) -> bool:
 
 @cache
 def observation_arguments(protocol: type) -> Mapping[str, str]:
-    """Return which argument of the methods of a protocol is an observation.
+    """Return the argument that is an observation, for each method of a protocol.
 
     Args:
         protocol: The protocol.
 
     Returns:
-        The name of the argument that is annotated as `Obs`, by the name of the method; methods
-        without such an argument are left out.
+        The name of the argument that is annotated as `Obs`, by the name of the method, without the
+        methods that have no such argument.
 
     Raises:
-        TypeError: A method has several observations, or one in another value, such as a list.
+        TypeError: A method has several such arguments, or an argument that contains observations,
+            such as a list.
     """
     arguments = {}
     for name in members(protocol):
@@ -402,8 +406,8 @@ def observation_arguments(protocol: type) -> Mapping[str, str]:
 def bind(
     protocol: type, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]
 ) -> inspect.BoundArguments:
-    """Return the arguments of a call by the names that the protocol gives them; the first one is
-    `self`, with the value None.
+    """Bind the arguments of a call to the parameters of a method; the first parameter, `self`, is
+    None.
 
     Args:
         protocol: The protocol.
@@ -423,5 +427,5 @@ def _signature(protocol: type, name: str) -> inspect.Signature:
 
 
 def _contains_obs(hint: Any) -> bool:
-    """Return whether a type is `Obs`, or has it among its arguments, as `list[Obs]` does."""
+    """Return whether a type is `Obs` or contains it, as in `list[Obs]`."""
     return hint is Obs or any(_contains_obs(argument) for argument in get_args(hint))

@@ -1,9 +1,10 @@
 """The contracts of policies and of robots or environments, and their comparison.
 
-Both sides have a `Contract`: the inputs and the actions that a policy needs and returns, and those
-that a robot or an env provides and accepts. `require_match` compares them before the first step and
-lists every difference with its cure. A field that is None is not compared. Images are always
-upright RGB; the env of a simulator that renders upside down rotates them.
+Both sides have a `Contract`. A policy's contract describes the inputs that it needs and the actions
+that it returns; the contract of a robot or an env describes the inputs that it provides and the
+actions that it accepts. `require_match` compares them before the first step and lists every
+difference with its cure. A field that is None is not compared. Images are always upright RGB; the
+env of a simulator that renders upside down rotates them.
 """
 
 from __future__ import annotations
@@ -20,10 +21,9 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, ContractMismatch, MalformedMessage
 from vlagents_ray.naming import explain_unknown_fields
 
-# The combinations of the env's state parts are tried for a message if it has no more parts than
-# this.
+# Largest number of state parts of an env for which an error message searches combinations of parts.
 _MAX_STATE_PARTS = 12
-_SHOWN_COMBINATIONS = 3  # the number of combinations that a message lists
+_SHOWN_COMBINATIONS = 3  # largest number of combinations that a message lists
 
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
@@ -55,11 +55,11 @@ class ActionSpec:
 
     dim: int | None = None
     space: str | None = None  # the commanded quantity: "joint", "ee_position", "ee_pose", ...
-    delta: bool | None = None  # whether it is relative to the current pose, else absolute
+    delta: bool | None = None  # True: relative to the current pose; False: absolute
     rotation: Rotation | None = None  # the representation of a commanded rotation
     frame: str | None = None  # frame of a Cartesian command: "base", "tool"
     gripper_open: float | None = None  # the value that opens the gripper
-    gripper_closed: float | None = None  # the value that closes it
+    gripper_closed: float | None = None  # the value that closes the gripper
     low: float | None = None  # lower bound of every number
     high: float | None = None  # upper bound of every number
     # Names of several arms, in the order of their commands in a row; each command is followed by
@@ -71,14 +71,14 @@ class ActionSpec:
     @property
     def relative(self) -> bool | None:
         """Whether zeros command no motion (deltas, velocities) instead of a target pose; None if
-        that is not stated.
+        the contract does not specify it.
         """
         return True if self.delta or "velocity" in (self.space or "") else self.delta
 
     def gripper_columns(self, dim: int) -> list[int]:
-        """Return the columns of the grippers in an action: the last one of each arm's part.
+        """Return the columns of the grippers in an action: the last column of each arm's part.
 
-        A gripper's number is a position, also in relative actions.
+        A gripper's value is a position, even in relative actions.
 
         Args:
             dim: The number of values in an action.
@@ -102,14 +102,15 @@ class ActionSpec:
         return [(arm + 1) * width - 1 for arm in range(arms)]
 
     def delta_columns(self, dim: int) -> list[int]:
-        """Return the columns of an action that are deltas or velocities; raises as
-        `gripper_columns` does.
+        """Return the columns of an action that are deltas or velocities; raises the errors of
+        `gripper_columns`.
 
         Args:
             dim: The number of values in an action.
 
         Returns:
-            The columns in rising order: all but the grippers' if actions are relative, else none.
+            The columns in rising order: all columns except the grippers' if actions are relative,
+            else none.
         """
         if not self.relative:
             return []
@@ -120,10 +121,9 @@ class ActionSpec:
 @explain_unknown_fields()
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """The inputs and actions of a policy, or of a robot or env, to be compared with the other
-    side's.
+    """The inputs and actions of a policy, or those of a robot or env.
 
-    The comments at the fields describe the meaning for each side.
+    `require_match` compares both. The comments at the fields give the meaning for each side.
     """
 
     cameras: Mapping[str, CameraSpec] | None = None  # policy: needs; env: provides
@@ -144,7 +144,7 @@ class Contract:
         """
         values = asdict(self)
         if self.behaviour is None:
-            del values["behaviour"]  # only the contracts of policies for learners have it
+            del values["behaviour"]  # only policies for learners have this field
         if self.action.names is None:
             del values["action"]["names"]
 
@@ -200,7 +200,7 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
 
 
 def differences(policy: Contract, env: Contract) -> list[str]:
-    """List the differences between the contracts of a policy and an env, one sentence each with
+    """List the differences between the contracts of a policy and an env; each is a sentence with
     its cure.
     """
     sentences = [*_camera_differences(policy, env), *_state_differences(policy, env)]
@@ -260,7 +260,7 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
 
-    # If the policy needs a single part, that may be several of the env's, concatenated.
+    # A policy's only state part may be several parts of the env, concatenated.
     has_single_part = len(policy.state or {}) == 1 and not policy.gripper
     for name, needed in (policy.state or {}).items():
         provided = env.state.get(name)
@@ -286,8 +286,8 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
 
 
 def _parts_cure(dim: int | None, env: Contract) -> str:
-    """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are
-    none.
+    """Return a cure that names parts of the env's state whose sizes add up to `dim`; "" if there
+    are no such parts.
     """
     dims = {name: spec.dim for name, spec in (env.state or {}).items() if spec.dim}
     if env.gripper:
@@ -377,8 +377,8 @@ _ACTION_CURES = {
 
 
 def require_match(policy: Contract | None, env: Contract | None, where: str = "") -> None:
-    """Raise `ContractMismatch` with every difference of a policy and an env; `where` names both
-    in an evaluation.
+    """Raise `ContractMismatch` with every difference between a policy and an env. In an evaluation,
+    `where` is a prefix of the message that names the policy and the env.
     """
     if policy is None or env is None:
         return
@@ -394,9 +394,9 @@ def closed(
     where: str,
     error: type[MalformedMessage | ConfigError] = MalformedMessage,
 ) -> dict[str, Any]:
-    """Return the entries of `data`, which may only have fields of a dataclass.
+    """Return the entries of `data`, whose keys must be fields of a dataclass.
 
-    Fields that are numbers, texts or booleans are checked; the caller reads all others.
+    Numbers, texts and booleans are checked here; the caller checks values of other types.
 
     Args:
         cls: The dataclass.
@@ -406,7 +406,7 @@ def closed(
 
     Raises:
         MalformedMessage: `data` is not a mapping, has another key, or has a value of a wrong type;
-            it is of the class `error`.
+            the exception is of the class `error`.
     """
     if not isinstance(data, Mapping):
         raise error(f"{where}: expected an object, got {type(data).__name__}")

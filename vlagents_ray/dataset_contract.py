@@ -3,8 +3,8 @@ dataset.
 
 LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`,
 with which a policy normalises. So the contract is written to `info.json` for readers and also to
-`stats.json`, as a feature whose values are the bytes of the contract's JSON. It reaches the
-checkpoint with every version of LeRobot.
+`stats.json`, as a feature whose values are the bytes of the contract's JSON. Every version of
+LeRobot copies this feature into the checkpoint.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from vlagents_ray.errors import ConfigError, MalformedMessage
 
 INFO = "vlagents_ray"  # key in `info.json`
 TRACE = "trace"  # key in the `info.json` of a server's recordings
-CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame of a recording
+CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of a recording
 STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
-GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
-_JOINTS = "joints"  # the only part of `observation.state` if nothing else is known
+GRIPPER = "gripper"  # name of the state part that stands for `Obs.gripper`
+_JOINTS = "joints"  # name of `observation.state` if its parts are unknown
 Centre = float | tuple[float, float, float]  # centre of an angle, or of a rotation vector, rad
 _TURN = 2 * math.pi
 _USUAL = {"joints": "rad", "xyzrpy": "m+rad"}
@@ -123,8 +123,8 @@ class DatasetContract:
     def to_statistics(self, frames: int) -> dict[str, dict[str, list[int]]]:
         """Return the entry of `stats.json` with the contract, for a dataset of `frames` frames.
 
-        It has all statistics of a feature, since LeRobot's tools average them when they merge
-        datasets.
+        The entry has all statistics of a usual feature, since LeRobot's tools average these when
+        they merge datasets.
         """
         text = json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False)
         numbers = list(text.encode())
@@ -134,8 +134,8 @@ class DatasetContract:
 
     @classmethod
     def from_statistics(cls, numbers: Iterable[float]) -> DatasetContract:
-        """Read a contract from the numbers of `to_statistics` as LeRobot stores them; raises
-        `ConfigError`.
+        """Read a contract from the numbers that `to_statistics` returned and LeRobot stored; raises
+        `ConfigError` if they are invalid.
         """
         try:
             data = json.loads(bytes(round(number) for number in numbers))
@@ -153,8 +153,8 @@ def state_parts(
     Args:
         width: The number of values in `observation.state`.
         policy: The policy's contract, with the sizes of its parts.
-        chosen: The parts in their order, "gripper" for `Obs.gripper`; by default those of the
-            contract, or `joints`.
+        chosen: The parts in their order, "gripper" for `Obs.gripper`; by default the parts of the
+            contract, or else `joints`.
         option: The option that sets `chosen`, with an example, for the error message.
 
     Returns:
@@ -173,7 +173,8 @@ def state_parts(
         else:
             dims[name] = specs[name].dim if name in specs else None
 
-    # A single part of unknown size gets all numbers that are left, at least one.
+    # If a single part has an unknown size, its size is the number of remaining values, at least
+    # one.
     unknown = [name for name, dim in dims.items() if dim is None]
     remaining = width - sum(dim or 0 for dim in dims.values())
     if len(unknown) == 1:
@@ -190,8 +191,8 @@ def state_parts(
 
 
 def wanted_parts(policy: Contract | None) -> list[str]:
-    """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper`
-    last.
+    """Return the parts of the state that a policy's contract names, followed by "gripper" if the
+    policy needs `Obs.gripper`.
     """
     if policy is None:
         return []
@@ -229,8 +230,8 @@ def divided_state(
 
 
 def angles_in(name: str, unit: str | None, dim: int) -> range:
-    """Return the indices of the angles in a part of the state that wrap at -pi and pi, by the
-    part's unit.
+    """Return the indices of those angles in a part of the state that wrap at -pi and pi, according
+    to its unit.
 
     The numbers of a rotation vector (`rotation_vector_in`) and of a quaternion are not such angles.
     """
@@ -256,7 +257,9 @@ def rotation_vector_in(name: str, unit: str | None, dim: int) -> int | None:
 
 
 def usual_unit(name: str) -> str | None:
-    """Return the usual unit of a part with this name, for a dataset without a contract."""
+    """Return the usual unit of a state part with this name, for a dataset without a contract; None
+    if there is no usual unit.
+    """
     return next((unit for end, unit in _USUAL.items() if name.endswith(end)), None)
 
 
@@ -273,12 +276,12 @@ def centre_between(lowest: float, highest: float) -> float | None:
 
 
 def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
-    """Return the centre around which to wrap an angle, (N,) rad in each episode: opposite to the
-    widest empty arc.
+    """Return the centre around which to wrap an angle, rad: the point opposite to the middle of the
+    widest arc without values.
 
     Returns:
-        The centre; None if the angle never jumps, within an episode or from one to the next, or if
-        it counts full turns.
+        The centre; None if the angle never jumps, within an episode or between episodes, or if its
+        values exceed pi because it counts full turns.
     """
     values = np.concatenate(episodes).astype(np.float64)
     if (
@@ -302,8 +305,8 @@ def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, fl
         episodes: The rotation vector in each episode, (N, 3) rad.
 
     Returns:
-        The centre, at most pi long; None if the vector never jumps, within an episode or from one
-        to the next, or if its length counts full turns.
+        The centre, at most pi long; None if the vector never jumps, within an episode or between
+        episodes, or if its length counts full turns.
     """
     vectors = np.concatenate(episodes).astype(np.float64)
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -321,7 +324,7 @@ def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, fl
 
 
 def _centre(value: Any) -> Centre:
-    """Read the centre of an angle or a rotation vector."""
+    """Read the centre of an angle or a rotation vector from JSON."""
     if not isinstance(value, list):
         return float(value)
     x, y, z = map(float, value)
@@ -329,11 +332,11 @@ def _centre(value: Any) -> Centre:
 
 
 def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Replace rotation vectors by those of the same rotations that are nearest to `centre`, (...,
-    3) each.
+    """Return equivalent rotation vectors, (..., 3), each the one nearest to `centre` of all that
+    describe its rotation.
 
     Adding full turns to the angle about the same axis gives the same rotation. Vectors that are
-    already the nearest stay bit-identical, and a zero vector, which has no axis, stays zero.
+    already nearest stay bit-identical, and a zero vector, which has no axis, stays zero.
     """
     angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axes = np.divide(vectors, angles, out=np.zeros_like(vectors), where=angles > 0)
@@ -342,7 +345,7 @@ def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def _near(angles: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
-    """Shift angles by full turns to within pi of `centre`; angles already within stay
+    """Shift angles by full turns to within pi of `centre`; angles already within that range stay
     bit-identical.
     """
     off = angles - centre

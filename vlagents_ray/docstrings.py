@@ -1,4 +1,4 @@
-"""Texts that are taken from docstrings."""
+"""Extraction of texts from docstrings."""
 
 from __future__ import annotations
 

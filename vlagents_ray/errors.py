@@ -16,8 +16,8 @@
     └── EnvFailed, StorageFailed, ClusterLost, MissingDependency (also ImportError)
 
 `code` is stable: by default the name of the class, "unknown_session" of `UnknownSession`. A server
-sends it in a problem+json document, with `status` as the HTTP status. A message states the received
-and the expected value, and the cure.
+sends it in a problem+json document, with `status` as the HTTP status. A message contains the
+expected and the received value, and the cure.
 """
 
 from __future__ import annotations
@@ -27,15 +27,14 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import ClassVar, Literal
 
-_SHOWN_ITEMS = 8  # the maximum number of items of a list or dict that an error shows
-_SHOWN_LEVELS = 3  # the maximum depth of lists and dicts that an error shows
+_SHOWN_ITEMS = 8  # maximum number of items of a list or dict that an error shows
+_SHOWN_LEVELS = 3  # maximum depth of lists and dicts that an error shows
 
 
 def shown(value: object, max_characters: int = 80) -> str:
-    """Return a text of at most `max_characters` of a value from the network, for an error.
-
-    Its time and memory do not depend on the size of the value, whereas `repr` or `str` would write
-    all of it first.
+    """Return a text of at most `max_characters` that shows a value from the network in an error
+    message. The time and memory of this call do not depend on the size of the value, whereas `repr`
+    or `str` would first write the whole value.
     """
     text = _shown(value, max_characters, _SHOWN_LEVELS)
     return text if len(text) <= max_characters else f"{text[: max_characters - 1]}…"
@@ -74,11 +73,11 @@ def _shown(value: object, max_characters: int, levels: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text of another party without characters that command a terminal or forge a line of
-    a log.
+    """Return a text from another party without characters that control a terminal or forge a line
+    of a log.
 
     Control and format characters, such as escape sequences, become "�". Line feeds and tabs stay,
-    but each further line is indented, so that it cannot pass for a record of its own.
+    but all lines after the first are indented, so that none can be mistaken for a log record.
     """
     if text.isprintable():
         return text
@@ -99,8 +98,8 @@ class VLAgentsError(Exception):
     status: ClassVar[int] = 500
 
     def __str__(self) -> str:
-        """Return the message without control characters, as parts of it may come from a server
-        or a client.
+        """Return the message without control characters, since a server or a client may have sent
+        parts of the message.
         """
         return printable(super().__str__())
 
@@ -161,7 +160,7 @@ class NotOffered(InvalidObservation):
 
 
 class UnknownSession(InvalidInput):
-    """The session expired, was closed, was on a replica that has ended, or was never reset."""
+    """The session has expired, was closed, was never reset, or was on a stopped replica."""
 
     status = 404
 
@@ -199,22 +198,20 @@ class InvalidWeights(InvalidInput):
 
 
 class UnchangedWeights(InvalidInput):
-    """Pushed weights equal those that the policy holds, so that probably the wrong ones were
-    pushed.
-    """
+    """Pushed weights equal the policy's present weights: probably the wrong ones were pushed."""
 
     status = 409
 
 
 class NotTrainable(InvalidInput):
-    """The policy names no parameters that could be replaced while it is served."""
+    """The policy has no parameters that can be replaced while it is served."""
 
     status = 409
 
 
 class WeightsNotStaged(InvalidInput):
-    """The version of weights to be served was never staged here, or was dropped since its
-    learner was silent.
+    """The requested version of the weights was never staged on this replica, or was dropped because
+    its learner sent nothing for too long.
     """
 
     status = 409
@@ -233,14 +230,14 @@ class Forbidden(InvalidInput):
 
 
 class TooManyRequests(VLAgentsError):
-    """The requests or sessions of the API key exceed its limits; the request was not executed."""
+    """The requests or sessions of an API key exceed its limits; the request was not executed."""
 
     status = 429
     retry_after_s: float = 1.0  # seconds until the next request is accepted
 
 
 class Overloaded(VLAgentsError):
-    """The replica has no memory left for the request, which was not executed: send it again
+    """The replica has no memory left for the request. The request was not executed; send it again
     later.
     """
 
@@ -267,8 +264,8 @@ class InvalidAction(PolicyFailed):
 
 
 class CheckpointFailed(PolicyFailed):
-    """The checkpoint named in a reset did not load; others keep working, and the next reset
-    tries to load it again.
+    """The checkpoint named in a reset did not load. Other checkpoints still work, and the next
+    reset that names this one tries to load it again.
     """
 
 
@@ -284,7 +281,7 @@ class NoReplica(PolicyUnavailable):
     """No replica of the application runs: its policy is loading or waits for resources, or the last
     replica died.
 
-    Clients raise it also if nothing accepts connections at the server's address.
+    Clients also raise this error if nothing accepts connections at the server's address.
     """
 
 
@@ -301,7 +298,9 @@ class DeadlineExceeded(VLAgentsError, TimeoutError):
 
 
 class OutcomeUnknown(DeadlineExceeded):
-    """The deadline passed during inference: the session has taken the step, or is about to."""
+    """The deadline passed during inference: the policy has computed the session's action, or is
+    about to.
+    """
 
 
 class ConfigError(VLAgentsError, ValueError):
@@ -311,8 +310,8 @@ class ConfigError(VLAgentsError, ValueError):
 
 
 class WeightsLost(ConfigError):
-    """The policy acts with other weights than the learner's: it was restarted since the push, or
-    not pushed to.
+    """The policy's weights are not the learner's: the policy was restarted after the push, or the
+    push did not reach it.
     """
 
 
@@ -333,8 +332,8 @@ class EnvFailed(VLAgentsError):
 
 
 class StorageFailed(VLAgentsError):
-    """Results cannot be written, e.g. to a full disk or a read-only folder; results written
-    before are kept.
+    """Results cannot be written, e.g. because the disk is full or the folder is read-only; earlier
+    results are kept.
     """
 
 

@@ -1,7 +1,7 @@
 """Obs, Act and Agent: the interface of the paper "VLAgents: A Policy Server for Efficient VLA
 Inference".
 
-A policy written as in the paper is served unchanged to many sessions at once:
+The server runs a policy that is written as in the paper for many sessions at once:
 
     class Reach(Agent):
         def initialize(self):                 # called once in each replica: load the weights here
@@ -34,59 +34,67 @@ if TYPE_CHECKING:
 
     from vlagents_ray.contract import Contract
 
-# The keys of `Obs.info` and `Act.info` that have a meaning here; others are also allowed, with
-# values of the types that `Obs.info` names.
+# The keys of `Obs.info` and `Act.info` that this package interprets. Other keys are also allowed,
+# with values of the types listed at `Obs.info`.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
-# In an observation: the number of samples of its action distribution to return, N.
+# In an observation: N, the number of samples from the policy's action distribution that the Act
+# returns.
 SAMPLES = "samples"
 # In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32. For each name
-# of WANT, it also has the value for every sample, with N as the first dimension.
+# in WANT, the dict also has an array with the value of every sample, whose first dimension is N.
 DISTRIBUTION = "distribution"
-# In an observation: names of `Contract.behaviour` whose values the Act returns with the action.
+# In an observation: names from `Contract.behaviour`; the Act returns their values with the action.
 WANT = "want"
-# In the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats.
+# In the Act: {name: a number, or a number for each row or token}, e.g. the action's "logprob",
+# nats.
 BEHAVIOUR = "behaviour"
-# In an observation: the time at which its first sensor was read, s since 1970 (`time.time`).
+# In an observation: the time at which the first of its sensors was read, s since 1970
+# (`time.time`).
 CAPTURED = "captured_at"
 # In an observation: the time after which `RemoteAgent` abandons the request, ms.
 DEADLINE = "deadline_ms"
-# The next two are in an observation for real-time chunking (Black, Galliker & Levine 2025,
-# https://arxiv.org/abs/2506.07339). When the answer arrives, DELAY rows of LEFTOVER have been
-# executed; the new chunk begins with them, and continues the other rows of LEFTOVER.
-LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this observation's tick on
-# int: the expected number of ticks until the answer arrives, at most the rows of LEFTOVER. It is 0
-# if the number is unknown.
+# The next two keys are in an observation for real-time chunking (Black, Galliker & Levine 2025,
+# https://arxiv.org/abs/2506.07339). When the answer arrives, the first DELAY rows of LEFTOVER have
+# been executed. The new chunk begins with these rows, and is computed to continue the other rows of
+# LEFTOVER.
+LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan, from this observation's tick
+# int: the expected number of ticks until the answer arrives, at most the number of rows of
+# LEFTOVER; 0 if unknown.
 DELAY = "delay_ticks"
-# The next three are in the observations of a robot with a planner (`vlagents_ray.robot.planner`).
+# The next three keys are in the observations of a robot with a planner
+# (`vlagents_ray.robot.planner`).
 GOAL = "goal"  # (D,) float32: the action of the planner's newest answer, such as a pose to reach
-# str: what the robot is to do until the planner's next answer; in the Act of a planner as well.
+# str: the task of the robot until the planner's next answer; this key is also in the Act of a
+# planner.
 SUBTASK = "subtask"
 # float: the time since the observation from which the planner computed its newest answer, ms.
 SUBTASK_AGE = "subtask_age_ms"
-# In an observation, float: the time from the request's arrival for which the server may take to
-# send its answer, ms. A robot that has no rows left states 0.
+# In an observation, float: the time that the server may take to answer, from the arrival of the
+# request, ms. It is 0 if the robot has no rows left.
 SLACK = "slack_ms"
-# In an observation, [int, int]: the ticks since the last request at which the policy was to act,
-# and those of them without a row of an answer (starved ticks).
+# In an observation, [int, int]: the number of ticks since the last request at which the robot
+# needed an action of the policy, and the number of these ticks without one (starved ticks).
 TICKS = "ticks"
-# In an observation, float: the age of the action of the policy that was executed last, ms; absent
-# if there was none since the last request.
+# In an observation, float: the age of the last executed action of the policy, ms; absent if none
+# was executed since the last request.
 EXECUTED_AGE = "executed_age_ms"
-# In an observation, bool: whether another model has a session of the same robot, which counts it.
+# In an observation, bool: whether the same robot also has a session with another model, and is
+# counted there.
 FURTHER_MODEL = "further_model"
-# In the Act of a server that is under load, float: the time from its answer until the next request
-# of this robot is useful, ms.
+# In the Act of a server under load, float: how long the robot should wait after this answer before
+# its next request, ms.
 REPLAN = "replan_ms"
-# An option of `reset`: what the robot needs, as `vlagents_ray.slo.Slo.to_json`. In the info that
-# `reset` returns: {"load": float, "in_time": bool, "reason": str, if it is not in time}.
+# An option of `reset`: the robot's service level objective, as `vlagents_ray.slo.Slo.to_json`
+# returns it. In the info that `reset` returns: {"load": float, "in_time": bool}, and "reason", a
+# str, if `in_time` is False.
 SLO = "slo"
-# In the Act of a policy that was trained to continue given rows, an int: the number of rows of
-# LEFTOVER with which its chunk begins. If more rows have been executed when the chunk arrives, it
-# continues from a pose that the robot has left, and is dropped.
+# In the Act of a policy that was trained to continue given rows, int: the number of rows of
+# LEFTOVER with which its chunk begins. If the robot has executed more rows when the chunk arrives,
+# the chunk is dropped, since it continues from a pose that the robot has left.
 GIVEN = "given_rows"
-# In an observation, (N, D): the actions executed since the last request that the policy did not
-# choose.
+# In an observation, (N, D): the actions since the last request that the robot executed and that the
+# policy did not choose.
 EXECUTED = "executed_actions"
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the
 # loaded checkpoint.
@@ -94,20 +102,22 @@ POLICY = "policy"
 # The next keys are in the Act of a chunk player.
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 CAUSE = "safe_cause"  # str: the kind of that reason, see `vlagents_ray.chunking.fallback.Cause`
-INTERVENTION = "intervention"  # True for an operator's action, else absent
-WANTED = "policy_action"  # (D,) float32: the policy's action at an operator's; absent if unknown
+INTERVENTION = "intervention"  # True if the action is an operator's, else absent
+# (D,) float32: the policy's action that an operator's action replaced; absent if unknown.
+WANTED = "policy_action"
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
-PLANNED = "planned"  # (H, D) float32: the chunk of the action
-CHUNK, ROW = "chunk", "row"  # int: the chunk's number in the episode, and the row of the action
+PLANNED = "planned"  # (H, D) float32: the chunk that contains the action
+# int: the number of that chunk in the episode, and the index of the action's row.
+CHUNK, ROW = "chunk", "row"
 # float: the age of the observation in ms, from its capture until the player returned the action.
 AGE_MS = "age_ms"
-# float: seconds since the oldest unanswered request was sent first; 0.0 if there is none.
+# float: seconds since the oldest unanswered request was first sent; 0.0 if all are answered.
 SILENT = "silent_s"
-# bool: whether an answer of the policy had a row for this tick; absent if the policy was not to act
-# (see `vlagents_ray.chunking.timeliness`).
+# bool: whether an answer of the policy had a row for this tick; absent if the robot needed no
+# action of the policy (see `vlagents_ray.chunking.timeliness`).
 IN_TIME = "in_time"
 OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT, IN_TIME)
-"""The names of `Act.info` that only a chunk player on the robot writes, and that a control loop
+"""The keys of `Act.info` that only a chunk player on the robot writes, and that a control loop
 reads.
 """
 
@@ -116,10 +126,10 @@ reads.
 class Obs:
     """An observation: the sensor readings of a robot or an environment at one moment.
 
-    `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and
-    rad in the robot's base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms
-    prefixes them: `left/joints`, `right/joints`. With one camera: `Obs(cameras={"front": image},
-    gripper=1.0, state={"joints": joints})`.
+    `state` contains the parts of the proprioception by name: `joints` (D,) rad; `xyzrpy` (6,) m and
+    rad in the robot's base frame; `tquat` (7,) m and quaternion xyzw. If a robot has several arms,
+    the names have a prefix: `left/joints`, `right/joints`. With one camera: `Obs(cameras={"front":
+    image}, gripper=1.0, state={"joints": joints})`.
     """
 
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
@@ -127,7 +137,7 @@ class Obs:
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
     # The values are None, bool, int, float, str, bytes, arrays, or lists and dicts of these.
     info: dict[str, Any] = field(default_factory=dict)
-    # The server's result of `Prepares.prepare` (`vlagents_ray.abilities`), or None.
+    # The result of `Prepares.prepare` (`vlagents_ray.abilities`), which a server sets; or None.
     prepared: Any = field(default=None, repr=False, compare=False)
 
 
@@ -155,13 +165,12 @@ class Agent:
     """
 
     Config: ClassVar[type | None] = None
-    """Optional: a pydantic model of the settings with `extra="forbid"`, whose instance is passed
-    to `__init__`.
+    """Optional: a pydantic model of the settings, with `extra="forbid"`; `__init__` receives an
+    instance of it.
     """
 
     shared: ClassVar[tuple[str, ...]] = ()
-    """Names of the attributes that all sessions of a replica share (weights, processors,
-    clients).
+    """Names of the attributes (weights, processors, clients) that all sessions of a replica share.
     """
 
     @classmethod
@@ -187,8 +196,8 @@ class Agent:
             raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:
-        """Return the objects that `shared` names; an agent that wraps another one adds that
-        agent's objects.
+        """Return the objects that `shared` names; an agent that wraps another agent adds the other
+        agent's shared objects.
         """
         return [getattr(self, name, None) for name in dict.fromkeys(self.shared)]
 
@@ -200,21 +209,21 @@ class Agent:
         return None
 
     def initialize(self) -> None:
-        """Load the weights and everything else that takes long; called once in a replica, before
-        any `reset`.
+        """Load the weights and do all other slow preparation; a server calls this once in each
+        replica, before any `reset`.
         """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode.
 
-        A server calls this on a fresh copy of the initialized agent, so no state of an earlier
-        episode is left.
+        A server calls this on a fresh copy of the initialized agent, which contains no state of an
+        earlier episode.
 
         Args:
             obs: The first observation of the episode.
             instruction: The task in words; None if it has none.
-            kwargs: Options: `seed` (int), of the session's random generator; from an evaluation
-                also `env`, its name.
+            kwargs: Options: `seed` (int) is the seed of the session's random generator. An
+                evaluation also passes `env`, the name of its environment.
 
         Returns:
             Information about the episode, with values of the types that `Obs.info` may have; often
@@ -225,8 +234,8 @@ class Agent:
     def act(self, obs: Obs) -> Act:
         """Compute an action, or a chunk of actions.
 
-        An agent defines this, or `act_batch`, which the default implementation calls with a batch
-        of one.
+        An agent defines this method or `act_batch`. The default implementation calls `act_batch`
+        with a batch of one.
 
         Args:
             obs: The observation to act on; it must not be changed.
@@ -257,9 +266,9 @@ class Agent:
                 random generator; `obs[i]` belongs to `sessions[i]`, and no session occurs twice.
 
         Returns:
-            One action, or chunk of actions, for each session, in their order. An exception in the
-            place of an action fails the request of that session alone; an exception that is raised
-            fails the whole batch.
+            One action, or chunk of actions, for each session, in their order. If the list contains
+            an exception in place of an action, only the request of that session fails; if an
+            exception is raised, the whole batch fails.
         """
         acts: list[Act | Exception] = []
         for session, session_obs in zip(sessions, obs, strict=True):
@@ -282,7 +291,7 @@ class Agent:
 
 
 class TrainableAgent(Agent):
-    """An agent whose weights a learner trains, so that new ones can be pushed into a server.
+    """An agent whose weights a learner trains and pushes into a running server.
 
     A subclass names the attribute with the weights; see `vlagents_ray.abilities.Trainable`.
     """
@@ -291,7 +300,7 @@ class TrainableAgent(Agent):
     """The name of the attribute that a learner trains.
 
     It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all
-    sessions. "a.b" is the attribute b of the attribute a, which is then shared as a whole.
+    sessions. "a.b" is the attribute b of the attribute a; all of a is then shared.
     """
 
     def shared_objects(self) -> list[Any]:
@@ -310,23 +319,24 @@ class TrainableAgent(Agent):
         joined with "/".
 
         Raises:
-            NotTrainable: The agent has none, i.e. `trainable` is None.
+            NotTrainable: The agent has no trainable parameters, i.e. `trainable` is None.
         """
         return named_values(self._trainable())
 
     def load_parameters(self, values: Mapping[str, Any]) -> None:
-        """Act with these values from now on; a server calls this between two batches.
+        """Replace the parameters, for all later actions; a server calls this between two batches.
 
-        It replaces the values in `trainable` by reference, and copies those on a GPU to the
-        addresses of the old ones, so that CUDA graphs stay valid. An agent that derives other
-        values from its parameters overrides this, computes them again, and calls this method.
+        It replaces the values in `trainable` by reference. Values on a GPU are copied to the
+        addresses of the old values instead, so that CUDA graphs stay valid. An agent that derives
+        other values from its parameters must override this method, call it, and compute the derived
+        values again.
 
         Args:
             values: A value for each name of `parameters`, of the same shape, type and device. They
                 have been checked, and do not change later; the agent must not change them either.
 
         Raises:
-            NotTrainable: The agent has none, i.e. `trainable` is None.
+            NotTrainable: The agent has no trainable parameters, i.e. `trainable` is None.
         """
         set_values(self._trainable(), values)
 
@@ -345,8 +355,8 @@ class TrainableAgent(Agent):
 
 
 def copied(obs: Obs) -> Obs:
-    """Copy an observation with its arrays, since a caller may write the next observation into
-    the same memory.
+    """Copy an observation with its arrays, since a caller may reuse their memory for the next
+    observation.
     """
     return Obs(
         {name: np.array(image) for name, image in obs.cameras.items()},
@@ -357,7 +367,7 @@ def copied(obs: Obs) -> Obs:
 
 
 def _copied(value: Any) -> Any:
-    """Copy arrays at any depth: `DEPTH` has one for each camera."""
+    """Copy arrays at any depth of dicts and lists, such as the array of each camera in `DEPTH`."""
     if isinstance(value, np.ndarray):
         return np.array(value)
     if isinstance(value, dict):

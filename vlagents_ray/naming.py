@@ -1,4 +1,4 @@
-"""Distinct names for files and in JSON objects, and suggestions for misspelt names."""
+"""Distinct names of files and of keys in JSON objects, and suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ T = TypeVar("T")
 
 
 def plain(name: str) -> str:
-    """Return `name` as a part of a file's name: "maniskill/PushCube-v1" ->
-    "maniskill_PushCube-v1"; "pi0@20" stays.
+    """Return `name` in a form that is valid in a file's name: "maniskill/PushCube-v1" ->
+    "maniskill_PushCube-v1"; "pi0@20" is unchanged.
     """
     return re.sub(r"[^\w.@-]+", "_", name)
 
 
 def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> dict[str, str]:
-    """Simplify names, and append numbers if two of them would become the same, whatever their
-    order.
+    """Simplify names with `plain`, and append numbers to names that would become equal,
+    independently of their order.
 
-    "left/wrist" becomes "left_wrist"; beside a "left_wrist", which keeps its name, it becomes
-    "left_wrist_2".
+    "left/wrist" becomes "left_wrist", or "left_wrist_2" if another name is "left_wrist", which is
+    not changed.
     """
-    # Names that simplification does not change come first, and so keep their names.
+    # Names that simplification does not change come first, so that they are kept.
     in_order = sorted(set(names), key=lambda name: (simplify(name) != name, name))
 
     simplified: dict[str, str] = {}
@@ -40,8 +40,8 @@ def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> di
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Suggest a known name as the end of a message, "; did you mean 'scripted'?"; "" if none is
-    similar to `name`.
+    """Return a suggestion for the end of a message, such as "; did you mean 'scripted'?"; "" if no
+    known name is similar to `name`.
     """
     by_lower = {known_name.lower(): known_name for known_name in known}
     close = difflib.get_close_matches(name.lower(), by_lower, n=1)
@@ -54,18 +54,19 @@ def without_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """
     values = dict(pairs)
     if len(values) < len(pairs):
-        # The search takes linear time, since a stranger may have chosen the keys.
+        # The search takes linear time even if an attacker has chosen the keys.
         [(repeated_key, _)] = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"the key {repeated_key[:80]!r} occurs twice in one object")
     return values
 
 
 def explain_unknown_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
-    """Return a decorator of dataclasses: the error for an unknown field lists the known ones.
+    """Return a decorator for dataclasses, which lists the known fields in the error for an unknown
+    field.
 
     Args:
-        hint: The end of that message if no known field is similar, such as where other settings
-            are.
+        hint: The end of that message if no known field is similar, such as a pointer to other
+            settings.
     """
 
     def decorate(cls: type[T]) -> type[T]:

@@ -1,5 +1,5 @@
-"""Changes of settings on a command line, in the notation of OmegaConf and Hydra, and files that are
-found by their names in a folder.
+"""Changes of settings on a command line, in the notation of OmegaConf and Hydra, and a search for
+files by name in a folder.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from vlagents_ray.yaml_text import load_yaml, read_yaml
 YAML_SUFFIXES = (".yaml", ".yml")
 
 _NOTATION = "KEY=VALUE, +KEY=VALUE or ~KEY, as in batch.max_size=8"
-# A value that begins so and is not YAML is an unfinished list, mapping or quotation, not a text.
+# A value that begins with one of these characters and is not YAML is an unfinished list, mapping or
+# quotation, not plain text.
 _YAML_BEGINNINGS = ("[", "{", '"', "'")
 
 
@@ -27,13 +28,13 @@ class Override:
 
     option: str  # the option that contains the change, for errors
     text: str  # the change as it was written, for errors
-    # "set" changes a value or adds it, "add" only adds one, "remove" only removes one.
+    # "set" changes or adds a value, "add" adds a new value, "remove" removes a value.
     change: Literal["set", "add", "remove"]
-    path: tuple[str, ...]  # keys of mappings, and numbers of entries of lists
+    path: tuple[str, ...]  # keys of mappings and indices of lists
     value: Any = None
 
     def below(self, *path: str) -> Override:
-        """Return the same change of the mapping at `path`."""
+        """Return this change with `path` put before its keys."""
         return replace(self, path=(*path, *self.path))
 
     def error(self, message: str) -> ConfigError:
@@ -45,11 +46,11 @@ def parse_overrides(texts: Iterable[str], option: str) -> list[Override]:
     """Parse changes of settings.
 
     Args:
-        texts: The changes. `a.b=1` sets a value, `a.0.b=1` one in the first entry of a list,
-            `+a.b=1` adds a new one, `+a.2=x` appends to a list of two entries, and `~a.b` removes
-            one. `++a.b=1` is `a.b=1`, as in Hydra. A value is YAML, such as `[1, 2]` or `true`; a
-            value that is not YAML, such as `@handle`, is text, unless it begins like a list, a
-            mapping or a quotation.
+        texts: The changes. `a.b=1` sets a value, `a.0.b=1` sets a value in the first entry of a
+            list, `+a.b=1` adds a new value, `+a.2=x` appends to a list of two entries, and `~a.b`
+            removes a value. `++a.b=1` is `a.b=1`, as in Hydra. A value is YAML, such as `[1, 2]` or
+            `true`; a value that is not YAML, such as `@handle`, is text, unless it begins like a
+            list, a mapping or a quotation.
         option: The name of the option, for errors.
 
     Returns:
@@ -93,7 +94,7 @@ def _parse_value(text: str, key: str, option: str) -> Any:
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
-    """Return the settings that changes of an empty document make.
+    """Return the settings that result from applying changes to an empty document.
 
     Args:
         texts: The changes, see `parse_overrides`.
@@ -113,14 +114,14 @@ def with_overrides(document: dict[str, Any], overrides: Iterable[Override]) -> d
 
     Args:
         document: The document, such as the content of a YAML file.
-        overrides: The changes, which are made in order.
+        overrides: The changes, which are applied in order.
 
     Returns:
         The changed document.
 
     Raises:
-        ConfigError: A change adds a value that exists, removes one that does not, or goes below a
-            value that is neither a mapping nor a list.
+        ConfigError: A change adds a value that exists, removes a value that does not exist, or
+            names a key below a value that is neither a mapping nor a list.
     """
     changed = copy.deepcopy(document)
     for override in overrides:
@@ -129,7 +130,7 @@ def with_overrides(document: dict[str, Any], overrides: Iterable[Override]) -> d
 
 
 def _apply(document: dict[str, Any], override: Override) -> None:
-    """Make one change in a document."""
+    """Apply one change to a document."""
     section: Any = document
     for depth, name in enumerate(override.path[:-1]):
         key = _key_in(section, name, override)
@@ -143,7 +144,8 @@ def _apply(document: dict[str, Any], override: Override) -> None:
         section = section[key]
         if not isinstance(section, dict | list):
             raise override.error(
-                f"{next_name!r} goes below {name!r}, which has a value already: {shown(section)}"
+                f"expected a mapping or a list at {name!r}, to set {next_name!r} in it, got "
+                f"{shown(section)}"
             )
 
     name = override.path[-1]
@@ -167,10 +169,10 @@ def _key_in(section: dict[Any, Any] | list[Any], name: str, override: Override) 
     """Return the key of a mapping, or the number of an entry of a list, that a name denotes.
 
     Raises:
-        ConfigError: The name is not a number, in a list.
+        ConfigError: The section is a list, and the name is not a number.
     """
     if isinstance(section, dict):
-        # YAML reads the key of `8: 25.0` as a number.
+        # The key may be a number, as in the YAML `8: 25.0`.
         for key in section:
             if str(key) == name:
                 return key
@@ -185,7 +187,7 @@ def _key_in(section: dict[Any, Any] | list[Any], name: str, override: Override) 
 
 
 def _is_absent(section: dict[Any, Any] | list[Any], key: Any) -> bool:
-    """Return whether a mapping lacks a key, or a list an entry with this number."""
+    """Return whether a mapping lacks a key, or a list lacks an entry with this index."""
     if isinstance(section, dict):
         return key not in section
     return bool(key >= len(section))
@@ -210,38 +212,39 @@ def _insert(section: dict[Any, Any] | list[Any], key: Any, value: Any, override:
 
 
 def _missing(section: dict[Any, Any] | list[Any], name: str, override: Override) -> ConfigError:
-    """Return the error for a key or entry that cannot be removed, as it does not exist."""
+    """Return the error for a key or entry that cannot be removed because it does not exist."""
     if isinstance(section, list):
         return override.error(
             f"expected the number of an entry of a list, {_numbers(section)}, got {name}"
         )
     keys = [str(key) for key in section]
     return override.error(
-        f"expected a key that is set, {keys or 'of which there is none'}, got {name!r}"
+        f"expected an existing key, {keys or 'but there is none'}, got {name!r}"
         f"{did_you_mean(name, keys) or '; leave the change out'}"
     )
 
 
 def _numbers(section: list[Any]) -> str:
-    """Return the numbers of a list's entries in words."""
+    """Return the range of a list's indices in words."""
     return f"0 to {len(section) - 1}" if section else "which is empty"
 
 
 def find_file(source: str, folder: Path | None, *, others: Collection[str] = ()) -> str:
-    """Return the path of a file that is named without its folder.
+    """Return the path of a file, which may be named without its folder and suffix.
 
     Args:
-        source: A path; the name of a file in `folder`, with or without its suffix; or another
-            source, such as the name of a policy.
+        source: A path; the name of a file in `folder`, with or without its suffix; or something
+            else, such as the name of a policy.
         folder: The folder in which files are searched; None searches none.
-        others: Names that `source` may be in place of a file. A file of the same name has priority.
+        others: Names that are not files, which `source` may also be. A file of the same name has
+            priority.
 
     Returns:
-        The path of the file; `source` if there is no folder, if it exists as it is, if it is one
-        of `others`, or if it is a URL or "module:Class".
+        The path of the file. The result is `source` itself if there is no folder, or if `source` is
+        an existing path, one of `others`, a URL or "module:Class".
 
     Raises:
-        ConfigError: The folder does not exist, or has no such file.
+        ConfigError: The folder does not exist, or contains no such file.
     """
     if folder is None or Path(source).is_file():
         return source
@@ -274,12 +277,12 @@ def read_config_file(
     overrides: Iterable[Override] = (),
     cure: str = "; check the path",
 ) -> dict[str, Any]:
-    """Read a YAML file of settings, and change it.
+    """Read a YAML file of settings, and apply changes to its content.
 
     Args:
         file: The file.
         noun: What the file is, for errors, such as "run file".
-        keys: Keys that such a file has, for errors, such as "`policies` and `suites`".
+        keys: The usual keys of such a file, for errors, such as "`policies` and `suites`".
         overrides: The changes.
         cure: The end of the error for a missing file if no file has a similar name.
 
@@ -287,7 +290,7 @@ def read_config_file(
         The settings.
 
     Raises:
-        ConfigError: The file does not exist, is not a mapping, or cannot be changed so.
+        ConfigError: The file does not exist or is not a mapping, or a change is not possible.
     """
     path = Path(file)
     if path.is_dir():

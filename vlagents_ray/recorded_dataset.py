@@ -1,6 +1,4 @@
-"""The reader of LeRobotDatasets v2.0 to v3.0: recordings of servers and robots, and public
-datasets.
-"""
+"""Reader of LeRobotDatasets v2.0 to v3.0: recordings of servers and robots, and public datasets."""
 
 from __future__ import annotations
 
@@ -46,25 +44,25 @@ _IMAGE_DTYPES = ("video", "image")
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """The policy's names for the cameras and the state of a dataset that has no contract."""
+    """The policy's names of the cameras and the state parts in a dataset without a contract."""
 
-    # The policy's camera -> the camera or feature of the dataset.
+    # Name of the policy's camera -> camera or feature of the dataset.
     cameras: Mapping[str, str] = field(default_factory=dict)
-    # The names of the values that `observation.state` concatenates; "gripper" is `Obs.gripper`.
+    # Names of the parts that `observation.state` concatenates; "gripper" is `Obs.gripper`.
     state: Sequence[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedStep:
-    """A frame of an episode."""
+    """One frame of an episode."""
 
     frame: int
     obs: Obs
-    # (H, D): the recorded answer, or the actions from here to the end of the episode.
+    # (H, D): the recorded answer, or else the actions from this frame to the end of the episode.
     expected: np.ndarray
     intervention: bool = False  # whether the operator chose the recorded action
     captured_at: float | None = None  # s since 1970; None if the dataset does not contain it
-    # The images that the dataset contains as JPEG or PNG files, by camera; others are in videos.
+    # JPEG or PNG files of the cameras whose images the dataset contains as files, not as videos.
     image_files: Mapping[str, bytes] = field(default_factory=dict)
 
 
@@ -76,7 +74,7 @@ class RecordedEpisode:
     index: int
     length: int
     instruction: str
-    metadata: Mapping[str, Any]  # its row in `meta/episodes`
+    metadata: Mapping[str, Any]  # row of the episode in `meta/episodes`
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +86,7 @@ class RecordedSession:
 
 
 class RecordedDataset:
-    """A LeRobotDataset on disk, which is only read."""
+    """A LeRobotDataset on disk, opened for reading."""
 
     def __init__(self, root: Path) -> None:
         """Open a dataset.
@@ -171,7 +169,7 @@ class RecordedDataset:
         return sessions
 
     def gaps(self, episode: RecordedEpisode) -> int:
-        """Return the number of calls that are missing within a traced episode."""
+        """Return the number of calls that are missing within an episode of a server's recording."""
         if not self.traced:
             return 0
         ticks = np.array(self.columns(episode, ["tick"])["tick"])
@@ -180,7 +178,7 @@ class RecordedDataset:
     def steps(
         self, episode: RecordedEpisode, names: Names, policy: Contract | None
     ) -> Iterator[RecordedStep]:
-        """Yield the frames of an episode, with the input names of a policy.
+        """Yield the frames of an episode, with the policy's names of cameras and state parts.
 
         Args:
             episode: An episode of this dataset.
@@ -230,7 +228,8 @@ class RecordedDataset:
                 expected = chunk[: columns[ROWS][i]]
 
             intervention = INTERVENTION_COLUMN in columns and bool(columns[INTERVENTION_COLUMN][i])
-            # Datasets of earlier releases also mark an operator's action that the guard rejected.
+            # Datasets of earlier releases also mark frames in which the guard rejected the
+            # operator's action.
             rejected = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
             obs = Obs(images, gripper, state, info)
             captured_at = float(columns[CAPTURED][i]) if CAPTURED in columns else None
@@ -310,7 +309,9 @@ class RecordedDataset:
         )
 
     def _original_size(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Return an image without the row and the column that make the size of its video even."""
+        """Remove the row or column that was added to an image to make its height and width even, as
+        video codecs need.
+        """
         cameras = {} if self.contract is None else self.contract.contract.cameras or {}
         spec = cameras.get(camera)
         if spec is None or spec.height is None or spec.width is None:
@@ -318,14 +319,16 @@ class RecordedDataset:
         return np.ascontiguousarray(image[: spec.height, : spec.width])
 
     def _cameras(self, image_features: Sequence[str], names: Names) -> dict[str, str]:
-        """Return the policy's name of the camera of each feature that contains images.
+        """Return the policy's name of each camera, by the feature that contains the camera's
+        images.
 
         Args:
             image_features: The features of the dataset that contain images.
-            names: The policy's names; without cameras, it has those of the dataset.
+            names: The policy's names; if they contain no cameras, the dataset's camera names are
+                used.
 
         Raises:
-            ConfigError: The dataset has no camera or feature of a name.
+            ConfigError: The dataset lacks a camera or feature that `names` contains.
         """
         contract_names = {} if self.contract is None else self.contract.cameras
         dataset_names = {}
@@ -334,7 +337,7 @@ class RecordedDataset:
         if not names.cameras:
             return dataset_names
 
-        # Cameras are named by the dataset's name of the camera, or by the feature.
+        # The user may write the dataset's name of the camera, or the name of the feature.
         features = {camera: feature for feature, camera in dataset_names.items()}
         features |= {feature: feature for feature in image_features}
         unknown = [name for name in names.cameras.values() if name not in features]
@@ -348,7 +351,7 @@ class RecordedDataset:
     def _state_features(
         self, names: Names, policy: Contract | None
     ) -> dict[str, list[tuple[str, int]]]:
-        """Return, for each feature of the state, the names and sizes of its values in order.
+        """Return the names and sizes of the parts of each state feature, in order.
 
         Args:
             names: The policy's names.
@@ -365,7 +368,7 @@ class RecordedDataset:
             specs = self.contract.contract.state or {}
             sizes = {name: int(spec.dim or 0) for name, spec in specs.items()}
             for feature in widths:
-                # A name that the contract's state lacks is the gripper, which has one value.
+                # The only name that the contract's state lacks is "gripper", which has one value.
                 features[feature] = [(name, sizes.get(name, 1)) for name in orders[feature]]
             return features
 
@@ -392,7 +395,7 @@ def _read_info(file: Path) -> dict[str, Any]:
 
 
 def _embedded_file(value: Mapping[str, Any]) -> bytes:
-    """Return an image of the table as the JPEG or PNG file that it is."""
+    """Return the JPEG or PNG file that the table contains as an image."""
     data = value.get("bytes")
     if not data:
         raise ConfigError(
@@ -403,5 +406,5 @@ def _embedded_file(value: Mapping[str, Any]) -> bytes:
 
 
 def _read_values(text: str) -> dict[str, Any]:
-    """Read values by name from the text of a column, which is empty if there are none."""
+    """Read a mapping from the text of a column; an empty text is an empty mapping."""
     return dict(from_text(text, Budget(DEFAULT_LIMITS))) if text else {}

@@ -1,7 +1,7 @@
-"""Names of policies, environments, robots, commands and others, the location of their code, and
-their requirements.
+"""The registry of policies, environments, robots, commands and other extensions: their names, the
+location of their code, and their requirements.
 
-A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add
+Each name belongs to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add
 entries through the entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`,
 `.robots`, `.leaders`, `.commands`, `.replica`, `.pages`, `.exports`, `.dataset_exports` and
 `.trackers`: an entry point names a `RegistryEntry` in a module that imports nothing large. A
@@ -46,36 +46,40 @@ CORE = "vlagents-ray"  # the distribution of this package
 
 @dataclass(frozen=True, slots=True)
 class RegistryEntry:
-    """A policy, wrapper, environment, dialect, robot or command: where its code is, what it is,
-    and what it needs.
+    """The entry of a policy, wrapper, environment, dialect, robot, command or other extension: the
+    location of its code, a description, and its requirements.
     """
 
-    # "module:Class". Of an export and a leader (see `robot.leaders.OpenLeader`), "module:function".
-    # A command may also be "module:app", a typer.Typer; the function of a subcommand, such as
-    # "robot.check", takes the arguments and returns the exit status.
+    # "module:Class"; for an export and a leader (see `robot.leaders.OpenLeader`),
+    # "module:function". A command may also be "module:app", where `app` is a typer.Typer. A
+    # subcommand, such as "robot.check", is a function that accepts the arguments and returns the
+    # exit status.
     target: str
-    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one
-    # line for --help.
+    # For a policy or an environment: its models or tasks, for the tables of README and docs/; an
+    # entry without this text has no row there. For all other kinds: one line for --help.
     about: str = ""
-    # Import names; the first one may be in a source named by `checkouts`.
+    # Import names of required packages. The first package may be in a checkout that `checkouts`
+    # names.
     needs: tuple[str, ...] = ()
-    # Files NAME.txt in `requirements/` of the target's package that install these, the usual one
-    # first.
+    # Names of files NAME.txt, in `requirements/` of the target's package, that install these
+    # packages; the usual file is the first one.
     requirements: tuple[str, ...] = ()
-    extra: str | None = None  # extra of its distribution that installs them
-    checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
-    wants: str = ""  # further requirements of its users, such as "assets"
-    tasks: str = "/<task>"  # tasks of an environment or a robot: the pattern after its name
-    deployment: str | None = None  # file of deployments/ with its settings; None: its own name
-    weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
+    extra: str | None = None  # extra of the distribution that installs the packages
+    # Environment variables, one of which must contain the path of a checkout of the authors' code.
+    checkouts: tuple[str, ...] = ()
+    wants: str = ""  # further requirements for the tables, such as "assets"
+    tasks: str = "/<task>"  # pattern of an environment's or a robot's tasks, which follows the name
+    deployment: str | None = None  # deployment file in deployments/; None: NAME.yaml
+    # Whether a checkout of this project contains weights, which deployments/NAME.yaml names.
+    weights: bool = False
     # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page
     # of its own name.
     page: str | None = None
-    # For a part of a replica: whether it is on in each server, with its default settings.
+    # For a part of a replica: whether each server enables it, with default settings.
     by_default: bool = False
     # For a command: examples for --help, without "vlagents-ray".
     examples: tuple[str, ...] = ()
-    # Distribution that registers it; for a plug-in, that of its entry point.
+    # Distribution that registers the name; for a plug-in, the distribution of the entry point.
     distribution: str = CORE
 
 
@@ -127,8 +131,9 @@ WRAPPERS: dict[str, RegistryEntry] = {
     "subtasks": RegistryEntry("vlagents_ray.policies.subtasks:Subtasks"),
 }
 
-# Formats of `vlagents-ray export`. A function (results, path, **settings) writes the episodes and
-# returns their number; its keyword-only parameters are the settings of `--set`.
+# Formats of `vlagents-ray export`. Each target is a function (results, path, **settings) that
+# writes the episodes and returns their number; its keyword-only parameters are the settings of
+# `--set`.
 EXPORTS: dict[str, RegistryEntry] = {
     "json": RegistryEntry("vlagents_ray.evaluate.exports:to_json", "an object for each episode"),
     "csv": RegistryEntry("vlagents_ray.evaluate.exports:to_csv", "a line for each episode"),
@@ -141,12 +146,14 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "dialects": {},  # other systems' protocols, the names under `dialects` in a deployment file
     "robots": {},  # the names before the colon of `vlagents-ray robot --robot NAME:ARGUMENT`
     "leaders": {},  # operators' devices, `vlagents-ray robot --teleop NAME`
-    # Those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`.
+    # This package's own commands are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray
+    # robot`.
     "commands": {},
     "replica": {},  # parts of a replica
-    "pages": {},  # that show an evaluation while it runs
+    "pages": {},  # web pages that show an evaluation while it runs
     "exports": EXPORTS,
-    "dataset_exports": {},  # functions like those of exports, whose first argument is the folder
+    # Functions like the exports, but their first argument is the folder of the results.
+    "dataset_exports": {},
     "trackers": {},  # classes like `evaluate.trackers.TrackerRun`
 }
 _SINGULAR = {
@@ -164,7 +171,8 @@ _SINGULAR = {
     "trackers": "tracker",
 }
 
-# extra of this package -> import names of what it installs, beside those of the adapters
+# Extra of this package -> import names of the packages that it installs, except packages in `needs`
+# of an entry.
 _EXTRAS: dict[str, tuple[str, ...]] = {
     "serve": (
         "ray",
@@ -186,8 +194,8 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "rerun": ("rerun",),
 }
 
-# import name -> how to install a package that is in no extra and no requirements of an installed
-# plug-in
+# Import name -> how to install a package that is in no extra and in no requirements file of an
+# installed plug-in.
 _ELSEWHERE = {
     "torch": "run `pip install torch` in the policy's environment",
     "torchao": (
@@ -195,7 +203,7 @@ _ELSEWHERE = {
         "include it"
     ),
 }
-# packages installed as dependencies of those of the families
+# Package that is installed as a dependency -> the package that depends on it.
 _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors": "transformers"} | {
     "huggingface_hub": "transformers",
     "hydra": "diffusion_policy",
@@ -220,14 +228,14 @@ def require(module: str, *, extra: str | None = None, distribution: str = CORE) 
     except ModuleNotFoundError as error:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
-            raise  # the module is installed, but lacks a dependency, which this error names
+            raise  # the module is installed, but lacks a dependency, which `error` names
         raise MissingDependency(
             f"{module!r} is not installed; {how_to_install(top, extra, distribution)}"
         ) from error
 
 
 def how_to_install(package: str, extra: str | None = None, distribution: str = CORE) -> str:
-    """Return how to install an optional package, as the end of an error message.
+    """Return instructions for installing an optional package, as the end of an error message.
 
     Args:
         package: The name by which it is imported.
@@ -269,7 +277,9 @@ def how_to_install(package: str, extra: str | None = None, distribution: str = C
 
 
 def install_alone(package: str) -> str:
-    """Return how to install a package for a policy that has neither an extra nor requirements."""
+    """Return instructions for installing a package for a policy that has neither an extra nor a
+    requirements file.
+    """
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
 
 
@@ -282,8 +292,7 @@ def require_needs(kind: str, name: str) -> None:
 
 
 def requirements_file(name: str) -> Path:
-    """Return the requirements file that a policy or environment names, such as "hf", in its
-    package.
+    """Return the path of a requirements file, such as "hf", that a policy or environment names.
 
     Raises:
         ConfigError: No installed policy or environment names it.
@@ -306,8 +315,8 @@ def requirements_file(name: str) -> Path:
 def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
     """Return the command that installs a distribution, with one of its extras.
 
-    If this package was installed from a checkout, so are its plug-ins: the same code, and maybe
-    a version that no package index has.
+    If this package was installed from a checkout, the command installs a plug-in from the same
+    checkout, so that both have the same version, which may not be on any package index.
     """
     target, options = distribution, ""
     checkout, is_editable = _checkout()
@@ -324,10 +333,11 @@ def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
 
 @functools.lru_cache(maxsize=1)
 def _checkout() -> tuple[Path | None, bool]:
-    """Return the folder from which pip installed this package, None if it was an archive, and
-    whether it is used in place.
+    """Return the folder from which pip installed this package, or None if pip installed an archive,
+    and whether the installation is editable.
     """
-    # A checkout in the working directory may be found, too, without pip's record (PEP 610).
+    # The search may also find a checkout in the working directory, which lacks pip's record (PEP
+    # 610).
     for found in metadata.distributions(name=CORE):
         record = found.read_text("direct_url.json")
         if record is None:
@@ -341,13 +351,16 @@ def _checkout() -> tuple[Path | None, bool]:
 
 
 def names(kind: str) -> list[str]:
-    """Return all names of a kind, such as "policies" or "robots", this package's own first."""
+    """Return all names of a kind, such as "policies" or "robots"; this package's own names are
+    first.
+    """
     built_in = _BUILT_IN[kind]
     return [*built_in, *sorted(name for name in _entry_points(kind) if name not in built_in)]
 
 
 def find_entry(kind: str, name: str) -> RegistryEntry | None:
-    """Return the entry of a registered name, of this package or a plug-in; None if there is none.
+    """Return the entry of a name that this package or a plug-in registers; None if the name is not
+    registered.
 
     Raises:
         ConfigError: The plug-in's entry cannot be loaded, or several plug-ins register the name.
@@ -360,8 +373,8 @@ def find_entry(kind: str, name: str) -> RegistryEntry | None:
 
 
 def entries(kind: str) -> dict[str, RegistryEntry]:
-    """Return the entries of all names of `kind`; one that cannot be loaded is left out, and its
-    error is logged.
+    """Return the entries of all names of `kind`; an entry that cannot be loaded is left out, and
+    its error is logged.
     """
     entry_by_name = {}
     for name in names(kind):
@@ -389,8 +402,8 @@ def _entry_points(kind: str) -> Mapping[str, tuple[EntryPoint, ...]]:
 def _installed_entry_points(
     group: str, _path: tuple[str, ...]
 ) -> Mapping[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of a group on this path; reading those of all installed packages
-    takes 20 ms.
+    """Return the entry points of a group that are on `path`, from a cache, since reading the entry
+    points of all installed packages takes 20 ms.
     """
     by_name: dict[str, tuple[EntryPoint, ...]] = {}
     for point in entry_points(group=group):
@@ -400,8 +413,8 @@ def _installed_entry_points(
 
 @functools.cache
 def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
-    """Load the entry that an entry point names; raises `ConfigError` if it is none, or if there
-    are several.
+    """Load the entry that an entry point names; raises `ConfigError` if the object is no
+    `RegistryEntry`, or if there are several entry points.
     """
     point = points[0]
     distributions = sorted({_distribution_of(other) for other in points})
@@ -433,7 +446,7 @@ def _distribution_of(point: EntryPoint) -> str:
 
 
 def plugin_distributions() -> list[str]:
-    """Return the installed distributions that register names, other than this package's own."""
+    """Return the installed distributions that register names, without this package."""
     distributions = set()
     for kind in _BUILT_IN:
         for points in _entry_points(kind).values():
@@ -443,8 +456,8 @@ def plugin_distributions() -> list[str]:
 
 @functools.cache
 def published() -> Mapping[str, Mapping[str, str]]:
-    """Return the distribution of each name that the project's own plug-ins register, by kind,
-    installed or not.
+    """Return the distribution of each name that this project's plug-ins register, by kind, whether
+    or not the plug-in is installed.
     """
     file = Path(__file__).with_name("published.json")
     read: dict[str, dict[str, str]] = json.loads(file.read_text())
@@ -499,8 +512,8 @@ def _is_class(name: str) -> bool:
 
 
 def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
-    """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if
-    there is none.
+    """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there
+    is no such class.
     """
     return named_class(_importable_target(kind, name, unknown), unknown)
 
@@ -509,14 +522,14 @@ def registered_function(kind: str, name: str) -> Any:
     """Return the function or `typer.Typer` registered as `name`, or given as "module:function".
 
     Raises:
-        ConfigError: There is none, or it cannot be loaded, for whatever reason; the message names
-            the plug-in.
+        ConfigError: The name is not registered, or the function cannot be loaded, for any reason;
+            the message names the plug-in.
     """
     return load_target(_importable_target(kind, name, ConfigError))
 
 
 def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
-    """Return the target of a registered name, whose plug-in can be imported; "module:NAME" is
+    """Return the target of a registered name, and check that it can be imported; "module:NAME" is
     returned unchanged.
     """
     entry = find_entry(kind, name)
@@ -546,23 +559,24 @@ def _shown(kind: str, name: str) -> str:
 
 
 def _require_importable(kind: str, name: str, entry: RegistryEntry) -> None:
-    """Raise `ConfigError` if a plug-in's module raises any other error than those of this package.
+    """Raise `ConfigError` if importing a plug-in's module raises an error that is not from this
+    package.
 
-    Without this, a broken plug-in would end listings, and commands that do not use it.
+    Otherwise a broken plug-in would abort listings, and commands that do not use the plug-in.
     """
     try:
         importlib.import_module(entry.target.partition(":")[0])
     except VLAgentsError:
         raise
     except ModuleNotFoundError:
-        return  # `load_target` says what is not installed
+        return  # the message of `load_target` names the missing package
     except Exception as error:
         shown = f"{_SINGULAR[kind]} {_shown(kind, name)!r}"
         raise ConfigError(f"{shown} of {entry.distribution} cannot be loaded: {error}") from error
 
 
 def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
-    """Return the class given as "module:Class"; raises `unknown` if there is none."""
+    """Return the class given as "module:Class"; raises `unknown` if there is no such class."""
     cls = load_target(name, unknown)
     if not isinstance(cls, type):
         raise unknown(f"{name!r}: expected a class, got a {type(cls).__name__}")
@@ -570,13 +584,13 @@ def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any
 
 
 def _place_of(error: Exception) -> str:
-    """Return the line that raised an error, " (my_policy.py:12)"."""
+    """Return the location of the line that raised an error, as in " (my_policy.py:12)"."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     return f" ({Path(frame.filename).name}:{frame.lineno})"
 
 
 def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
-    """Return the object given as "module:NAME"; raises `unknown` if there is none."""
+    """Return the object given as "module:NAME"; raises `unknown` if there is no such object."""
     module, colon, attribute = name.partition(":")
     if not colon:
         raise unknown(f"{name!r}: expected 'module:Class'")
@@ -600,7 +614,7 @@ def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
     except VLAgentsError:
         raise
-    except Exception as error:  # whatever the module raises, a syntax error among them
+    except Exception as error:  # the module may raise any error, including a SyntaxError
         place = "" if isinstance(error, SyntaxError) else _place_of(error)
         raise unknown(
             f"{name!r}: the import of module {module!r} raised {type(error).__name__}: "

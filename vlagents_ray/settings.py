@@ -23,15 +23,15 @@ _WORD_ERRORS = (
     "sequence_str",
     *_BOUNDS,
 )
-# A hint how to write the value, by the type of error and the type of the value.
+# Hints how to write a value, by the type of error and the type of the value.
 _SPELLINGS = {
     ("list_type", dict): "; begin each of its entries with '- '",
     ("string_type", bool): "; put the word in quotation marks",
     ("string_type", datetime.date): "; put it in quotation marks",
 }
-_EXPECTED = "Input should be "  # pydantic's wording
-# The types of values that a plain type allows: numpy's are allowed, and whole numbers for a float,
-# since YAML reads 1 as int.
+_EXPECTED = "Input should be "  # beginning of pydantic's messages
+# The types of values that each plain type allows. numpy's types are allowed, and whole numbers are
+# allowed for a float, since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
     int: (numbers.Integral,),
@@ -51,7 +51,7 @@ def require_arguments(
     left to the function.
 
     Args:
-        subject: The object that the function makes, for the message.
+        subject: The object that the function creates, for the message.
         function: The function or class that will be called.
         arguments: The keyword arguments.
     """
@@ -71,12 +71,13 @@ def require_arguments(
     annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
     try:
         annotations = get_type_hints(annotated)
-    except (NameError, TypeError, AttributeError):  # they name types that cannot be found
+    # The annotations name types that cannot be resolved.
+    except (NameError, TypeError, AttributeError):
         annotations = {}
 
     for name, value in arguments.items():
         parameter = signature.parameters.get(name)
-        # It may be a value for **kwargs, or the default itself.
+        # The value may belong to **kwargs, or be the default itself.
         if parameter is None or value is parameter.default:
             continue
         annotation = annotations.get(name, _type_of_default(parameter.default))
@@ -92,7 +93,9 @@ def require_arguments(
 
 
 def _type_of_default(default: object) -> Any:
-    """Return the type of a parameter without an annotation: the default 1 allows 0.5 as well."""
+    """Return the type of a parameter without an annotation, from its default; the default 1 also
+    allows 0.5.
+    """
     if default is None:
         return Any
     return float if type(default) is int else type(default)
@@ -107,10 +110,10 @@ def wrong_settings(error: ValueError, model: type | None = None, option: str | N
     """Return the message of an error about settings.
 
     Args:
-        error: An error; if it is pydantic's, the message has a line for each wrong setting, without
-            the values, which may be secrets.
+        error: The error. For an error of pydantic, the message has a line for each wrong setting,
+            without the values, which may be secrets.
         model: The pydantic model of the settings, whose fields are listed if one is unknown.
-        option: The option of the command line that sets them, such as "--set".
+        option: The command-line option for settings, such as "--set".
     """
     listed: Callable[[], Sequence[Mapping[str, Any]]] | None = getattr(error, "errors", None)
     if listed is None:
@@ -159,11 +162,11 @@ def _reworded(item: Mapping[str, Any]) -> tuple[str, str, str]:
     """Return pydantic's message in clearer words, the text of the value, and a hint."""
     kind, value = item["type"], item["input"]
     message = str(item["msg"]).removeprefix("Value error, ")
-    # Other values are named by their type alone, as they may be secrets.
+    # Only the type of any other value is shown, as the value may be a secret.
     value_text = str(value) if isinstance(value, (bool, int, float)) else type(value).__name__
     if value is None:
         value_text = "nothing"
-    # A word in place of a number or a list is no secret.
+    # Text that is written in place of a number or a list is not a secret, so it is shown.
     if kind in _WORD_ERRORS and isinstance(value, str):
         value_text = shown(value)
         message = message.partition(", unable to")[0]
@@ -172,7 +175,7 @@ def _reworded(item: Mapping[str, Any]) -> tuple[str, str, str]:
 
     hint = _SPELLINGS.get((kind, type(value)), "")
     if kind == "literal_error" and isinstance(value, str):
-        # A word in place of one of a list is no secret, either.
+        # Text that is written in place of one of the allowed words is not a secret either.
         value_text = shown(value)
         hint = did_you_mean(value, item["ctx"]["expected"].split("'")[1::2])
     elif kind == "bool_parsing":
@@ -191,10 +194,10 @@ def _reworded(item: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _fields(model: type | None, path: Iterable[Any]) -> Mapping[str, Any]:
-    """Return the fields at a path below `model`; empty if they cannot be determined."""
-    is_key = False  # whether the next name is a key of a mapping, whose value has the fields
+    """Return the fields of the model at a path below `model`; empty if they are unknown."""
+    is_key = False  # whether the next name is a key of a dict, not a field
     for name in path:
-        if isinstance(name, int):  # an index in a list
+        if isinstance(name, int):  # an index of a list
             continue
         if is_key:
             is_key = False
@@ -212,7 +215,7 @@ def _of(model: type | None) -> Mapping[str, Any]:
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
-    """Yield a type and its arguments, recursively: `Batch` of `Batch | None`."""
+    """Yield a type and its arguments, recursively; for `Batch | None` these include `Batch`."""
     yield annotation
     for argument in get_args(annotation):
         yield from _parts(argument)

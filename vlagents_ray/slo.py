@@ -1,7 +1,8 @@
-"""What a robot needs of its policy to be served in time: its service level objective (SLO).
+"""The service level objective (SLO) of a robot: the timeliness that it needs from its policy.
 
-A control loop sends it with its reset, as the option `slo`; the server compares it with what the
-replica can do, and answers in the reset's info (`SLO` in `vlagents_ray.interface`).
+A control loop sends the SLO with `reset`, as the option `slo`. The server estimates whether the
+replica can meet it, and returns the result in the info of the reset (`SLO` in
+`vlagents_ray.interface`).
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, printable, shown
 from vlagents_ray.naming import did_you_mean
 
-# Limits of a rate, Hz, of an age, ms, and of a number of rows: the server computes with their
-# reciprocals and products.
+# Limits of a rate (Hz), an age (ms) and a number of rows, with whose reciprocals and products the
+# server computes.
 _LEAST, MOST = 1e-6, 1e9
-_REASON_CHARACTERS = 1000  # of a server's reason why a robot is not served in time
+_REASON_CHARACTERS = 1000  # maximum length of a server's reason why a robot is not served in time
 SHARE = 0.98
-"""The share of ticks with an action in time that a robot needs if it states none."""
+"""The default share of ticks with an action in time that a robot needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +29,14 @@ class Slo:
 
     Args:
         hz: The rate of its control loop, Hz.
-        age_ms: The largest age of an executed action, from the capture of its observation, ms;
-            None: any.
-        share: The least share in time: of the ticks at which the policy was to act, those with an
-            action in time, above 0 and at most 1.
-        rows: The rows of a chunk that it executes at most; None: all of them.
+        age_ms: The largest acceptable age of an executed action, measured from the capture of its
+            observation, ms; None: no limit.
+        share: The smallest acceptable share of ticks with an action in time, among the ticks that
+            need an action of the policy; above 0 and at most 1.
+        rows: The maximum number of rows of a chunk that the robot executes; None: all.
 
     Raises:
-        ConfigError: A value is not a number, or is out of its range.
+        ConfigError: A value is not a number, or is out of range.
     """
 
     hz: float
@@ -70,13 +71,13 @@ class Slo:
 
     @classmethod
     def from_json(cls, value: object) -> Slo:
-        """Return the objective that a message or a file states.
+        """Read an objective from a message or a file.
 
         Args:
             value: A JSON object with `hz`, and optionally `age_ms`, `share` and `rows`.
 
         Raises:
-            ConfigError: It is not such an object, or has a wrong value.
+            ConfigError: The value is not such an object, or contains a wrong value.
         """
         if not isinstance(value, Mapping):
             raise ConfigError(
@@ -96,7 +97,7 @@ class Slo:
         return cls(**value)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the objective as a JSON object, without what is None."""
+        """Return the objective as a JSON object, without the fields that are None."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -104,8 +105,9 @@ class Slo:
 def read_answer(answer: object) -> dict[str, Any]:
     """Return a server's answer to an SLO: `load`, `in_time`, and a `reason` if it is not in time.
 
-    It is empty if there is none, or if it has another form: a run does not depend on it. The reason
-    is a text of another party, and has no line feeds, with which it could forge a line of a log.
+    The result is empty if the server sent no answer, or one of another form, since a run does not
+    depend on the answer. Line feeds are removed from the reason, since a server could forge lines
+    of a log with them.
     """
     in_time = answer.get("in_time") if isinstance(answer, Mapping) else None
     if not isinstance(answer, Mapping) or not isinstance(in_time, bool):
@@ -126,5 +128,5 @@ def _is_number(value: object) -> bool:
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer without a float
+    except OverflowError:  # an integer too large for a float
         return False

@@ -1,5 +1,5 @@
-"""Test suites for policies and environments, which all those of this package pass and yours can
-also use.
+"""Test suites for policies and environments. All policies and environments of this package pass
+them, and you can use them for your own.
 
     from vlagents_ray.testing import check_agent, check_env
 
@@ -9,8 +9,8 @@ also use.
     def test_my_policy_keeps_its_contract():
         check_agent(MyPolicy())
 
-Each raises `ContractViolation` with the first violation that it finds, and closes the agent or
-environment.
+Each function raises `ContractViolation` with the first violation that it finds, and closes the
+agent or environment.
 """
 
 from __future__ import annotations
@@ -38,22 +38,25 @@ from vlagents_ray.validation import check_action, check_observation
 __all__ = ["ContractViolation", "check_agent", "check_env"]
 
 _SCALARS = (bool, int, float, str, bytes)
-_SIDE = 64  # px, of a random image whose size the contract does not state
-_DIM = 7  # length of a part of the state whose size the contract does not state
+_SIDE = 64  # px; height and width of a random image if the contract has no size
+_DIM = 7  # length of a part of the state if the contract has no size
 _SESSIONS = 3
 _THREADS = 4  # number of threads that prepare observations in a server
-_ROUNDS = 20  # acts concurrent with those threads, each after `_RESETS` resets
-_RESETS = 15  # since a reset is short, few of them coincide with a preparation
-_LONGEST_S = 5.0  # time after which no further act begins, since other threads slow down the agent
-_SWITCH_S = 1e-5  # Python's switch interval, short so that threads interleave more often
+_ROUNDS = 20  # calls of `act` concurrent with these threads, each after `_RESETS` resets
+_RESETS = 15  # many resets, since a reset is short and rarely coincides with a call of `prepare`
+# Time after which no further call of `act` begins, as the other threads slow it down.
+_LONGEST_S = 5.0
+_SWITCH_S = 1e-5  # Python's thread switch interval, s, short so that threads interleave more often
 
 
 class ContractViolation(VLAgentsError):
-    """A policy or an environment does not implement its interface; the message names the place."""
+    """A policy or an environment does not implement its interface; the message names the method or
+    value.
+    """
 
 
 def require_wireable(value: object, where: str) -> None:
-    """Raise `ContractViolation` unless a message can carry `value`."""
+    """Raise `ContractViolation` unless `value` can be sent in a message."""
     if value is None or type(value) in _SCALARS:
         return
     if isinstance(value, np.ndarray):
@@ -104,7 +107,9 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
 
 
 def _first_difference(items: Iterable[tuple[Any, Any, str]], atol: float) -> str | None:
-    """Describe the first difference between the items of two values, each with its place."""
+    """Describe the first difference between the items of two values, which are given with their
+    paths.
+    """
     for a, b, where in items:
         description = difference(a, b, where, atol)
         if description:
@@ -116,14 +121,14 @@ def _plain(value: object) -> object:
     """Convert tensors and images to arrays, and objects that have attributes but no equality to
     dictionaries.
     """
-    if isinstance(value, Act):  # without its info, which may contain times
+    if isinstance(value, Act):  # without `info`, which may contain times
         return {"action": value.action, "done": value.done}
     if isinstance(value, Obs):
         return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
-        if "bfloat16" in str(getattr(value, "dtype", "")):  # which NumPy lacks
+        if "bfloat16" in str(getattr(value, "dtype", "")):  # NumPy has no bfloat16
             value = value.float()  # type: ignore[attr-defined]
         return np.asarray(value)
     if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__"):
@@ -146,8 +151,8 @@ def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> 
 
 
 def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) -> None:
-    """Raise `ContractViolation` with the difference and the reason `because` unless two values
-    are equal.
+    """Raise `ContractViolation` unless two values are equal; the message contains the difference
+    and the reason `because`.
     """
     description = difference(a, b, where, atol)
     if description:
@@ -174,13 +179,14 @@ def check_agent(
     steps: int = 3,
     atol: float = 1e-5,
 ) -> None:
-    """Check that an agent implements the interface of `Agent`; initializes and closes it.
+    """Check that an agent implements the interface of `Agent`; initializes and closes the agent.
 
-    Three sessions, copies of the initialized agent, run with an observation, an instruction and a
-    seed each: first in sequence, then interleaved, with prepared observations, then in batches of
-    1, 2 and 3. Their actions must not depend on the other sessions, nor on whether `prepare` was
-    called. If the agent defines `prepare`, several threads call it while sessions are reset and
-    acted on, as in a server, and every result must equal that of a single thread.
+    Three sessions, which are copies of the initialized agent, each receive an observation, an
+    instruction and a seed. They run in sequence, interleaved, with prepared observations, and in
+    batches of 1, 2 and 3. The actions of a session must not depend on the other sessions, nor on
+    whether `prepare` was called. If the agent defines `prepare`, several threads call it while
+    others call `reset` and `act`, as in a server, and every result must equal that of a single
+    thread.
 
     Args:
         agent: The agent, not initialized yet.
@@ -188,13 +194,14 @@ def check_agent(
             contract.
         instructions: The instructions of the sessions, in turn; pass valid ones if the policy
             parses them.
-        reset_kwargs: Further arguments of each `reset`, beside `seed`.
+        reset_kwargs: Further arguments of each `reset`, besides `seed`.
         steps: The number of calls of `act` in a session.
         atol: The largest difference between an action in a batch and the same action of a single
             session.
 
     Raises:
-        ContractViolation: The agent does not implement the interface; the message names the place.
+        ContractViolation: The agent does not implement the interface; the message names the method
+            or value.
     """
     if not isinstance(agent, Agent):
         raise ContractViolation(
@@ -219,13 +226,13 @@ def check_agent(
         dict(reset_kwargs or {}),
     )
 
-    # The actions of each session alone.
+    # Run each session alone.
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
     because = "the same observations, instruction and seed must give the same actions"
     for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
         require_same(alone[i], again, f"act of session {i}", because)
 
-    # All sessions in turn.
+    # Run all sessions interleaved.
     because = (
         "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
     )
@@ -239,7 +246,7 @@ def check_agent(
     for protocol in (Trainable, Sleeps):
         _require_whole(agent, protocol)
 
-    # Prepared observations, also from several threads.
+    # Run with prepared observations, also from several threads.
     if ability(agent, Prepares) is not None:
         because = "`prepare` must compute what `act` computes without it"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
@@ -248,7 +255,7 @@ def check_agent(
                 require_same(alone[i][step], suite.act(i, session, prepared=True), where, because)
         _check_threads(suite, [acts[0] for acts in alone])
 
-    # Batches.
+    # Run in batches.
     because = "act_batch must give each session what act gives it alone"
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
@@ -260,8 +267,8 @@ def check_agent(
 
 
 def _require_whole(agent: Agent, protocol: type) -> None:
-    """Raise `ContractViolation` if an agent has only some methods of an ability, so that a server
-    uses none of them.
+    """Raise `ContractViolation` if an agent has only some methods of an ability; a server would use
+    none of them.
     """
     missing = [name for name in members(protocol) if getattr(agent, name, None) is None]
     if missing and len(missing) < len(members(protocol)):
@@ -272,8 +279,8 @@ def _require_whole(agent: Agent, protocol: type) -> None:
 
 
 def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
-    """Check that threads can prepare observations while sessions, with the acts `first`, are
-    reset and acted on.
+    """Check that threads can prepare observations during calls of `reset` and `act`, whose results
+    must equal `first`.
     """
     sessions = [suite.begin(i) for i in range(_SESSIONS)]
     serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
@@ -318,14 +325,14 @@ def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
 
 @dataclass(slots=True)
 class _AgentSuite:
-    """Begins sessions and calls them, and checks their arguments and results."""
+    """Begins sessions, calls their methods, and checks arguments and results."""
 
     _agent: Agent
     _contract: Contract | None
     _views: list[Obs]  # the observation of each session
     _instructions: list[str]  # the instruction of each session
     _reset_kwargs: dict[str, Any]
-    # The cure of errors that the agent raises, for messages.
+    # The cure in messages about errors that the agent raises.
     cure: str = (
         "if the policy parses its instructions or accepts only some observations, pass some that "
         "it accepts: check_agent(…, instructions=[…], obs=[…])"
@@ -346,14 +353,14 @@ class _AgentSuite:
         before = copy.deepcopy(obs)
         with self._calling("reset", i):
             info = session.reset(obs, self._instructions[i], seed=i, **self._reset_kwargs)
-        require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
+        require_same(before, obs, "the observation", "reset changed its argument: work on a copy")
         if not isinstance(info, dict):
             raise ContractViolation(f"reset: expected a dict, got {type(info).__name__}")
         require_wireable(info, "reset: info")
         return session
 
     def play_alone(self, i: int, steps: int) -> list[Act]:
-        """Act `steps` times in session `i`, and return copies of the acts."""
+        """Call `act` `steps` times in session `i`, and return copies of the results."""
         session = self.begin(i)
         acts: list[Act] = []
         copies: list[Act] = []
@@ -361,39 +368,39 @@ class _AgentSuite:
             acts.append(self.act(i, session))
             copies.append(copy.deepcopy(acts[-1]))
         require_same(
-            copies, acts, "an earlier act", "a later one changed it: give a new array each time"
+            copies, acts, "an earlier act", "a later call changed it: return a new array each time"
         )
         return copies
 
     def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
-        """Act once in session `i`, on a prepared observation if `prepared`."""
+        """Call `act` once in session `i`, with a prepared observation if `prepared`."""
         obs = self._views[i]
         before = copy.deepcopy(obs)
         if prepared:
             obs = replace(obs, prepared=self.prepare(i, session))
         with self._calling("act", i):
             act = session.act(obs)
-        require_same(before, obs, "the observation", "act changed the caller's: work on a copy")
+        require_same(before, obs, "the observation", "act changed its argument: work on a copy")
         return self._checked(act, "act")
 
     def prepare(self, i: int, session: Agent) -> Any:
-        """Return what session `i` prepares of its observation."""
+        """Return the result of `prepare` in session `i`, for the session's observation."""
         prepares = ability(session, Prepares)
         if prepares is None:
             raise ContractViolation(
-                f"prepare: expected it in the copy of session {i}, as in the agent; define it in "
-                "the class"
+                f"prepare: expected the method in the copy of session {i}, as in the agent; define "
+                f"it in the class"
             )
         with self._calling("prepare", i):
             return prepares.prepare(self._views[i])
 
     def act_batch(self, sessions: list[Agent]) -> list[Act]:
-        """Act once in the first sessions, in one batch."""
+        """Call `act_batch` once, with the first `size` sessions."""
         views = self._views[: len(sessions)]
         before = copy.deepcopy(views)
         acts = self._agent.act_batch(views, sessions)
         require_same(
-            before, views, "the observations", "act_batch changed the caller's: work on copies"
+            before, views, "the observations", "act_batch changed its arguments: work on copies"
         )
         if not isinstance(acts, list) or len(acts) != len(sessions):
             result = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
@@ -404,7 +411,9 @@ class _AgentSuite:
 
     @contextmanager
     def _calling(self, method: str, i: int) -> Iterator[None]:
-        """Turn an error of a method that is called within this context into a violation."""
+        """Convert an error of a method that is called within this context into a
+        `ContractViolation`.
+        """
         try:
             yield
         except Exception as error:
@@ -490,24 +499,25 @@ def check_env(
     same_steps: bool = True,
     step_limit: bool = True,
 ) -> None:
-    """Check that an environment implements the interface of `EvalEnv`; closes it.
+    """Check that an environment implements the interface of `EvalEnv`; closes the environment.
 
-    Random actions are executed in an episode of each of the two seeds, and then in the first
-    episode again.
+    The check executes random actions in one episode for each of the two seeds, and then repeats the
+    first episode.
 
     Args:
         env: The environment, not reset yet.
         steps: The number of actions in an episode.
         seeds: The seeds of two different episodes.
         options: The options of each `reset`.
-        same_steps: Whether the same actions must also lead to the same observations; if False, only
-            the first observation of a seed must be the same, as for a simulator that is not
-            reproducible bit for bit.
-        step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
+        same_steps: Whether the same actions must also lead to the same observations. Pass False for
+            a simulator that is not bit-reproducible; then only the first observation of a seed must
+            be the same.
+        step_limit: Whether to run one episode until `env.max_steps`; pass False if it takes too
+            long.
 
     Raises:
         ContractViolation: The environment does not implement the interface; the message names the
-            place.
+            method or value.
     """
     if not isinstance(env, EvalEnv):
         raise ContractViolation(
@@ -548,7 +558,7 @@ def check_env(
         )
         suite.check_unseen(seeds[0], actions, first)
 
-    because = "a later step or reset changed it: give new arrays each time"
+    because = "a later step or reset changed it: return new arrays each time"
     for rollout in (first, other, again):
         for i, (obs, obs_copy) in enumerate(zip(rollout.observations, rollout.copies, strict=True)):
             require_same(obs_copy, obs, f"the observation after step {i}", because)
@@ -564,14 +574,14 @@ class _Rollout:
     """An episode of random actions."""
 
     instruction: str
-    observations: list[Obs]  # the env's own objects
-    copies: list[Obs]  # copies of them, made immediately
+    observations: list[Obs]  # the env's own objects, not copied
+    copies: list[Obs]  # copies of these objects, made immediately
     outcomes: list[Any]  # outcomes of each step: reward, terminated, truncated and success
 
 
 @dataclass(slots=True)
 class _EnvSuite:
-    """Plays episodes, and checks the results of the environment."""
+    """Runs episodes, and checks the results of the environment."""
 
     _env: EvalEnv
     _contract: Contract
@@ -648,8 +658,8 @@ class _EnvSuite:
         return obs, [*outcome, info["success"]]
 
     def check_unseen(self, seed: int, actions: list[np.ndarray], rollout: _Rollout) -> None:
-        """Repeat an episode with `looked_at` False before the last step; only images may be
-        absent.
+        """Repeat an episode, with `looked_at` False until the last step; the only permitted
+        difference is that images are absent.
         """
         self.reset(seed)
         last = len(rollout.outcomes) - 1
@@ -727,7 +737,8 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
     ):
         if expected is not None and set(names) != set(expected):
             raise ContractViolation(
-                f"{where}: {kind} are {sorted(names)}, the contract states {sorted(expected)}"
+                f"{where}: expected the {kind} of the contract, {sorted(expected)}, got "
+                f"{sorted(names)}"
             )
     if contract.gripper is False and obs.gripper is not None:
         raise ContractViolation(

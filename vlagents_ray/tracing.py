@@ -1,10 +1,12 @@
-"""OpenTelemetry: the tracer of this process, if the environment enables traces; the extra "otel".
+"""OpenTelemetry tracing of this process, if environment variables enable it; needs the extra
+"otel".
 
 `VLAGENTS_RAY_OTEL=1` turns tracing on, both in a client's process and in a server's. A request
 carries its trace in the observation's `info["traceparent"]`, in the format of
 https://www.w3.org/TR/trace-context/, over every transport. The spans go to the program's own tracer
-provider if it has set one; otherwise to an OTLP exporter, which OpenTelemetry's own variables
-configure (`OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_SERVICE_NAME`, `OTEL_TRACES_SAMPLER`).
+provider if the program has set one; otherwise to an OTLP exporter, which OpenTelemetry's
+environment variables configure (`OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_SERVICE_NAME`,
+`OTEL_TRACES_SAMPLER`).
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ TRACEPARENT = "traceparent"
 
 
 def tracer() -> Any | None:
-    """Return the tracer of this process; None unless the environment enables traces.
+    """Return the tracer of this process; None unless `VLAGENTS_RAY_OTEL` enables tracing.
 
     Raises:
         MissingDependency: The extra "otel" is not installed.
@@ -38,7 +40,7 @@ def flush() -> None:
 
 @functools.cache
 def _provider() -> Any:
-    """Return the program's tracer provider if it has set one; else a new one with an exporter."""
+    """Return the tracer provider that the program has set, or else a new one with an exporter."""
     program_provider = require("opentelemetry.trace", extra="otel").get_tracer_provider()
     sdk = require("opentelemetry.sdk.trace", extra="otel")
     if isinstance(program_provider, sdk.TracerProvider):

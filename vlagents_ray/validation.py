@@ -16,13 +16,14 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import WANT, Obs
 
-LARGEST_ACTION = 1e9  # beyond it no number of an action has a meaning, in any unit
-_SMALL = 64  # the size of arrays up to which Python's own check is faster than numpy's
+# Limit of the absolute value of an action's numbers; larger numbers are meaningless in any unit.
+LARGEST_ACTION = 1e9
+_SMALL = 64  # largest array size for which Python's own check is faster than numpy's
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 
 def check_observation(obs: Obs, contract: Contract | None) -> None:
-    """Raise `InvalidObservation` unless `obs` is well formed and has the inputs that `contract`
+    """Raise `InvalidObservation` unless `obs` is well-formed and has the inputs that `contract`
     names.
     """
     for name, image in obs.cameras.items():
@@ -142,7 +143,7 @@ def _finite(array: np.ndarray) -> bool:
 
 
 def _largest(array: np.ndarray) -> float:
-    """Return the largest absolute value; NaN or infinity if there is one."""
+    """Return the largest absolute value; NaN or infinity if the array contains such a value."""
     if array.size <= _SMALL:
         values = array.ravel().tolist()
         return max(map(abs, values)) if all(map(math.isfinite, values)) else math.inf

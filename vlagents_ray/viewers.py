@@ -1,6 +1,8 @@
-"""Episodes for Rerun (https://rerun.io): `.rrd` files, or a running viewer; the extra "rerun".
+"""Output of episodes to Rerun (https://rerun.io), as `.rrd` files or in a running viewer; needs the
+extra "rerun".
 
-A thread writes them, and drops frames that arrive too fast, so that the loop is never delayed.
+A separate thread writes the frames, and drops frames that arrive too fast, so that the control loop
+is never delayed.
 """
 
 from __future__ import annotations
@@ -41,9 +43,9 @@ __all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
 logger = logging.getLogger(__name__)
 LIVE = "rerun+http://127.0.0.1:9876/proxy"  # the default address of `rerun`, the viewer
 _PORT = 9876
-CLOSING_S = 2.0  # s, time limit for a live viewer to receive the remaining frames
-FRAMES = 100  # size of the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
-_NICE = 5  # the writing thread has a lower priority than the loop
+CLOSING_S = 2.0  # time limit for a live viewer to receive the remaining frames
+FRAMES = 100  # size of the queue in frames: 2 s at 50 Hz, 180 MB with two cameras of 640x480
+_NICE = 5  # niceness of the writing thread, so that its priority is lower than the loop's
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +57,17 @@ class ViewerFrame:
     tick: int  # tick of the episode
     time: float  # s since 1970, of the observation
     cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
-    # (D,) float32; the gripper is a part.
+    # (D,) float32 by name; the gripper is also a part.
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
     executed: np.ndarray | None = None  # (D,) float32
     planned: np.ndarray | None = None  # (D,) float32, the row of the newest chunk for this tick
-    chunk: np.ndarray | None = None  # (H, D) float32, if a new one begins
+    chunk: np.ndarray | None = None  # (H, D) float32, if a new chunk begins
     numbers: Mapping[str, float] = field(default_factory=dict)  # times and other numbers, by name
     note: str = ""  # a message to show, such as why the action is a safe one
 
     @classmethod
     def from_obs(cls, obs: Obs, tick: int, **fields: Any) -> ViewerFrame:
-        """Make a frame of an observation.
+        """Make a frame from an observation.
 
         Args:
             obs: The observation, whose arrays are copied.
@@ -73,7 +75,7 @@ class ViewerFrame:
             fields: Further fields.
 
         Returns:
-            The frame, with the time of `info["captured_at"]` if the observation has it, else the
+            The frame. Its time is `info["captured_at"]` if the observation has that key, else the
             current time.
         """
         state = {name: np.array(values) for name, values in obs.state.items()}
@@ -89,10 +91,11 @@ class ViewerFrame:
 
 
 class RerunRecordings:
-    """Writes a recording of each episode, on the timelines `tick` and `time`.
+    """Writes one Rerun recording for each episode, on the timelines `tick` and `time`.
 
-    Cameras are `cameras/NAME`, parts of the state `state/NAME`, the actions `action/executed`,
-    `action/planned` and `action/chunk`, times and other numbers `timing/NAME`, and notes `log`.
+    The entities are `cameras/NAME`, `state/NAME` for each part of the state, `action/executed`,
+    `action/planned` and `action/chunk`, `timing/NAME` for times and other numbers, and `log` for
+    notes.
     """
 
     def __init__(self, target: str) -> None:
@@ -106,11 +109,14 @@ class RerunRecordings:
         self._rerun = require("rerun")
         self._folder = None if is_live else Path(target)
         self.closing_s = CLOSING_S if self._folder is None else None
-        """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
+        """Time limit, s, for writing the remaining frames when the recordings are closed; None for
+        no limit.
+        """
 
         if self._folder is None:
             self._require_listener()
-            self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
+            # By default the SDK waits forever for a viewer that has ended.
+            self._rerun.unregister_shutdown()
         else:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
@@ -206,12 +212,12 @@ class EpisodeViewer:
             with viewer.episode("stack_0", "stack the cups"):
                 viewer.add(ViewerFrame.from_obs(obs, tick=0, executed=action))
 
-    `add` puts the frame into a queue and returns. If the queue is full, because the disk or the
-    other side of a live connection is slow, the frame is dropped and counted in `dropped`. If
-    writing fails, the rest of the episode is not shown; the error is logged, and kept in `error`.
+    `add` puts the frame into a queue and returns. If the queue is full, because the disk or a live
+    viewer is slow, the frame is dropped and counted in `dropped`. If writing fails, the remaining
+    frames of the episode are not shown; the error is logged and stored in `error`.
 
     Args:
-        target: Where episodes are written to.
+        target: The folder or the address to which episodes are written; see `open_viewer`.
         frames: The largest number of frames in the queue.
     """
 
@@ -235,8 +241,8 @@ class EpisodeViewer:
 
     @contextlib.contextmanager
     def episode(self, name: str, instruction: str = "") -> Iterator[None]:
-        """Show the frames that are added within the context as one episode, however the context
-        ends.
+        """Show the frames that are added within the context as one episode, even if the context
+        ends with an exception.
 
         Args:
             name: The name of the episode, and of its file.
@@ -300,10 +306,10 @@ class EpisodeViewer:
                     for frame in frames:
                         writer.write(frame)
                 self.episodes += 1
-            except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
+            except Exception as error:  # noqa: BLE001 - the run continues without the viewer
                 logger.warning("rerun: episode %s is not shown: %s", name, error)
                 self.error = self.error or error
-            for _ in frames:  # those that were not written
+            for _ in frames:  # drop the frames that were not written
                 pass
 
     def _frames_of_episode(self) -> Iterator[ViewerFrame]:
@@ -317,7 +323,7 @@ class EpisodeViewer:
 
 
 class LoopView:
-    """Shows one run in a viewer; does nothing if there is no viewer."""
+    """Shows the episodes of one run in a viewer; does nothing if there is no viewer."""
 
     def __init__(self, viewer: EpisodeViewer | None) -> None:
         self._viewer = viewer
@@ -325,8 +331,8 @@ class LoopView:
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
-        """Show the frames added within the context as one episode, with its time (UTC) as its
-        name.
+        """Show the frames added within the context as one episode, whose name is the present time
+        (UTC).
         """
         if self._viewer is None:
             return contextlib.nullcontext()
@@ -343,7 +349,7 @@ class LoopView:
         work_s: float,
         stop: str = "",
     ) -> None:
-        """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop;
+        """Show a tick with `work_s`, the computing time of the loop, and the reason of a stop;
         never waits.
         """
         viewer = self._viewer

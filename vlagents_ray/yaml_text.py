@@ -1,4 +1,6 @@
-"""The one reader of YAML: a key that is written twice is an error, and `1e-4` is a number."""
+"""The YAML reader of the whole package: a key that is written twice is an error, and `1e-4` is a
+number.
+"""
 
 from __future__ import annotations
 
@@ -47,13 +49,13 @@ def read_yaml(file: Path | str, *, extra: str = "serve") -> Any:
         return load_yaml(Path(file).read_text(encoding="utf-8"), extra=extra)
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read ({error.strerror})") from error
-    except ValueError as error:  # also of a file that is not UTF-8
+    except ValueError as error:  # includes the error for a file that is not UTF-8
         raise ConfigError(f"{file}: not YAML ({error})") from error
 
 
 @functools.cache
 def _loader(yaml: Any) -> Any:
-    """Return a class of PyYAML's that rejects a key that is written twice, and reads `1e-4` as a
+    """Return a PyYAML loader class that rejects a key that is written twice, and reads `1e-4` as a
     number.
     """
 

@@ -94,5 +94,5 @@ def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(
     context.load_cert_chain(*ours.sign("server"))
     with http_server(context, "0.0.0.0") as port:  # noqa: S104 - for 127.0.0.2
         agent = RemoteAgent(f"https://{host}:{port}", ca=ours.file, timeout_s=TIMEOUT_S)
-        with pytest.raises(ConfigError, match="write the URL with a name that the certificate has"):
+        with pytest.raises(ConfigError, match="write the URL with a host name of the certificate"):
             agent.initialize()

@@ -1,4 +1,6 @@
-"""The client, which runs on the robot or with the environment: a remote policy as an `Agent`."""
+"""The client, which represents a remote policy as an `Agent`; it runs on the robot or in the
+environment's process.
+"""
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent

@@ -1,4 +1,4 @@
-"""RemoteAgent: a policy on a server, used like one in this process."""
+"""`RemoteAgent`: a policy on a server, used like a policy in this process."""
 
 from __future__ import annotations
 
@@ -40,18 +40,20 @@ if TYPE_CHECKING:
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
 
-    When the replica stops, crashes or has more sessions than others, the session continues on
-    another replica within `timeout_s`. If the old replica still runs, the session moves with all
-    its state. Otherwise the client resumes it with the same instruction and options and sends the
-    last observations (`Contract.history` of them; see `Observes.observe`); `act.info["resumed"]` is
-    then set. A replica whose process is frozen, so that it answers no ping for 2 s, is left as soon
-    as another one answers. If a replica has not answered for 5 s in calls that reached their
-    deadlines, the next call uses another replica, if one answers. A session never acts twice on one
-    observation.
+    When the replica stops, crashes or has more sessions than other replicas, the session continues
+    on another replica within `timeout_s`. If the old replica still runs, the session moves with all
+    its state. Otherwise the client resumes the session with the same instruction and options, and
+    sends the last `Contract.history` observations (see `Observes.observe`); `act.info["resumed"]`
+    is then set. If the process of a replica is frozen, so that it answers no ping for 2 s, the
+    client switches to another replica as soon as that replica answers. If a replica has not
+    answered for 5 s in calls that reached their deadlines, the next call uses another replica, if
+    any answers. The policy never computes two actions for the same observation.
     """
 
     statistics: dict[str, Any] | None = None
-    """The ranges of the policy's training, once it is initialized; see `HasStatistics`."""
+    """The ranges of the policy's training data, available after `initialize`; see
+    `HasStatistics`.
+    """
 
     def __init__(
         self,
@@ -68,31 +70,31 @@ class RemoteAgent(Agent):
         certificate: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
         commands: CommandInbox | None = None,
     ) -> None:
-        """Set the server; `initialize`, or the first `reset`, connects.
+        """Set the server, without connecting; `initialize` or the first `reset` connects.
 
         Args:
             url: `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-            transport: "auto" selects the fastest available: shared memory to a server of the same
-                user on this machine, else a WebSocket; inside the cluster a plasma channel to a
-                replica on this node, else a Serve handle. The others force one. `agent.transport`
-                names it, once connected.
+            transport: "auto" selects the fastest available transport: shared memory to a server of
+                the same user on this machine, else a WebSocket; inside the cluster also a plasma
+                channel to a replica on this node, else a Serve handle. The other values force a
+                transport. `agent.transport` is the name of the transport in use.
             timeout_s: Time limit of a `reset` or `act`; an observation's `info["deadline_ms"]`
-                shortens it for its `act`. 2 to 5 s suit a robot, since a call to a policy that
-                hangs lasts until this limit.
+                shortens it for its `act`. 2 to 5 s suit a robot, since a call to a hanging policy
+                lasts until this limit.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still
                 loading, by default `timeout_s`; after 2 s, a warning is logged.
             codec: The encoding of images for a network: "auto" is JPEG, which changes the pixels a
                 little, and "exact" is PNG; to a server on this machine, both leave the pixels raw.
-                "raw", which is faster from 300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an
-                `ImageCodec` force one.
-            priority: The priority of the requests: those of a "robot" are answered before those of
-                a "simulation".
+                "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` force an encoding; "raw" is
+                faster on a network of more than 300 MB/s (2.4 Gbit/s).
+            priority: The priority of the requests: requests of a "robot" are answered before
+                requests of a "simulation".
             resume: If False, the loss of a session raises `ConnectionLost`, and the episode needs a
                 new `reset`.
             api_key: The API key, for a server that requires one; by default the value of
                 `VLAGENTS_RAY_API_KEY`.
-            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the
-                system's.
+            ca: For `https://` and `wss://`: the PEM file with the certificates of the CAs that the
+                client trusts; by default the CAs of the system.
             certificate: The PEM files of this client's certificate and its key, for a server that
                 requires one.
             commands: Receives the commands from the live page to this agent's session; by default
@@ -125,8 +127,8 @@ class RemoteAgent(Agent):
         self._tracer = tracer()
 
     def sessions(self, n: int) -> list[Self]:
-        """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`;
-        close each of them.
+        """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; the
+        caller closes each of them.
         """
         agents = [copy.copy(self) for _ in range(n)]
         for agent in agents:
@@ -155,14 +157,14 @@ class RemoteAgent(Agent):
 
     @property
     def codec(self) -> ImageCodec | None:
-        """The codec of the cameras; None until it is chosen when the agent connects."""
+        """The codec of the camera images; None before the agent has connected."""
         if self.transport in ("shm", "plasma", "handle"):
             return RAW
         return self._connection.codec.codec
 
     @property
     def reconnects(self) -> int:
-        """The number of reconnections, after a lost connection or at the server's request."""
+        """The number of reconnections after lost connections or at the server's request."""
         return self._connection.reconnects
 
     @property
@@ -182,7 +184,7 @@ class RemoteAgent(Agent):
 
         Raises:
             PolicyUnavailable: The server does not become ready.
-            MalformedMessage: Its metadata have a value of another type.
+            MalformedMessage: The server's metadata contain a value of the wrong type.
         """
         self._connection.open()
         weights = (self._connection.metadata or {}).get("weights") or {}
@@ -202,10 +204,10 @@ class RemoteAgent(Agent):
     ) -> dict[str, Any]:
         """Begin an episode; `kwargs` are passed to the policy's `reset`.
 
-        `checkpoint` and `checkpoint_step` are not passed on: they select one of
-        `metadata["checkpoints"]`, which the returned info names. With `contract`, that of the robot
-        or the environment, the server first compares it with the policy's, and raises
-        `ContractMismatch` with every difference.
+        `checkpoint` and `checkpoint_step` are not passed to the policy: they select one of
+        `metadata["checkpoints"]`; the returned info contains the name of the selected checkpoint.
+        If `contract`, the contract of the robot or the environment, is given, the server first
+        compares it with the policy's contract. `ContractMismatch` then lists every difference.
         """
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
         if isinstance(info, Exception):
@@ -229,7 +231,7 @@ class RemoteAgent(Agent):
             instructions: The instruction of each session.
             sessions: Agents returned by `sessions` of this agent, or this agent itself.
             contract: The contract of the robot or the environment, as in `reset`.
-            seeds: The option `seed` of each session's reset, in place of one for all.
+            seeds: The option `seed` for the reset of each session, if the seeds differ.
             kwargs: Options of the policy's `reset`, the same for all sessions.
 
         Returns:
@@ -278,11 +280,12 @@ class RemoteAgent(Agent):
     def act(self, obs: Obs) -> Act:
         """Return the next action, (D,) float32, or chunk of actions, (H, D).
 
-        `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last
-        byte of the request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has
-        finished), `encode_ms`, and `total_ms`, which is their sum and the time between them. The
-        client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its own coding, the network,
-        and proxies. `batch_size` is a number of requests, not a time.
+        `act.info["timing"]` contains the duration of each stage in milliseconds. The server starts
+        to measure when it has received the last byte of the request: `decode_ms`, `queue_ms`,
+        `inference_ms` (until the device has finished), `encode_ms`, and `total_ms`, which also
+        includes the time between these stages. The client adds `round_trip_ms` and `wire_ms`, which
+        is `round_trip_ms` minus `total_ms`: encoding and decoding by the client, the network, and
+        proxies. `timing` also contains `batch_size`, the number of requests in the batch.
         """
         commands = self._commands
         require_obs(obs)
@@ -301,8 +304,8 @@ class RemoteAgent(Agent):
             agent.reset_batch(observations, ["pick up the cube"] * 16, envs)
             acts = agent.act_batch(observations, envs)
 
-        The server runs them in as few batches as its limit allows. An exception affects only its
-        own session.
+        The server computes the actions in as few batches as its batch limit allows. An exception in
+        the returned list affects only the session at its index.
         """
         begun = time.perf_counter()
         client_sessions = self._client_sessions(sessions)
@@ -334,17 +337,19 @@ class RemoteAgent(Agent):
 
     @property
     def longest_prefix(self) -> int:
-        """The most rows of the executed plan with which a chunk begins; see `BeginsWithPlan`."""
+        """The largest number of rows of the executed plan with which a chunk begins; see
+        `BeginsWithPlan`.
+        """
         rows = (self.metadata or {}).get("longest_prefix")
         return rows if type(rows) is int and rows > 0 else 0
 
     @property
     def reads_slo(self) -> bool:
-        """Whether the server reads an SLO at a reset; see `ReadsSlo`."""
+        """Whether the server accepts an SLO in a reset; see `ReadsSlo`."""
         return bool((self.metadata or {}).get("reads_slo"))
 
     def close(self) -> None:
-        """End the session. A later `reset` begins another one."""
+        """End the session. A later `reset` begins a new session."""
         self._connection.end_session(self._session, self._session.id)
         self._session = ClientSession(self._connection, self._priority)
 
@@ -357,7 +362,7 @@ class RemoteAgent(Agent):
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
                 raise ConfigError(
                     "sessions: expected agents made by sessions() of this agent, which share its "
-                    "connection, got others; make them so"
+                    "connection, got other agents; make them with sessions()"
                 )
             client_sessions.append(agent._session)
         return client_sessions
@@ -374,7 +379,8 @@ class RemoteAgent(Agent):
         if self._tracer is None:
             return call(requests, timeout_s)
 
-        # The span is a child of the caller's, if there is one, and the parent of the server's.
+        # The span is a child of the caller's span, if there is one, and the parent of the server's
+        # span.
         trace: Any = require("opentelemetry.trace", extra="otel")
         context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
         name = f"vlagents {requests[0].op}"
@@ -406,7 +412,7 @@ class RemoteAgent(Agent):
         episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
             session.failed(reply.error, resumes=self._resume)
-            return reply.error or PolicyFailed("act: the server's reply holds no action")
+            return reply.error or PolicyFailed("act: the server's reply contains no action")
 
         session.begun(reply)
         if episode.recent.maxlen:
@@ -420,7 +426,7 @@ class RemoteAgent(Agent):
 
 
 def _deadline_s(obs: Sequence[Obs]) -> float:
-    """Return the time, s, until the most urgent observation no longer needs an answer."""
+    """Return the time, s, until the earliest deadline of the observations."""
     deadlines_ms = [session.info[DEADLINE] for session in obs if DEADLINE in session.info]
     for deadline_ms in deadlines_ms:
         if not isinstance(deadline_ms, (int, float)) or not deadline_ms > 0:

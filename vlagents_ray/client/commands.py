@@ -1,5 +1,5 @@
-"""Commands from the live page to a robot, which arrive in the replies to its requests. They can
-only pause or stop it, or end its episode.
+"""Commands from the live page to a robot, which arrive in the replies to the robot's requests. A
+command can only pause or stop the robot, or end its episode.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"
 # The entry of `Obs.info` with the outcomes of commands, by id: the reason of the rejection, or ""
 # if the command was executed.
 COMMANDED = "commanded"
-COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
+COMMANDS = ("pause", "stop", "success", "failure")  # no command can start a motion
 logger = logging.getLogger(__name__)
-_NAME_CHARACTERS = 80  # the maximum length of a name from the network; longer ones are cut
+_NAME_CHARACTERS = 80  # the maximum length of a name from the network; longer names are truncated
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command from the live page."""
 
-    id: str  # identifies the answer for the server
+    id: str  # identifies the command when its outcome is sent to the server
     do: str  # one of `COMMANDS`
     by: str = ""  # name of the API key used for the command; empty on a server without keys
 
@@ -54,10 +54,11 @@ class CommandInbox:
                 f"allow: expected only {list(COMMANDS)}, got {unknown}; leave these out"
             )
 
-        self.control = RobotControl()  # the control of the last run
+        self.control = RobotControl()  # the `RobotControl` of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
-        # Outcomes by the command's id: the reason of a rejection, or "" if it was executed.
+        # Outcomes by the id of the command: the reason of a rejection, or "" if the command was
+        # executed.
         self._outcomes: dict[str, str] = {}
         self._sent_outcomes: dict[str, str] = {}  # the outcomes in the last request
 
@@ -67,12 +68,12 @@ class CommandInbox:
         return replace(obs, info={**obs.info, COMMANDED: outcomes}) if outcomes else obs
 
     def receive(self, act: Act | Exception) -> None:
-        """Remove the command from the answer to the last request, and queue or reject it. An
-        invalid entry is ignored.
+        """Remove the command from the answer to the last request, and queue or reject the command.
+        An invalid entry is ignored.
         """
         if isinstance(act, Exception):
             return
-        for sent_id in self._sent_outcomes:  # the server has received these
+        for sent_id in self._sent_outcomes:  # the server has received these outcomes
             self._outcomes.pop(sent_id, None)
 
         entry = act.info.pop(COMMAND, None)
@@ -95,7 +96,7 @@ class CommandInbox:
 
     @property
     def waiting(self) -> list[Command]:
-        """The commands that were received and have not been executed yet, oldest first."""
+        """The received commands that have not been executed yet, oldest first."""
         return list(self._waiting)
 
     def apply(self, control: RobotControl) -> list[Command]:

@@ -42,29 +42,31 @@ from vlagents_ray.protocol.messages import (
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
-# The deadline sent to the server is shorter by the time of transport: this share of the deadline,
-# but at most this many seconds.
+# The deadline that is sent to the server is earlier, to leave time for the transport of the answer:
+# this share of the remaining time, but at most this many seconds.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
 # The time limit for finding another replica, and the pause between two attempts, s.
 _LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0
-# The time limit while the present replica is silent. The load balancer may still choose that one,
-# so that both attempts within this time, the first a third of it, fail. A look-up that has failed
-# begins again at once, and the balancer marks the silent replica as down meanwhile.
+# The time limit for finding another replica while the present replica is silent. The time limit
+# contains two attempts, of which the first lasts for a third of it. Both may fail, since the load
+# balancer may still choose the silent replica. A failed look-up is repeated at once, until the load
+# balancer marks the silent replica as down.
 _SILENT_LOOK_UP_S = 1.2
 # The time without any answer, s, over one or several calls, after which the next call uses another
 # replica, although the replica answers pings or cannot be pinged.
 SILENT_S = 5.0
-# The time for which a ping is unanswered, s, after which another replica is looked up, and after
-# which that one is used.
+# Durations of an unanswered ping, s: after the first, the client looks for another replica, and
+# after the second, it uses that replica.
 _LOOK_UP_AFTER_S, FROZEN_S = 0.5, 2.0
 
 
 class Connection:
-    """Connects on first use, and again after the connection is lost or the replica asks for it.
+    """Connects on first use, and again after the connection is lost or the replica requests a
+    reconnection.
 
-    A replica that asks for a reconnection still answers, so its connection is used until another
-    replica has answered. So is that of a replica that answers no ping, since it may continue. Only
-    one thread may use a connection at a time.
+    A replica that requests a reconnection still answers, so its connection is used until another
+    replica has answered. The connection to a replica that answers no ping is also used until then,
+    since that replica may recover. Only one thread may use a connection at a time.
     """
 
     def __init__(
@@ -81,12 +83,13 @@ class Connection:
 
         Args:
             url: The URL of the server.
-            new_transport: Makes a transport to the server, which gives up a frozen replica by this
-                watch.
-            codec: The choice of the codec of this connection.
+            new_transport: Makes a transport to the server, which uses the given watch to detect a
+                frozen replica.
+            codec: The codec choice of this connection.
             timeout_s: The default time limit of a call.
             connect_timeout_s: The default time limit of `open`.
-            leaves_silent: Whether to switch to another replica when one no longer answers.
+            leaves_silent: Whether to switch to another replica when the present replica no longer
+                answers.
         """
         self.url = url
         self.codec = codec
@@ -96,25 +99,25 @@ class Connection:
         self._make_transport = new_transport
         self.transport = self._new_transport()
 
-        # The server sends both when a transport connects; they are None before.
+        # The server sends these values when a transport connects; they are None before.
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None
-        self.users: set[object] = set()  # the owners of the sessions
+        self.users: set[object] = set()  # the objects that use this connection for a session
 
-        # The time of the first call since the last answer, time.monotonic(); None if the last call
-        # was answered.
+        # Start of the first call after the last answer, time.monotonic(); None if the last call was
+        # answered.
         self._silent_since: float | None = None
-        self._silent = False  # whether the silence has lasted for `SILENT_S`
-        # The transport to the silent replica, kept until another one answers, since its sessions
-        # may still be moved.
+        self._silent = False  # whether the replica has been silent for `SILENT_S`
+        # The transport to the silent replica. It stays open until another replica answers, since
+        # the sessions may still be moved from the silent replica.
         self._old_transport: Transport | None = None
         # The transport to the next replica, while the current one still answers.
         self._next: _NextTransport | None = None
-        self._look_up_at = float("-inf")  # time.monotonic(), earliest time of the next look-up
+        self._look_up_at = float("-inf")  # earliest time of the next look-up, time.monotonic()
 
         self.reconnects = 0  # the number of reconnections
         self._must_reconnect = False  # whether to connect again before the next request
-        # Whether the replica asked for a reconnection. It then keeps the sessions when its
+        # Whether the replica requested a reconnection. The replica then keeps the sessions when the
         # connection is closed.
         self._asked_to_move = False
 
@@ -151,8 +154,8 @@ class Connection:
             self._connected(self.transport.connect(limit_s))
 
     def _connected(self, metadata: dict[str, Any]) -> None:
-        """Store the metadata of the replica to which the transport has connected. If they are
-        invalid, close the transport.
+        """Store the metadata of the replica to which the transport has connected. Invalid metadata
+        close the transport.
         """
         try:
             if metadata.get("protocol") != PROTOCOL_VERSION:
@@ -167,15 +170,16 @@ class Connection:
             self.transport.close()
             raise
 
-        # The URL is not sufficient, as a tunnel to another machine also begins at a loopback
-        # address.
+        # A loopback address in the URL is not sufficient, since a tunnel to another machine also
+        # has one.
         is_near = (
             local is not None
             and local.boot_id == boot_id() != ""
             and is_loopback(urlsplit(self.url).hostname or "")
         )
         self.codec.connected(near=is_near)
-        self._silent, self._silent_since = False, None  # even if the transport is unchanged
+        # Necessary even if the transport is unchanged.
+        self._silent, self._silent_since = False, None
         self.metadata = metadata
 
     def _move(self) -> None:
@@ -198,12 +202,12 @@ class Connection:
         self._connected(next_transport.metadata)
 
     def _on_silence(self, silent_s: float, is_proxied: bool) -> None:
-        """Look for another replica while the present one does not answer a ping, and leave it when
-        another one has answered; called by the transport, see `ReplicaWatch`.
+        """Look for another replica while the present replica does not answer a ping, and switch
+        when another replica has answered. The transport calls this, see `ReplicaWatch`.
 
-        If there is no other one, the call continues to wait. Through a proxy, the next replica
-        cannot be compared with the present one. It has just answered, however, which a frozen one
-        does not.
+        If there is no other replica, the call continues to wait. Behind a proxy, it is unknown
+        whether the next replica is the present one. However, it has just answered, and a frozen
+        replica does not answer.
 
         Raises:
             ReplicaSilent: Another replica is connected.
@@ -242,9 +246,7 @@ class Connection:
                 self.open(timeout_s)
                 timeout_s -= time.monotonic() - begun
                 if timeout_s <= 0:  # nothing is sent; the next call uses the new connection
-                    late = DeadlineExceeded(
-                        f"{self.url}: connected again, but too late for this call"
-                    )
+                    late = DeadlineExceeded(f"{self.url}: reconnected, but too late for this call")
                     return [Reply(request.request_id, error=late) for request in requests]
 
             left_s = max(1e-3, timeout_s)
@@ -257,7 +259,7 @@ class Connection:
             if self._old_transport is not None:
                 self._close_old_transport()
             if self._next is not None and not self._asked_to_move:
-                self._drop_next()  # the replica was silent, and has answered after all
+                self._drop_next()  # the replica was silent, but has answered now
         except VLAgentsError as error:
             if isinstance(error, DeadlineExceeded):
                 self._silent_since = begun if self._silent_since is None else self._silent_since
@@ -268,7 +270,8 @@ class Connection:
             replies = [Reply(request.request_id, error=error) for request in requests]
 
         for reply in replies:
-            if reply.act is not None:  # a server must not set keys of the control loop
+            # A server must not set the keys that are reserved for the control loop.
+            if reply.act is not None:
                 for name in OF_THE_LOOP:
                     reply.act.info.pop(name, None)
         if len(replies) == len(requests) and not any(
@@ -282,7 +285,7 @@ class Connection:
     ) -> list[Reply]:
         """Record errors and whether to reconnect; return a reply for each request."""
         for reply in replies:
-            # The application existed, so the server is stopping or restarting.
+            # The application existed before, so the server is stopping or restarting.
             if isinstance(reply.error, UnknownApp):
                 reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
 
@@ -301,8 +304,8 @@ class Connection:
         return replies
 
     def end_session(self, user: object, session: str) -> None:
-        """End the session of `user`, if it was begun. The connection is closed with the last
-        session.
+        """End the session of `user`, if it has begun. Ending the last session closes the
+        connection.
         """
         was_begun = user in self.users
         self.users.discard(user)
@@ -315,7 +318,7 @@ class Connection:
                 "close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3
             )
             with contextlib.suppress(VLAgentsError):  # harmless: the server drops idle sessions
-                # This is still the old connection, which holds the session.
+                # The old connection is still open, and the session belongs to it.
                 self.transport.call([close], _CLOSE_S)
 
         if not self.users:
@@ -325,14 +328,16 @@ class Connection:
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
 
     def _close_old_transport(self) -> None:
-        """Close the transport to the former replica, in a thread, since that may take long."""
+        """Close the transport to the former replica in a thread, since closing may take long."""
         if self._old_transport is not None:
             threading.Thread(target=self._old_transport.close, daemon=True).start()
             self._old_transport = None
 
 
 def _is_same_replica(metadata: dict[str, Any] | None, other: dict[str, Any]) -> bool:
-    """Return whether both metadata come from the same replica, whose addresses no other one has."""
+    """Return whether both metadata come from the same replica; no two replicas have the same
+    addresses.
+    """
     names = ("local", "stream")
     addresses = [None if metadata is None else metadata.get(name) for name in names]
     return any(addresses) and addresses == [other.get(name) for name in names]
@@ -344,7 +349,8 @@ class _NextTransport:
     def __init__(self, transport: Transport, timeout_s: float) -> None:
         self.transport = transport
         self._timeout_s = timeout_s
-        self.metadata: dict[str, Any] | None = None  # of the replica; None if there was no answer
+        # Metadata of the replica; None if there was no answer.
+        self.metadata: dict[str, Any] | None = None
         self.ended = False
         self._dropped = False
         self._lock = threading.Lock()
@@ -362,7 +368,9 @@ class _NextTransport:
             if metadata.get("protocol") != PROTOCOL_VERSION:
                 metadata = None
         except VLAgentsError as error:
-            logger.info("the session stays at this replica, as no other was found: %s", error)
+            logger.info(
+                "the session stays on this replica, as no other replica was found: %s", error
+            )
         finally:
             with self._lock:
                 self.metadata, self.ended = metadata, True

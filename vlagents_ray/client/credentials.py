@@ -22,11 +22,12 @@ logger = logging.getLogger(__name__)
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
 WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.protocol")
 """The logger for websockets. At the level DEBUG, websockets logs the headers that it sends; this
-logger drops the lines with the key.
+logger drops the lines that contain the key.
 """
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
-# X509_V_ERR_HOSTNAME_MISMATCH and X509_V_ERR_IP_ADDRESS_MISMATCH: the certificate has other names.
+# X509_V_ERR_HOSTNAME_MISMATCH and X509_V_ERR_IP_ADDRESS_MISMATCH: the certificate is for other
+# names.
 _NAME_MISMATCH_CODES = (62, 64)
 
 
@@ -41,7 +42,7 @@ class Credentials:
     certificate: tuple[_Path, _Path] | None = None
 
     def __post_init__(self) -> None:
-        """Take the key from the environment if none was passed, and check it."""
+        """Read the key from the environment if none was passed, and check the key."""
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
             raise ConfigError(
@@ -61,7 +62,7 @@ class Credentials:
         return {} if self.api_key is None else {"authorization": f"Bearer {self.api_key}"}
 
     def use_at(self, url: str) -> None:
-        """Warn if the key would be sent to that URL unencrypted over a network."""
+        """Warn if the key would be sent to this URL over a network without encryption."""
         parts = urlsplit(url)
         if self.api_key is not None and parts.scheme in ("http", "ws"):
             warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
@@ -77,7 +78,7 @@ class Credentials:
 
         try:
             context = ssl.create_default_context(cafile=self.ca)
-        except OSError as error:  # ssl.SSLError is a subclass
+        except OSError as error:  # includes ssl.SSLError, a subclass
             raise ConfigError(
                 f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed "
                 f"the server's, in PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
@@ -112,7 +113,7 @@ def withheld() -> Iterator[None]:
 
 @cache
 def warn_of_plain_http(origin: str) -> None:
-    """Log, once per server, that an API key is sent to it unencrypted over a network."""
+    """Log, once per server, that an API key is sent over a network without encryption."""
     if not is_loopback(urlsplit(origin).hostname or ""):
         logger.warning(
             "%s: the API key is sent unencrypted, and others may read it; use https:// or wss://",
@@ -121,8 +122,8 @@ def warn_of_plain_http(origin: str) -> None:
 
 
 def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
-    """Return the error for a failed TLS handshake, with its cure. Only after a lost connection is a
-    retry useful.
+    """Return the error for a failed TLS handshake, with its cure. A retry is useful only if the
+    connection was lost.
     """
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
         return ConnectionLost(
@@ -132,8 +133,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     if isinstance(error, ssl.SSLCertVerificationError):
         if error.verify_code in _NAME_MISMATCH_CODES:
             cure = (
-                "write the URL with a name that the certificate has, or make a certificate with "
-                "this name"
+                "write the URL with a host name of the certificate, or make a certificate with "
+                "this host name"
             )
         else:
             cure = (
@@ -141,7 +142,7 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
                 "certificate, not of the server's, as ca=, or in SSL_CERT_FILE"
             )
         return ConfigError(
-            f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}"
+            f"{url}: the server's certificate is not trusted: {error.verify_message}; {cure}"
         )
 
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
@@ -161,8 +162,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
 
 
 def require_plain(url: SplitResult, timeout_s: float) -> None:
-    """Raise `ConfigError` if the URL is not encrypted but its port uses TLS, with any
-    certificate.
+    """Raise `ConfigError` if the URL is unencrypted but a server with TLS, whatever its
+    certificate, listens at its port.
     """
     if url.scheme not in ("http", "ws"):
         return
@@ -172,7 +173,7 @@ def require_plain(url: SplitResult, timeout_s: float) -> None:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
     except OSError as error:
-        # Only a server with TLS sends an alert.
+        # Only a TLS server sends an alert.
         if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):
             return
     port = url.netloc.rpartition("@")[2]

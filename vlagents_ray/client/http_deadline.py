@@ -1,7 +1,6 @@
-"""A socket for `http.client` whose exchanges end by a deadline, however slowly the server sends.
-
-The time limit of a plain socket applies to each read, so a server that sends a byte now and then
-could keep its client waiting forever.
+"""A socket for `http.client` with a deadline for each exchange, even if the server sends slowly.
+The time limit of a plain socket applies to each read, so a server that sends a byte from time to
+time could keep its client waiting forever.
 """
 
 from __future__ import annotations
@@ -26,7 +25,8 @@ class DeadlineSocket:
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
         self._deadline = math.inf  # time.monotonic()
-        self._pieces: list[Buffer] | None = None  # pieces of a request, until it is sent at once
+        # Pieces of a request, until the whole request is sent.
+        self._pieces: list[Buffer] | None = None
 
     @classmethod
     def install(cls, connection: http.client.HTTPConnection) -> DeadlineSocket:
@@ -52,10 +52,11 @@ class DeadlineSocket:
 
     @contextlib.contextmanager
     def sending_at_once(self) -> Iterator[None]:
-        """Send the data of all calls of `sendall` within the context together, at its end.
+        """Collect the data of all calls of `sendall` within the context, and send them together
+        when the context ends.
 
-        `http.client` sends the head of a request and its body one after the other, which would
-        wake up the server twice.
+        `http.client` sends the headers and the body of a request separately, which would wake up
+        the server twice.
         """
         pieces: list[Buffer] = []
         self._pieces = pieces
@@ -107,6 +108,7 @@ class _AnswerReader(io.RawIOBase):
         return self._raw.readinto(buffer)
 
     def close(self) -> None:
-        # `http.client` may have closed the socket already, which stays open until now.
+        # `http.client` may have closed the connection already; the socket stays open until its
+        # reader is closed, here.
         self._raw.close()
         super().close()

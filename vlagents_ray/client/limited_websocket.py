@@ -1,8 +1,7 @@
-"""A WebSocket of `websockets` that ends if a message takes longer to send than its time limit.
-
-That package sends without a limit, and the kernel's own limit is not enough: it begins again
-whenever the peer has taken a few bytes. A server that hangs, or reads a byte now and then, would
-block a robot for minutes.
+"""A WebSocket of the package `websockets` whose connection ends if sending a message exceeds a time
+limit. The package sends without a limit, and the kernel's limit is not sufficient, since it
+restarts whenever the peer has read a few bytes. A server that hangs, or reads a byte from time to
+time, would block a robot for minutes.
 """
 
 from __future__ import annotations
@@ -24,34 +23,35 @@ _PERIOD_S = 0.1  # period at which the limits are checked
 
 
 class SharedConnection(ClientConnection):
-    """A connection whose threads may use a TLS socket at the same time: the `create_connection` of
-    `connect`. Without it, an opening handshake over TLS may be lost, and exceed its time limit.
+    """A connection with a TLS socket that several threads can use at the same time, for the
+    argument `create_connection` of `connect`. With a plain TLS socket, the opening handshake may be
+    lost, and exceed its time limit.
     """
 
     def __init__(self, sock: socket.socket, *args: Any, **options: Any) -> None:
-        """Begin to read a connected socket; the arguments are those of `ClientConnection`."""
+        """Begin to read a connected socket; takes the arguments of `ClientConnection`."""
         shared = SharedTlsSocket(sock) if isinstance(sock, ssl.SSLSocket) else sock
         super().__init__(cast("socket.socket", shared), *args, **options)
 
 
 class LimitedWebSocket:
-    """An open connection; a thread ends it when the limit of an operation is over."""
+    """An open connection, which a thread ends when the time limit of an operation has passed."""
 
     def __init__(self, connection: ClientConnection) -> None:
-        """Limit what is sent over a connection, until `close`."""
+        """Limit the duration of every send operation of a connection, until `close`."""
         self.connection = connection
         # Deadlines of the operations in progress, s of `time.monotonic`.
         self._deadlines: set[float] = set()
-        self._is_late = False  # whether the connection was ended since a limit was over
+        self._is_late = False  # whether the connection was ended because a time limit had passed
         self._closed = threading.Event()
         threading.Thread(target=self._watch, name="websocket-limit", daemon=True).start()
 
     def send(self, message: str | bytes, timeout_s: float) -> None:
-        """Send a message, a text if it is a `str`.
+        """Send a message: a text message for a `str`, otherwise a binary message.
 
         Raises:
             ConnectionClosed: The connection is closed.
-            OSError: The connection broke, or the server has not taken the message in time, which
+            OSError: The connection broke, or the server has not read the message in time, which
                 ends the connection.
         """
         with self._limited(timeout_s):
@@ -65,7 +65,7 @@ class LimitedWebSocket:
 
     @contextlib.contextmanager
     def _limited(self, timeout_s: float) -> Iterator[None]:
-        """End the connection if what is done within this context takes longer than `timeout_s`."""
+        """End the connection if this context lasts longer than `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         self._deadlines.add(deadline)
         try:
@@ -79,7 +79,7 @@ class LimitedWebSocket:
             self._deadlines.discard(deadline)
 
     def _watch(self) -> None:
-        """End the connection when a limit is over; runs on its own thread."""
+        """End the connection when a time limit has passed; runs on its own thread."""
         while not self._closed.wait(_PERIOD_S):
             now = time.monotonic()
             if any(deadline < now for deadline in tuple(self._deadlines)):
@@ -92,5 +92,5 @@ class LimitedWebSocket:
         thread.
         """
         self._closed.set()
-        with contextlib.suppress(OSError):  # it is closed already
+        with contextlib.suppress(OSError):  # the socket is already closed
             self.connection.socket.shutdown(socket.SHUT_RDWR)

@@ -1,9 +1,10 @@
-"""How a session continues after its client has lost an answer: the client's half of a move.
+"""The client's part of moving a session: how the session continues after the client has lost an
+answer.
 
-A failed request has one of four outcomes (`Outcome`), which its error and the session decide. The
-server's half is `vlagents_ray.serve.scaling.session_migration`: a replica that gets a request for a
-session that it does not have fetches that from the replica that has it. Only if there is none does
-the client resume the session from its own `ResumePoint`.
+A failed request has one of four outcomes (`Outcome`), which follow from its error and the session.
+The server's part is `vlagents_ray.serve.scaling.session_migration`: a replica that receives a
+request for a session of another replica fetches the session from that replica. Only if no replica
+has the session does the client resume it from a `ResumePoint`.
 """
 
 from __future__ import annotations
@@ -32,43 +33,44 @@ from vlagents_ray.protocol.messages import PriorityName, Reply, Request
 
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
-# No attempt begins with less time left than the smaller of these, in s and as a share of the time
-# limit: a late request would be executed after its caller has given up.
+# No attempt begins if the remaining time is less than the smaller of these two limits, in s and as
+# a share of the time limit: a late request would be executed after its caller has given up.
 _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
-# Errors after which a reset is sent again. A running replica rejects a reset if it is full, for
-# instance, which is the caller's to know.
+# Errors after which a reset is sent again. Other errors, such as the error of a full replica, are
+# returned to the caller.
 _RESET_AGAIN = (ConnectionLost, NoReplica)
-# Errors of an act after which no replica has the session. It is `NotReset` if a reset that was to
-# resume the session did not succeed.
+# Errors of `act` that mean that no replica has the session. The error is `NotReset` if a reset that
+# should have resumed the session failed.
 _LOST = (NotReset, UnknownSession, ReplicaSilent)
 
 
 class Outcome(Enum):
-    """What a session does after the reply to one of its requests."""
+    """The next step of a session after the reply to one of its requests."""
 
-    FINAL = "the reply is the result, be it an error"
-    AGAIN = "send the request again: the session, with its state, is where it arrives"
-    RESUME = "no replica has the session: begin it again from its `ResumePoint`"
-    UNKNOWN = "the policy may have acted on the request: the next one resumes the session"
+    FINAL = "the reply is the result, even if it is an error"
+    AGAIN = "send the request again: the replica that receives it has the session with its state"
+    RESUME = "no replica has the session: resume it from its `ResumePoint`"
+    UNKNOWN = "the policy may have executed the request: the next request resumes the session"
 
 
 @dataclass(slots=True)
 class ResumePoint:
-    """What a client has of its episode: the arguments of the reset, and the last observations.
+    """The data with which a client can resume an episode: the arguments of the reset, and the last
+    observations.
 
-    A replica that begins the episode again resets the policy, and shows it those observations. That
-    is less than the `SessionState` that replicas pass to each other, which has the policy's own
-    state.
+    A replica that resumes the episode resets the policy, and passes these observations to
+    `Observes.observe`. A `SessionState`, which replicas send to each other, also contains the
+    policy's own state.
     """
 
     obs: Obs  # the first observation
     instruction: str | None
     kwargs: dict[str, Any]
     contract: dict[str, Any] | None
-    # The last observations that were answered.
+    # The last answered observations.
     recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))
-    step: int | None = 0  # the server's count of acts; None if an answer may be lost
+    step: int | None = 0  # number of actions, counted by the server; None if an answer may be lost
 
 
 class ClientSession:
@@ -78,10 +80,12 @@ class ClientSession:
         self.id = uuid.uuid4().hex
         # None before the first reset and after the end of an episode.
         self.episode: ResumePoint | None = None
-        self.step: int | None = None  # the server's count in its last reply, of any episode
-        self.resumed = False  # whether the episode was resumed and no action has reported it yet
-        # Whether its replica was left as silent, so that the next act begins with a reset: a search
-        # for the session would wait for that replica.
+        self.step: int | None = None  # number of actions in the server's last reply, of any episode
+        # Whether the episode was resumed and `Act.info` has not reported this yet.
+        self.resumed = False
+        # Whether the client has left the session's replica because it was silent. The next `act`
+        # then begins with a reset, since a search for the session would wait for the silent
+        # replica.
         self.is_lost = False
         self._connection = connection
         self._priority: PriorityName = priority
@@ -102,7 +106,7 @@ class ClientSession:
         )
 
     def act(self, obs: Obs) -> Request:
-        """Return the request for an action; raises `NotReset` outside an episode."""
+        """Return the request for an action; raises `NotReset` if no episode has begun."""
         if self.episode is None:
             raise NotReset(
                 "expected a reset before act: this agent has no session, or lost it; reset it"
@@ -135,20 +139,22 @@ class ClientSession:
             return Outcome.RESUME
         if not isinstance(error, PolicyUnavailable):
             return Outcome.FINAL
-        # With a step, the replica that gets the request checks that no answer was lost.
+        # If the request has a step, the replica that receives it checks that no answer was lost.
         has_step = self.episode is not None and self.episode.step is not None
         return Outcome.AGAIN if has_step else Outcome.RESUME
 
     def failed(self, error: VLAgentsError | None, *, resumes: bool) -> None:
-        """Record that an act got no action; unless a lost session `resumes`, it needs a reset."""
+        """Record that `act` returned no action. A lost session needs a reset, unless it
+        `resumes`.
+        """
         if isinstance(error, DeadlineExceeded) and self.episode is not None:
-            self.episode.step = None  # the policy may have acted on this observation
+            self.episode.step = None  # the policy may have computed an action for this observation
         elif isinstance(error, ConnectionLost | UnknownSession) and not resumes:
             self.episode = None
 
     def begin_again(self, request: Request) -> Request:
-        """Return the reset that resumes the session under a new id; `request` follows it, with that
-        id.
+        """Return the reset that resumes the session under a new id, and set this id in `request`,
+        which is sent after the reset.
 
         With a new id, any later reply to `request` comes from the new session, even if the reply to
         the reset is late.
@@ -166,19 +172,19 @@ def call_with_recovery(
     requests: Sequence[Request],
     timeout_s: float,
 ) -> list[Reply]:
-    """Return the reply to one request of each session, from another replica if the session's
-    replica is gone.
+    """Send one request of each session and return the replies, from another replica if the
+    session's replica is gone.
 
-    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded`
-    for a session that is not resumed yet. The first action after an episode was resumed has
-    `info["resumed"]`.
+    The call retries until `timeout_s` has passed. Then the reply contains the last error, or
+    `DeadlineExceeded` for a session that is not resumed yet. The first action after an episode was
+    resumed has `info["resumed"]`.
     """
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
     replies = _first_replies(connection, sessions, requests, timeout_s)
     first_errors = [reply.error for reply in replies]
 
-    lost: set[int] = set()  # indices of the sessions that are to be resumed
+    lost: set[int] = set()  # indices of the sessions to be resumed
     pause_s = 0.0
     while True:
         outcomes = [
@@ -191,7 +197,7 @@ def call_with_recovery(
         time.sleep(pause_s)
         pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s + _FIRST_PAUSE_S)
 
-        # Resume the lost sessions by a reset.
+        # Resume the lost sessions with a reset.
         lost |= {i for i in failed if outcomes[i] is Outcome.RESUME}
         to_resume = [i for i in failed if i in lost]
         if to_resume:
@@ -208,7 +214,7 @@ def call_with_recovery(
         if time.monotonic() >= last_attempt:
             break
 
-        # Send the requests of all other sessions again, those just resumed included.
+        # Send the failed requests of all other sessions again, including the sessions just resumed.
         to_send = [i for i in failed if i not in lost]
         if to_send:
             for i in to_send:
@@ -226,7 +232,8 @@ def call_with_recovery(
         # The messages of these errors advise a reset, which is not needed here.
         if isinstance(reply.error, NotReset | UnknownSession) and request.op == "act":
             reply.error = DeadlineExceeded(
-                f"the session did not begin again within {timeout_s:g} s; the next act does"
+                f"the session was not resumed within {timeout_s:g} s; the next call of act resumes "
+                f"it"
             )
         reply.error = _with_cause(reply.error, first_error)
         if session.resumed and reply.act is not None:
@@ -255,17 +262,17 @@ def _first_replies(
     requests: Sequence[Request],
     timeout_s: float,
 ) -> list[Reply]:
-    """Return the replies to requests that are sent for the first time, or errors in their place if
-    a session has to be resumed before.
+    """Send requests for the first time and return their replies; return errors instead if a session
+    must be resumed first.
     """
     if requests[0].op != "act" or not any(session.is_lost for session in sessions):
         return _call(connection, sessions, requests, timeout_s)
 
     replies = []
     for session, request in zip(sessions, requests, strict=True):
-        error: VLAgentsError = PolicyUnavailable("not sent: another session is resumed before")
+        error: VLAgentsError = PolicyUnavailable("not sent: another session must be resumed first")
         if session.is_lost:
-            error = UnknownSession("its replica was silent, so that the client has left it")
+            error = UnknownSession("the client has left the session's replica, which was silent")
         replies.append(Reply(request.request_id, error=error))
     return replies
 
@@ -273,8 +280,8 @@ def _first_replies(
 def _with_cause(
     error: VLAgentsError | None, first_error: VLAgentsError | None
 ) -> VLAgentsError | None:
-    """Return the last error of a call with the loss of the connection that came before it: an
-    address that does not answer any more is no cause.
+    """Return the last error of a call. If the address no longer answers, add the loss of the
+    connection before it, which is the cause.
     """
     if error is first_error or not isinstance(first_error, ConnectionLost):
         return error

@@ -1,9 +1,9 @@
 """A TLS socket that one thread reads while others write.
 
-OpenSSL does not permit that, and Python 3.11 does not prevent it. While OpenSSL handles a session
-ticket of the server in a read, it keeps what another thread writes in a buffer that it drops with
-the ticket. So the opening handshake of about 1 in 100 WebSockets to a server on the same machine
-was never sent, and the client waited for the answer until its time limit.
+OpenSSL does not permit this use, and Python 3.11 does not prevent it. While a read handles the
+server's session ticket, OpenSSL puts the bytes that another thread writes into a buffer, which it
+discards after the ticket. As a result, about 1 in 100 WebSockets to a server on the same machine
+never sent the opening handshake, and the client waited for the answer until its time limit.
 """
 
 from __future__ import annotations
@@ -23,19 +23,21 @@ from typing import Any, TypeVar
 from vlagents_ray.protocol.frame_layout import Buffer
 
 T = TypeVar("T")
-# The longest time for which a thread waits before it looks again whether another one has read what
-# it waits for, s.
+# The longest time, s, before a waiting thread checks again whether another thread has already read
+# the expected bytes.
 _WAIT_S = 1.0
 
 
 class SharedTlsSocket:
     """Passes the calls of several threads to a connected TLS socket, one at a time.
 
-    No call waits for the network while it holds the lock. At most one thread may write at a time.
+    No call waits for the network while it has the lock. At most one thread may write at a time.
     """
 
     def __init__(self, tls: ssl.SSLSocket) -> None:
-        """Take over a socket whose TLS handshake is over; nothing else may use it from now on."""
+        """Take over a socket whose TLS handshake is complete; no other object may use the socket
+        afterwards.
+        """
         tls.setblocking(False)
         self._tls = tls
         self._timeout_s: float | None = None
@@ -43,11 +45,11 @@ class SharedTlsSocket:
         self._is_closed = False
 
     def __getattr__(self, name: str) -> Any:
-        """Return what else a socket has, such as its addresses."""
+        """Return any other attribute of the socket, such as its address."""
         return getattr(self._tls, name)
 
     def settimeout(self, timeout_s: float | None) -> None:
-        """Set the time limit of each further call, s."""
+        """Set the time limit of each later call, s."""
         self._timeout_s = timeout_s
 
     def recv(self, size: int) -> bytes:
@@ -63,7 +65,7 @@ class SharedTlsSocket:
         """Send bytes.
 
         Raises:
-            TimeoutError: The peer has not taken them in time.
+            TimeoutError: The peer has not read the bytes in time.
             OSError: The connection broke, or was closed.
         """
         deadline = self._deadline()
@@ -73,13 +75,13 @@ class SharedTlsSocket:
             unsent = unsent[count:]
 
     def shutdown(self, how: int) -> None:
-        """End a direction of the connection, or both; wakes the threads that wait."""
-        # The method of a TLS socket would also discard its state, which another thread uses.
+        """Shut down one or both directions of the connection; wakes the waiting threads."""
+        # `SSLSocket.shutdown` would also discard the TLS state, which another thread uses.
         socket.socket.shutdown(self._tls, how)
 
     def close(self) -> None:
         """Close the connection; calls of other threads end."""
-        with contextlib.suppress(OSError):  # it has ended already
+        with contextlib.suppress(OSError):  # the connection has already ended
             self.shutdown(socket.SHUT_RDWR)
         with self._lock:
             self._is_closed = True
@@ -89,7 +91,7 @@ class SharedTlsSocket:
         return float("inf") if self._timeout_s is None else time.monotonic() + self._timeout_s
 
     def _complete(self, call: Callable[[], T], deadline: float) -> T:
-        """Repeat a call that does not wait until OpenSSL can complete it."""
+        """Repeat a non-blocking call until OpenSSL completes it."""
         while True:
             with self._lock:
                 if self._is_closed:

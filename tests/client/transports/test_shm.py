@@ -70,7 +70,7 @@ def test_a_server_of_another_user_is_sent_nothing(
                 LocalAddress(NAME, boot_id(), keyed=keyed), Credentials("vlr_x")
             )
             with pytest.raises(
-                PolicyUnavailable, match=f"belongs to the user with the number {os.getuid() + 1}"
+                PolicyUnavailable, match=f"belongs to the user with the uid {os.getuid() + 1}"
             ):
                 transport.call([Request("act", Obs(), request_id="1")], 5)
             peer, _ = listener.accept()

@@ -20,30 +20,30 @@ from vlagents_ray.protocol.messages import Reply, Request
 logger = logging.getLogger(__name__)
 
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
-# Codecs that depend on the location of the server.
+# Names whose codec depends on the location of the server.
 _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}
 
-_ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
+_ANSWER_S = 2.0  # s, time limit for the first byte of the first replica's answer
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 SPIN_S = 150e-6  # s to poll for an answer before sleeping
 # s to wait for a replica's own port: a firewall may drop the packets
 DIRECT_S = 1.0
-# s for which an own port is not used after it could not be: a replica may have been restarting or
-# full, or the network down
+# s, pause before an own port that could not be used is tried again: the replica may have been
+# restarting or full, or the network down
 AVOIDED_S = 30.0
-FAST_S = 600e-6  # s; if an answer takes less, wake-up included, the next one is polled for
+FAST_S = 600e-6  # s; if an answer takes less, including the wake-up, the client polls for the next
 
-# The time without an answer after which a replica is pinged, the shortest time between two pings of
-# a connection, and the time between two checks, s. A server permits one ping each second.
+# The time without an answer after which a replica is pinged, the shortest time between two pings on
+# a connection, and the time between two checks, s. A server permits one ping per second.
 _PING_AFTER_S, _PING_PERIOD_S, _CHECK_PERIOD_S = 0.5, 1.25, 0.25
-PROBE_S = 5.0  # time limit of a ping that has a thread
+PROBE_S = 5.0  # time limit of a ping on its own thread
 
 
 def no_answer(address: str, timeout_s: float) -> DeadlineExceeded:
     """Return the error for a request without an answer, with likely causes."""
     return DeadlineExceeded(
-        f"{address}: no answer within {round(timeout_s, 3):g} s; the policy may need longer (raise "
-        "timeout_s) or hang in a call (the server's log then names the line)"
+        f"{address}: no answer within {round(timeout_s, 3):g} s; the policy may need more time "
+        f"(raise timeout_s), or hang in a call (the server's log then contains the line)"
     )
 
 
@@ -56,18 +56,17 @@ def connection_lost(address: str, reason: object) -> ConnectionLost:
 
 
 class ReplicaSilent(ConnectionLost):
-    """The client has left a replica that does not even answer pings: its process is frozen, or its
-    machine cannot be reached.
-
-    The connection is closed, so that the replica does not act on the request later.
+    """The client has left a replica that does not even answer pings: the replica's process is
+    frozen, or its machine cannot be reached. The connection is closed, so that the replica does not
+    execute the request later.
     """
 
 
 class ReplicaWatch:
-    """Finds out whether a replica that has not answered yet is alive, on one connection.
+    """Detects, for one connection, whether a replica that has not answered yet is alive.
 
-    The replica is pinged. Something in its process answers even while the policy's thread runs a
-    long batch or a checkpoint is loaded, but nothing does while the process is frozen.
+    The watch pings the replica. The replica's process answers pings even while the policy's thread
+    runs a long batch or loads a checkpoint, but not while the process is frozen.
     """
 
     def __init__(self, on_silence: Callable[[float, bool], None] | None = None) -> None:
@@ -75,20 +74,20 @@ class ReplicaWatch:
 
         Args:
             on_silence: Called several times a second while the replica does not answer a ping, with
-                the time since the first such ping, s, and `is_proxied`. It raises `ReplicaSilent`
-                to end the call. If None, the replica is not pinged.
+                the time since the first such ping, s, and `is_proxied`. The function raises
+                `ReplicaSilent` to end the call. If None, the replica is not pinged.
         """
-        # Whether the connection ends at a proxy, so that the metadata may be from another replica.
+        # Whether the connection ends at a proxy; then the metadata may be from another replica.
         self.is_proxied = False
         self._on_silence = on_silence
         self._check_at = float("inf")  # time of the next check, time.monotonic()
         self._pinged_at = float("-inf")  # time of the latest ping
-        # Time of the first ping since the last sign of life; None if none is unanswered.
+        # Time of the first ping since the last sign of life; None if no ping is unanswered.
         self._silent_since: float | None = None
 
     @property
     def is_silent(self) -> bool:
-        """Whether a ping, perhaps of an earlier call, is unanswered."""
+        """Whether a ping, perhaps one of an earlier call, is unanswered."""
         return self._silent_since is not None
 
     def begin(self) -> None:
@@ -97,7 +96,7 @@ class ReplicaWatch:
             self._check_at = time.monotonic() + _PING_AFTER_S
 
     def received(self) -> None:
-        """Record a sign of life: the replica has sent or taken bytes."""
+        """Record a sign of life: the replica has sent or read bytes."""
         self._silent_since = None
 
     def wait(
@@ -111,12 +110,12 @@ class ReplicaWatch:
         meanwhile.
 
         Args:
-            ping: Sends a ping, without waiting. None within a message, of which the replica has to
-                take bytes instead.
+            ping: Sends a ping, without waiting. None while a message is being sent; then the
+                replica must read bytes of the message instead.
 
         Raises:
             TimeoutError: The deadline has passed.
-            ReplicaSilent: The replica is given up.
+            ReplicaSilent: The client leaves the replica.
         """
         self.wait_until(lambda limit_s: _is_ready(connection, event, limit_s), deadline, ping)
 
@@ -126,17 +125,17 @@ class ReplicaWatch:
         deadline: float,
         ping: Callable[[], None] | None = None,
     ) -> None:
-        """Wait as `wait` does, but for something other than a socket.
+        """Wait like `wait`, but for a condition other than a socket.
 
         Args:
-            is_ready: Waits for at most the time that it is given, s, and returns whether the answer
-                is there. It may be called again after it has returned True.
+            is_ready: Waits for at most its argument, s, and returns whether the answer has arrived.
+                It may be called again after it has returned True.
             deadline: The time limit, time.monotonic().
             ping: Sends a ping, without waiting.
 
         Raises:
             TimeoutError: The deadline has passed.
-            ReplicaSilent: The replica is given up.
+            ReplicaSilent: The client leaves the replica.
         """
         while True:
             left_s = min(deadline, self._check_at) - time.monotonic()
@@ -147,10 +146,10 @@ class ReplicaWatch:
             self._check(is_ready, ping)
 
     def probe(self, is_alive: Callable[[], bool]) -> None:
-        """Ping on another thread, by a call that waits for the answer of the replica.
+        """Ping on another thread, with a call that waits for the replica's answer.
 
         Args:
-            is_alive: Returns whether the replica has answered, after `PROBE_S` at the latest.
+            is_alive: Returns whether the replica has answered; takes at most `PROBE_S`.
         """
 
         def ping() -> None:
@@ -169,7 +168,7 @@ class ReplicaWatch:
             if self._silent_since is None:
                 self._silent_since = now
 
-        # This process may have been paused itself, with the answer waiting in the socket.
+        # This process itself may have been paused, while the answer was already in the socket.
         is_silent = self._silent_since is not None and not is_ready(0.0)
         if is_silent and self._silent_since is not None and self._on_silence is not None:
             self._on_silence(now - self._silent_since, self.is_proxied)
@@ -178,15 +177,15 @@ class ReplicaWatch:
 class Transport(Protocol):
     """Sends requests, one frame at a time, to the replica of a server that `connect` chooses.
 
-    A request names its session, which ends with its `close` request or with the connection. An
-    error in a reply of the server is in `Reply.error`. After `close`, `connect` may choose another
-    replica.
+    A request contains the id of its session. A session ends with its `close` request or with the
+    connection. An error that the server returns is in `Reply.error`. After `close`, `connect` may
+    choose another replica.
 
     Raises:
         PolicyUnavailable: The server cannot be reached or is not ready.
-        ConnectionLost: The connection broke after the request was sent, or its replica was given up
-            (`ReplicaSilent`).
-        DeadlineExceeded: There was no answer in time.
+        ConnectionLost: The connection broke after the request was sent, or the client left the
+            replica (`ReplicaSilent`).
+        DeadlineExceeded: No answer arrived in time.
     """
 
     @property
@@ -198,10 +197,10 @@ class Transport(Protocol):
         """The name of the transport for users: "shm", "plasma", "websocket", "http" or "handle"."""
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Try once to reach the server; return its metadata."""
+        """Try once to reach the server, and return the server's metadata."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests as one frame and wait for their replies, in order. Nothing is ever sent
+        """Send requests as one frame and wait for their replies, in order. No request is ever sent
         twice.
         """
 
@@ -213,12 +212,12 @@ class ConnectReport:
     """Logs once, after 2 s of failed attempts to connect, that a server is not ready and that the
     client retries.
 
-    An unknown host name is logged immediately, as it is most often misspelt. The client still
+    An unknown host name is logged immediately, since it is usually misspelt. The client still
     retries, since the name of a container may be registered later.
     """
 
     def __init__(self, url: str, timeout_s: float) -> None:
-        """Begin; the attempts to connect last for `timeout_s` in total."""
+        """Begin a report of attempts to connect that last for `timeout_s` in total."""
         self._url = url
         self._begun, self._timeout_s = time.monotonic(), timeout_s
         self._logged = False
@@ -236,11 +235,9 @@ class ConnectReport:
 
 
 def first_timeout_s(timeout_s: float) -> float:
-    """Return the part of `timeout_s` that is the time limit for the first byte of the first
-    replica, s. The next replica gets twice that.
-
-    Every attempt to connect, however short, thus tries at least two replicas, as the first one may
-    hang.
+    """Return the time limit for the first byte of the first replica's answer, s, a part of
+    `timeout_s`. The time limit of the next replica is twice as long. So each attempt to connect,
+    however short, tries at least two replicas, since the first replica may hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
@@ -280,25 +277,26 @@ def await_answer(
     watch: ReplicaWatch,
     ping: Callable[[], None] | None,
 ) -> None:
-    """Wait for `connection`, which `poller` polls, as `watch.wait` does, but sleep only after
-    `spin_until`, s of `perf_counter`.
+    """Wait for `connection`, which `poller` polls, like `watch.wait`, but poll without sleeping
+    until `spin_until`, s of `perf_counter`.
     """
-    while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
+    while not poller.poll(0):  # a poll is much faster than the exception of an empty read
         if time.perf_counter() < spin_until:
-            # Other processes can use the core; waking up from a sleep would double the latency.
+            # Other processes can use the core meanwhile. A sleep would double the latency, because
+            # of the wake-up.
             os.sched_yield()
         else:
             watch.wait(connection, select.POLLIN, deadline, ping)
 
 
 class CodecChoice:
-    """The codec of a connection's cameras. It is the user's choice, or depends on the location of
-    the server.
+    """The codec of a connection's camera images. It is the user's choice, or depends on the
+    location of the server.
 
     Within a machine, "auto" and "exact" select raw pixels; over a network, "auto" selects JPEG and
-    "exact" PNG. On one core of a server, JPEG costs 3 ns per byte of pixels, encoded and decoded,
-    and leaves 7 to 10 % of the bytes, so it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s).
-    PNG costs 18 ns and leaves about half.
+    "exact" PNG. On one core of a server, encoding and decoding JPEG takes 3 ns per byte of pixels,
+    and the result has 7 to 10 % of the bytes. So JPEG is faster than raw pixels on networks of up
+    to 300 MB/s (2.4 Gbit/s). PNG takes 18 ns, and the result has about half of the bytes.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:

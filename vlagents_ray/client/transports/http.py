@@ -1,10 +1,10 @@
 """The HTTP transport: POST requests with binary frames on a persistent connection.
 
-They go to the own port of the replica that the server chooses for this client, which is in the
-metadata. If that port cannot be reached (because of a firewall, a tunnel of one port, or TLS, which
-ends at the proxy), the client uses `POST /v1/<op>` on the server's port, which is slower, with a
-header that leads to the same replica. Later it pings the replica's own port, and uses it after an
-answer.
+The server chooses a replica for this client. The requests go to this replica's own port, whose
+number is in the metadata. If that port cannot be reached (because of a firewall, a tunnel of one
+port, or TLS, which ends at the proxy), the client uses `POST /v1/<op>` on the server's port, which
+is slower, with a header that routes the requests to the same replica. Later, the client pings the
+replica's own port, and uses this port again after an answer.
 """
 
 from __future__ import annotations
@@ -75,15 +75,16 @@ from vlagents_ray.protocol.messages import (
     read_address,
 )
 
-_UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
-# Headers that are tried until the proxy's hash of one leads to the chosen replica, few, as each
-# costs a request, and the time limit of each, s: another replica may be frozen.
+_UNKNOWN_APP_S = 10.0  # a starting server has no route until its first replica exists
+# Maximum number of header values to try until the proxy's hash selects the chosen replica; it is
+# small, as each value costs a request. The second number is the time limit of each request, s,
+# since it may reach a frozen replica.
 _MOST_HEADERS, _HEADER_S = 4, 0.5
 
 
 class HttpTransport:
-    """The HTTP/1.1 transport. A header names the session, and routes all requests of this object to
-    one replica.
+    """The HTTP/1.1 transport. A header contains the session id, and routes all requests of this
+    object to one replica.
     """
 
     name = "http"
@@ -101,7 +102,7 @@ class HttpTransport:
 
         Args:
             machine: The least loaded replica on this machine is preferred; see `MACHINE_HEADER`.
-            watch: Finds out whether the replica is frozen, at its own port and behind the proxy.
+            watch: Detects whether the replica is frozen, at its own port and behind the proxy.
         """
         self._watch = watch
         self._machine, self._credentials = machine, credentials
@@ -112,7 +113,7 @@ class HttpTransport:
         # The own port of the replica behind the proxy that answered the last request; None before
         # the first answer.
         self._answered_by: StreamAddress | None = None
-        self._direct: _Link | None = None  # to the own port of the replica that answered
+        self._direct: _Link | None = None  # connection to the own port of the replica that answered
         self._direct_address: StreamAddress | None = None
         self._own_ports = _OwnPorts()
         self._has_answered = False  # whether an own port has answered
@@ -130,13 +131,14 @@ class HttpTransport:
         return metadata
 
     def read_metadata(self, timeout_s: float) -> dict[str, Any]:
-        """Return the metadata of the replica that the server chooses, without a connection to it.
-        This retries while the server is not ready.
+        """Return the metadata of the replica that the server chooses, without connecting to the
+        replica. This retries while the server is not ready.
         """
         url = self._url.geturl()
         deadline = time.monotonic() + timeout_s
         report = ConnectReport(url, timeout_s)
-        unknown_since: float | None = None  # time.monotonic() of the first answer without the app
+        # Time of the first answer that the app does not exist, time.monotonic().
+        unknown_since: float | None = None
         pause_s, attempt_s = 0.05, first_timeout_s(timeout_s)
 
         while True:
@@ -144,7 +146,7 @@ class HttpTransport:
             try:
                 return self._metadata(max(0.1, min(remaining_s, attempt_s)))
             except (PolicyUnavailable, DeadlineExceeded) as error:
-                # If the replica hangs, another session id selects another one.
+                # If the replica hangs, another session id selects another replica.
                 if isinstance(error, DeadlineExceeded):
                     self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
                 if isinstance(error, ConnectionLost):
@@ -165,13 +167,14 @@ class HttpTransport:
             pause_s = min(0.3, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
-        # The hash of the session id selects the replica that chooses the replica.
+        # The proxy's hash of the session id selects a replica, which then chooses the replica for
+        # this client.
         headers = {SESSION_HEADER: self._session, MACHINE_HEADER: self._machine}
         self._answered_by = None
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
             raise ConfigError(
-                f"{self._url.geturl()}: expected a vlagents_ray server, got another one "
+                f"{self._url.geturl()}: expected a vlagents_ray server, got another server "
                 f"({str(metadata)[:80]}); check the URL"
             )
         self._set_direct(read_address(StreamAddress, metadata.get("stream")))
@@ -192,14 +195,14 @@ class HttpTransport:
         document = _json(body)
         if not isinstance(document, dict):
             raise ConfigError(
-                f"{self._url.geturl()}: expected a vlagents_ray server, got another one "
+                f"{self._url.geturl()}: expected a vlagents_ray server, got another server "
                 f"({body[:80]!r}); check the URL"
             )
         return document
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one POST request. A response that is not a frame of replies becomes an error of the
-        server or of the proxy.
+        """Send one POST request. A response that is not a frame of replies is converted to an error
+        of the server or the proxy.
         """
         headers = {
             SESSION_HEADER: self._session,
@@ -215,14 +218,15 @@ class HttpTransport:
             if self._watch is not None:
                 self._watch.is_proxied = True
             probe = _ProxiedProbe(self._url, self._credentials, self._session, self._answered_by)
-            # After a silence, the proxy may give this call to a replica that would search for the
-            # session at the silent one. The client leaves as if that one had this call.
+            # After a silence, the proxy may route this call to a replica that searches for the
+            # session on the silent replica. So the watch treats this call as if the silent replica
+            # had received it.
             probe.accepts_first = self._watch is None or not self._watch.is_silent
             path = f"/v1/{op}"
             answer = self._link.exchange("POST", path, frame, headers, left_s(deadline), probe)
             self._answered_by = _address_of_link(self._link.alternate, op)
             if self._answered_by is not None:
-                # The replica before this one has ended, or its own port may be used again.
+                # The replica of the earlier calls has ended, or its own port can be used again.
                 self._set_direct(self._answered_by)
         status, kind, body = answer
         if status == 200:
@@ -231,7 +235,7 @@ class HttpTransport:
         return [Reply(request.request_id, error=error) for request in requests]
 
     def _set_direct(self, address: StreamAddress | None) -> None:
-        """Use the own port of the replica that answered, from the next call on."""
+        """Use the own port of the replica that answered, beginning with the next call."""
         if self._direct is not None:
             self._direct.close()
             self._direct = self._direct_address = None
@@ -262,8 +266,8 @@ class HttpTransport:
         return True
 
     def _choose_session(self, replica: StreamAddress, deadline: float) -> None:
-        """Choose a session id by whose hash the proxy leads the calls to the replica with that own
-        port. If a few attempts find none, they go to another replica.
+        """Choose a session id whose hash makes the proxy route the calls to the replica with this
+        own port. If a few attempts find no such id, the calls go to another replica.
         """
         session, answered_by = self._session, self._answered_by
         for _ in range(_MOST_HEADERS):
@@ -275,9 +279,10 @@ class HttpTransport:
                 address = read_address(StreamAddress, metadata.get("stream"))
                 if address is not None:
                     session, answered_by = self._session, address
-            except TooManyRequests:  # the session itself needs the rest of the key's rate
+            # The session itself needs the rest of the request rate of the API key.
+            except TooManyRequests:
                 break
-            except VLAgentsError:  # another replica may answer
+            except VLAgentsError:  # another replica may answer the next attempt
                 pass
             if answered_by == replica:
                 break
@@ -300,7 +305,7 @@ class HttpTransport:
                 self._watch.is_proxied = False
             answer = link.exchange("POST", path, frame, headers, left_s(deadline), link.is_alive)
         except ConnectionLost:
-            # The port may belong to a server of another protocol.
+            # A server of another protocol may have this port now.
             if not self._has_answered:
                 self._own_ports.avoid_all()
             raise
@@ -311,13 +316,13 @@ class HttpTransport:
         return None
 
     def _leave_direct(self) -> None:
-        """Use the server's port instead of an own port that did not execute a request."""
+        """Use the server's port instead of an own port that failed to execute a request."""
         if self._direct_address is not None:
             self._own_ports.avoid(self._direct_address)
         self._set_direct(None)
 
     def close(self) -> None:
-        """Close the connections; the next one may reach another replica."""
+        """Close the connections; a later connection may reach another replica."""
         self._link.close()
         if self._direct is not None:
             self._direct.close()
@@ -386,7 +391,7 @@ class _Link:
         self._credentials = credentials
         self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
         self.alternate = ""  # the header `Link` of the last answer
-        self._poller = select.poll()  # polls the connection
+        self._poller = select.poll()  # polls the socket of the connection
         self._answers_fast = True  # whether the last answer was immediate
 
     def exchange(
@@ -402,12 +407,12 @@ class _Link:
 
         Args:
             probe: Pings the replica, and returns whether it is alive. It is called on other
-                threads, as one connection carries one request at a time. If None, the replica is
-                not watched.
+                threads, as one connection carries one request at a time. If it is None, the replica
+                is not watched.
 
         Raises:
             NoReplica: Nothing was sent, as the address cannot be reached.
-            ConnectionLost: The connection broke, or the replica was given up.
+            ConnectionLost: The connection broke, or the client left the replica.
             DeadlineExceeded: There was no answer in time.
         """
         begun = time.monotonic()
@@ -436,7 +441,8 @@ class _Link:
             self.close()
             raise no_answer(self.url.geturl(), timeout_s) from error
         except ssl.SSLError as error:
-            # With TLS 1.3, the server checks the client's certificate only now.
+            # With TLS 1.3, the server checks the client's certificate only after the handshake, so
+            # the error occurs here.
             self.close()
             raise tls_failure(self.url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
@@ -482,7 +488,7 @@ class _Link:
             self._connection = None
 
     def is_alive(self) -> bool:
-        """Send a request over another connection. Whatever its answer, the process at the address
+        """Send a request over another connection. Any answer shows that the process at the address
         is alive.
         """
         link = _Link(self.url, self._credentials)
@@ -510,9 +516,9 @@ class _Link:
 class _ProxiedProbe:
     """Pings the replica of one call through the proxy, which may give a ping to another replica.
 
-    The header of the session leads a ping to the replica that has the request, until the proxy
-    marks that one as down. An answer is therefore a sign of life only if it comes from the replica
-    that answered the call before, or from the one that answered the first ping of this call.
+    The session header routes a ping to the replica that has the request, until the proxy marks this
+    replica as down. Therefore an answer is a sign of life only if it comes from the replica that
+    answered the previous call, or from the replica that answered the first ping of this call.
     """
 
     def __init__(
@@ -525,7 +531,7 @@ class _ProxiedProbe:
         self._url, self._credentials = url, credentials
         self._headers = {SESSION_HEADER: session}
         self._replicas = set() if answered_by is None else {answered_by}
-        # Whether the replica that answers the first ping is taken for the one of this call.
+        # Whether the replica that answers the first ping is assumed to be the replica of this call.
         self.accepts_first = True
 
     def __call__(self) -> bool:
@@ -541,7 +547,7 @@ class _ProxiedProbe:
             address = read_address(StreamAddress, metadata.get("stream"))
             if (
                 address is None
-            ):  # the replicas cannot be distinguished, so no other one is left to try
+            ):  # the replicas cannot be distinguished, so the client cannot choose another replica
                 return True
             if is_first:
                 self._replicas.add(address)
@@ -550,7 +556,9 @@ class _ProxiedProbe:
 
 
 def _address_of_link(header: str, op: str) -> StreamAddress | None:
-    """Return the own port of the replica that sent this header `Link`; None if it has none."""
+    """Return the own port of the replica that sent this header `Link`; None if it has no own
+    port.
+    """
     target = header.partition(">")[0].rpartition(":")[2].removesuffix(f"/{op}")
     port, slash, path = target.partition("/")
     if not (port.isascii() and port.isdecimal()):
@@ -561,9 +569,8 @@ def _address_of_link(header: str, op: str) -> StreamAddress | None:
 
 
 def _is_executed(answer: tuple[int, str, bytes]) -> bool:
-    """Return whether a replica may have executed a request that got this answer at its own port.
-
-    Otherwise another server has the port, or the replica takes no further connection.
+    """Return whether a replica may have executed a request, given the answer at its own port.
+    Otherwise another server has the port, or the replica accepts no further connection.
     """
     status, kind, _ = answer
     if not kind.startswith((CONTENT_TYPE, PROBLEM_TYPE)):
@@ -586,12 +593,12 @@ def http_url(url: str) -> SplitResult:
     """Return the http(s) form of a server's URL.
 
     Raises:
-        ConfigError: It is not the URL of a server.
+        ConfigError: The text is not the URL of a server.
     """
     try:
         parts = urlsplit(url)
         is_port = parts.port != 0
-    except ValueError as error:  # error of its port, or of an IPv6 address
+    except ValueError as error:  # raised for an invalid port or IPv6 address
         raise ConfigError(
             f"url: expected http(s)://HOST:PORT, with a port from 1 to 65535, got {url!r} ({error})"
         ) from error
@@ -605,7 +612,9 @@ def http_url(url: str) -> SplitResult:
 
 
 def _closed_by_peer(sock: socket.socket | None) -> bool:
-    """Return whether the server has closed an idle connection, which is then readable."""
+    """Return whether the server has closed an idle connection; the socket of a closed connection is
+    readable.
+    """
     if sock is None:
         return True
     poller = select.poll()
@@ -626,14 +635,14 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
         return MessageTooLarge(
             f"a proxy rejects bodies of this size ({text}); raise its limit, or send JPEG"
         )
-    if status in (401, 403):  # without a JSON document, as for a rejected WebSocket
+    if status in (401, 403):  # the answer has no JSON document, e.g. if a WebSocket was rejected
         return (Unauthorized if status == 401 else Forbidden)(
             f"the server rejects this API key, or requires one (HTTP {status}); set api_key or "
             f"{KEY_VARIABLE}"
         )
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
-    if status in (500, 502, 503, 504):  # from the proxy: no replica is ready
+    if status in (500, 502, 503, 504):  # the proxy answered, since no replica is ready
         return NoReplica(f"no replica answers (HTTP {status}: {text})")
     return VLAgentsError(f"HTTP {status}: {text}")
 
@@ -641,5 +650,5 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
 def _json(body: bytes) -> Any:
     try:
         return json.loads(body)
-    except (ValueError, RecursionError):  # not JSON, or JSON of a hostile server
+    except (ValueError, RecursionError):  # the body is not JSON, or is hostile JSON
         return None

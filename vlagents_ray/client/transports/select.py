@@ -25,10 +25,11 @@ class AutoTransport:
     """Uses shared memory if the policy runs on this machine for this user, otherwise a WebSocket.
 
     Inside the cluster, it uses shared memory, otherwise a plasma channel on the replica's node,
-    otherwise the Serve handle. Shared memory comes first because it is faster, as it needs no locks
-    and no framing of Ray. Plasma reaches a replica on this node whose socket is in another network
-    namespace. If the object store has no space for a channel, the handle is used instead: its
-    frames are in the store for a moment, or on disk if the store has no space for them.
+    otherwise the Serve handle. Shared memory is the first choice because it is faster, as it needs
+    no locks and no framing of Ray. Plasma reaches a replica on this node whose socket is in another
+    network namespace. If the object store has no space for a channel, the handle is used instead:
+    the handle puts its frames into the store only for a moment, or on disk if the store has no
+    space for them.
     """
 
     def __init__(
@@ -48,12 +49,13 @@ class AutoTransport:
         self._chosen: (
             ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None
         ) = None
-        # The Serve handle to the replica of a plasma channel, for frames too large for the channel.
+        # Serve handle to the replica of a plasma channel, for frames that are too large for the
+        # channel.
         self._handle: HandleTransport | None = None
 
     @property
     def name(self) -> str:
-        """The name of the chosen transport; "auto" before one is chosen."""
+        """The name of the chosen transport; "auto" before the choice."""
         return "auto" if self._chosen is None else self._chosen.name
 
     @property
@@ -108,7 +110,7 @@ class AutoTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests as one frame by the chosen transport, and return their replies."""
+        """Send requests as one frame with the chosen transport, and return their replies."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
         try:
@@ -122,7 +124,9 @@ class AutoTransport:
         return self._chosen.call(requests, timeout_s)
 
     def close(self) -> None:
-        """End the connection. The next one chooses again, since the server may have moved."""
+        """End the connection. The next connection selects a transport again, since the server may
+        have moved.
+        """
         if self._chosen is not None:
             self._chosen.close()
             self._chosen = self._handle = None
@@ -131,8 +135,8 @@ class AutoTransport:
         if local is None or not reaches(local):
             if self._only_shm:
                 raise ConfigError(
-                    f"{self._url}: expected the policy on this machine for transport 'shm', got "
-                    "one on another; use transport 'auto'"
+                    f"{self._url}: expected the policy on this machine for transport 'shm', got a "
+                    f"policy on another machine; use transport 'auto'"
                 )
             return None
         transport = ShmTransport(local, self._credentials, self._watch)
@@ -153,8 +157,8 @@ def select_transport(
     credentials: Credentials,
     watch: ReplicaWatch | None = None,
 ) -> Transport:
-    """Return the transport for a URL. The `watch` finds out whether its replica is frozen, if the
-    transport can ping it.
+    """Return the transport for a URL. The `watch` detects whether the replica is frozen, if the
+    transport can send pings.
 
     Raises:
         ConfigError: The URL does not support the transport.
@@ -167,12 +171,12 @@ def select_transport(
     unsupported = ("http", "websocket") if is_in_cluster else ("handle", "plasma")
     if transport in unsupported:
         raise ConfigError(
-            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together "
-            "with serve://APP"
+            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' are for "
+            f"serve://APP, 'http' and 'websocket' for http://HOST:PORT"
         )
 
     if not is_in_cluster:
-        http_url(url)  # raises for an invalid URL before anything is tried
+        http_url(url)  # raises for an invalid URL before any attempt to connect
     credentials.use_at(url)
     if transport in ("handle", "plasma"):
         app = urlsplit(url).netloc

@@ -46,12 +46,13 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.ray_tools import private
 
-_PAUSE_S = 0.2  # s before another replica is requested after one was lost
-_QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
+_PAUSE_S = 0.2  # pause after the loss of a replica before another replica is requested
+_QUERY_S = 10.0  # time between two queries for the replicas' nodes, which change over time
 # The longest wait for the first query, s. An application without a replica does not answer.
 _FIRST_QUERY_S = 3.0
-_CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
-_WRITE_MS = 1000  # longest wait for the channel, which should be free when a frame is written
+_CHUNK = 2**20  # bytes; Ray copies longer buffers with other threads
+# Time limit for a channel to become free; it should be free when a frame is written.
+_WRITE_MS = 1000
 
 
 class ClientApi(Protocol):
@@ -63,14 +64,14 @@ class ClientApi(Protocol):
     async def attach(
         self, node: str = "", boot_id: str = "", must_be_near: bool = False
     ) -> tuple[dict[str, Any], Any]:
-        """Return metadata and actor of the best replica for a client on that node."""
+        """Return the metadata and the actor of the best replica for a client on this node."""
 
     async def call(self, session_id: str, frame: Any, pause: float) -> bytes | float:
         """Return the replies to a frame of requests.
 
-        If the replica's process was paused while the frame may have waited, nothing is executed, as
-        the client may have left. The result is then a number of that pause, with which the client
-        sends the frame again.
+        If the replica's process was paused while the frame may have been waiting, nothing is
+        executed, since the client may have left. The result is then a number that identifies the
+        pause; the client sends the frame again with this number.
 
         Args:
             session_id: The caller's own session.
@@ -102,7 +103,7 @@ class HandleTransport:
 
         Args:
             app: The name of the application.
-            watch: Finds out whether the replica is frozen.
+            watch: Detects whether the replica is frozen.
             must_be_near: Whether to accept only replicas on this machine, even if others have far
                 less load.
         """
@@ -114,7 +115,9 @@ class HandleTransport:
         self._unanswered: list[Any] = []  # attempts to choose a replica that are still pending
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Choose a replica, or another one if the chosen one has ended; return its metadata."""
+        """Choose a replica, or another replica if the chosen replica has ended; return its
+        metadata.
+        """
         import ray
 
         if not ray.is_initialized():
@@ -136,13 +139,13 @@ class HandleTransport:
         while True:
             try:
                 return self._attach(max(0.0, min(attempt_s, deadline - time.monotonic())))
-            except ConnectionLost as error:  # Serve notices the loss of a node with a delay
+            except ConnectionLost as error:  # Serve detects the loss of a node with a delay
                 if time.monotonic() + _PAUSE_S > deadline:
                     raise PolicyUnavailable(str(error)) from error
                 report.failed(error)
                 time.sleep(_PAUSE_S)
             except DeadlineExceeded as error:
-                # The replica may hang; the handle may then choose another one.
+                # The replica may hang; the handle may choose another replica at the next attempt.
                 if time.monotonic() >= deadline:
                     raise PolicyUnavailable(
                         f"serve://{self._app}: no replica within {timeout_s:g} s"
@@ -166,7 +169,8 @@ class HandleTransport:
         except RayServeException as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error}") from error
         except TimeoutError as error:
-            # While it is pending, Serve counts it as load, and chooses another replica next.
+            # While this request is pending, Serve counts it as load, and chooses another replica
+            # next.
             self._unanswered.append(attaching)
             raise DeadlineExceeded(
                 f"serve://{self._app}: no replica within {timeout_s:g} s"
@@ -176,15 +180,15 @@ class HandleTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Make an actor call, and a second one if the first may have waited in a pause of the
-        replica; the frame is in plasma until the reply.
+        """Make an actor call, and repeat it if the first call may have waited while the replica was
+        paused. The frame is in plasma until the reply.
         """
         import ray
 
         deadline = time.monotonic() + timeout_s
 
-        # Ray stores a plain buffer in plasma, separately from its pickle. The pickle of an array
-        # would depend on the version of numpy.
+        # Ray stores a plain buffer in plasma, outside the pickle. The pickle of an array would
+        # depend on the version of numpy.
         content = pickle.PickleBuffer(encode_requests(requests, RAW))
         try:
             frame = ray.put(content)
@@ -207,7 +211,8 @@ class HandleTransport:
                 if not isinstance(answer, float):
                     return decode_replies(answer)
                 self._pause = answer
-        except ray.exceptions.RayTaskError as error:  # may be a TimeoutError of the replica
+        # May be a TimeoutError that the replica raised.
+        except ray.exceptions.RayTaskError as error:
             # It is unknown whether the replica executed the request.
             raise ConnectionLost(
                 f"serve://{self._app}: the replica failed: {error.cause}; reset again"
@@ -219,14 +224,14 @@ class HandleTransport:
             ray.cancel(pending)
             raise no_answer(f"serve://{self._app}", timeout_s) from error
         except ray.exceptions.RayError as error:
-            # The replica is gone, or the node that held the frame or the answer.
+            # The replica is gone, or the node with the frame or the answer is gone.
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
         """Call `ClientApi.lease` of the chosen replica.
 
         Raises:
-            VLAgentsError: The replica raised it.
+            VLAgentsError: The replica raised this error.
         """
         import ray
 
@@ -251,7 +256,9 @@ class HandleTransport:
         self._replica = None
 
     def _answer(self, pending: Any, deadline: float) -> bytes | float:
-        """Return the answer to a call of the replica, which is pinged meanwhile."""
+        """Wait for the answer to a call of the replica, ping the replica meanwhile, and return the
+        answer.
+        """
         import ray
 
         replica = self._replica
@@ -289,12 +296,12 @@ class ReplicaNodes:
     def __init__(self, app: str) -> None:
         self._app = app
         self._nodes: dict[str, int] = {}
-        self._asked: float | None = None  # time.monotonic() of the last query
+        self._asked: float | None = None  # time of the last query, time.monotonic()
         self._answer: Any = None  # the pending answer
 
     def query(self) -> dict[str, int]:
-        """Return the number of replicas on each node, by Ray's id, from the last answer; {} before
-        the first answer.
+        """Return the number of replicas on each node, by Ray's node id, from the last answer; {}
+        before the first answer.
         """
         import ray
         from ray import serve
@@ -317,8 +324,8 @@ class ReplicaNodes:
 
 
 def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_id: str = "") -> Any:
-    """Call a method of one replica, as Serve's own router does. A Serve handle cannot choose the
-    replica.
+    """Call a method of one particular replica, as Serve's own router does; a Serve handle cannot
+    choose the replica.
 
     `method` is a method of `ClientApi` or of `SiblingApi`.
     """
@@ -326,16 +333,16 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
     return replica.handle_request.remote(header, *args)
 
 
-# The plasma transport writes frames into mutable objects of the node's store. It is for a client on
-# the node of its replica.
+# The plasma transport, for a client on the node of its replica, writes frames into mutable objects
+# of the node's store.
 
 
 class PlasmaTransport(UnixTransport):
     """Writes raw frames into a channel that the replica leases to this connection, which is one
     session.
 
-    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. If a frame
-    is too large for the channel, a larger one is leased.
+    Any process of the cluster on the replica's node can use it: an actor, a task or a driver. If a
+    frame is too large for the channel, the client leases a larger channel.
     """
 
     name: ClassVar[str] = "plasma"
@@ -346,7 +353,7 @@ class PlasmaTransport(UnixTransport):
         self._handle = HandleTransport(app, must_be_near=True)
         self._channel: Any = None  # the ObjectRef of the channel
         self._capacity = 0
-        self._unread = False  # whether the replica may not have read the last frame yet
+        self._unread = False  # whether the last frame may still be unread
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Choose a replica with the Serve handle, connect to its socket, and return its metadata.
@@ -363,8 +370,8 @@ class PlasmaTransport(UnixTransport):
     def connect_to(
         self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float
     ) -> None:
-        """Connect as `connect` does, but to the replica that `handle` chose and that has this
-        metadata.
+        """Connect like `connect`, but to the replica that `handle` chose, whose metadata is
+        `metadata`.
         """
         node = this_node()
         if node is None:
@@ -376,13 +383,12 @@ class PlasmaTransport(UnixTransport):
         address = read_address(PlasmaAddress, metadata.get("plasma"))
         if address is None:
             raise ConfigError(
-                f"serve://{self._app}: its replica offers no plasma endpoint; use transport "
-                "'handle'"
+                f"serve://{self._app}: the replica has no plasma endpoint; use transport 'handle'"
             )
         if address.node != node:
             raise ConfigError(
                 f"serve://{self._app}: expected a replica on this node ({node[:8]}) for transport "
-                f"'plasma', got one on {address.node[:8]}; use transport 'handle', or 'auto'"
+                f"'plasma', got a replica on {address.node[:8]}; use transport 'handle', or 'auto'"
             )
 
         self._handle = handle
@@ -403,7 +409,8 @@ class PlasmaTransport(UnixTransport):
             key, self._capacity = self._handle.lease(
                 frame.total_bytes, max(1e-3, deadline - time.monotonic())
             )
-            # The id is sufficient, as the replica owns the object and keeps it until it ends.
+            # The id is sufficient, as the replica owns the object and keeps it until the replica
+            # ends.
             self._channel = ray.ObjectRef(key)
             private.register_writer(self._channel)
 
@@ -417,20 +424,20 @@ class PlasmaTransport(UnixTransport):
         return (message if written is None else message + written.message), None
 
     def _unsent(self) -> None:
-        self._unread = False  # if this frame was not read, the channel rejects a later one
+        self._unread = False  # if this frame is still unread, the channel rejects the next frame
 
     def _answered(self, freed: int) -> None:
         self._unread = False
 
     def close(self) -> None:
-        """End the session; the replica takes the channel back."""
+        """End the session; the replica then reclaims the channel."""
         super().close()
         self._channel, self._capacity, self._unread = None, 0, False
 
 
 def _chunks(buffers: Iterable[Buffer]) -> Iterator[memoryview]:
-    """Divide buffers into chunks. Ray copies longer buffers with six threads, and starting these
-    takes longer than the copy.
+    """Divide buffers into chunks. Ray copies longer buffers with six threads, and starting the
+    threads takes longer than the copy.
     """
     for buffer in buffers:
         for start in range(0, len(buffer), _CHUNK):

@@ -38,7 +38,7 @@ from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id, peer_uid
 
-_MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, and a margin
+_MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, plus a margin
 _CONTROL = socket.CMSG_SPACE(4)
 _PAGE = mmap.PAGESIZE
 
@@ -56,7 +56,7 @@ class UnixTransport(ABC):
         self._server = ""  # the address of the server's socket
         self._key: str | None = None  # the API key, sent first
         self._socket: socket.socket | None = None
-        self._poller = select.poll()  # polls the socket
+        self._poller = select.poll()  # polls the Unix socket
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._writer = shm_layout.ShmWriter()
         self._answers_fast = True  # whether the last answer was immediate
@@ -79,15 +79,15 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _unsent(self) -> None:
-        """Clean up after a message about the last requests that was not sent."""
+        """Clean up if the message about the last requests was not sent."""
 
     @abstractmethod
     def _answered(self, freed: int) -> None:
-        """Process a reply. Bit n of `freed` is set if the server no longer reads memory n."""
+        """Process a reply. Bit n of `freed` is set if the server no longer reads memory file n."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Write requests for the server, send it a message and return its replies. Late replies to
-        earlier requests are discarded.
+        """Write requests to shared memory, send a message to the server, and return the replies.
+        Late replies to earlier requests are discarded.
         """
         deadline = time.monotonic() + timeout_s
         connection = self._socket or self._open(timeout_s)
@@ -105,7 +105,7 @@ class UnixTransport(ABC):
             raise connection_lost(self.name, f"{error}; reset before the next act") from error
 
     def close(self) -> None:
-        """End the connection, and with it its sessions."""
+        """End the connection and its sessions."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -121,7 +121,7 @@ class UnixTransport(ABC):
             OSError: Writing or sending failed.
         """
         try:
-            while not self._is_free():  # the memory still holds requests that timed out
+            while not self._is_free():  # the memory still contains requests that timed out
                 try:
                     self._receive(connection)
                 except BlockingIOError:
@@ -133,7 +133,7 @@ class UnixTransport(ABC):
                 self._unsent()
                 raise
         except BaseException:
-            self._writer = shm_layout.ShmWriter()  # the server may not have received a layout
+            self._writer = shm_layout.ShmWriter()  # the server may not have received the new layout
             raise
 
     def _await(
@@ -166,7 +166,7 @@ class UnixTransport(ABC):
                     f"{self.name}: the server's socket does not answer ({error})"
                 ) from error
             except BaseException:
-                # an unencodable key, or Ctrl-C: nothing else refers to the socket
+                # e.g. an unencodable key or Ctrl-C: no other object refers to the socket
                 connection.close()
                 raise
             connection.setblocking(False)
@@ -179,14 +179,15 @@ class UnixTransport(ABC):
     def _ping(self) -> None:
         """Ping the server, unless the socket is full of messages that it has not read."""
         if self._socket is not None:
-            with contextlib.suppress(OSError):  # the next read reports it
+            with contextlib.suppress(OSError):  # the next read raises the error
                 self._socket.send(LocalAddress.PING)
 
     def _receive(self, connection: socket.socket) -> list[Reply]:
-        """Return the next replies, to any requests; none if the next message answers a ping.
+        """Return the next replies, to any requests; an empty list if the next message answers a
+        ping.
 
         Raises:
-            BlockingIOError: There are none yet.
+            BlockingIOError: No message has arrived yet.
         """
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
@@ -237,18 +238,17 @@ def _require_same_user(connection: socket.socket) -> None:
     uid = peer_uid(connection)
     if uid != os.getuid():
         raise PermissionError(
-            f"it belongs to the user with the number {uid}, not to {os.getuid()}, this process's "
-            "user"
+            f"it belongs to the user with the uid {uid}, not to {os.getuid()}, this process's user"
         )
 
 
 @dataclass(slots=True)
 class _Memory:
-    """A memory file of this client that the server also maps."""
+    """A memory file of this client, which the server also maps."""
 
     number: int
     map: mmap.mmap
-    busy: bool = False  # the server may still read it
+    busy: bool = False  # whether the server may still read the memory
 
 
 def reaches(local: LocalAddress) -> bool:
@@ -272,7 +272,7 @@ class ShmTransport(UnixTransport):
         self._server = f"\0{address.socket}"
         self._key = (credentials.api_key or "-") if address.keyed else None
         self._memories: list[_Memory] = []
-        # The memory of the last request, and the descriptor sent for it, if any.
+        # The memory of the last request, and its descriptor if the request sends one.
         self._written: tuple[_Memory, int | None] | None = None
 
     def connect(self, timeout_s: float) -> None:

@@ -74,20 +74,20 @@ logger = logging.getLogger(__name__)
 # restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
-_CLOSE_S = 1.0  # maximum time of a closing handshake
-_PING_SENT_S = 1.0  # s for the rest of a ping of which the kernel has taken a part
+_CLOSE_S = 1.0  # maximum duration of a closing handshake
+_PING_SENT_S = 1.0  # s, time limit for the rest of a partly sent ping
 _READ_BYTES = 256 * 1024
 # The maximum number of pieces that are sent without a copy; Linux takes at most 1,024 at once.
 _MAX_PIECES = 64
-# A client's frames must have a mask, which prevents a web page from choosing the bytes that a proxy
-# reads (RFC 6455, 10.3). This client is no web page, so its mask leaves the bytes unchanged, which
+# A client must mask its frames, so that a web page cannot choose the bytes that a proxy reads (RFC
+# 6455, 10.3). This client is not a web page. Its mask of zeros leaves the bytes unchanged, which
 # saves two passes over each message.
 _NO_MASK = bytes(4)
 
 
 class ProxiedSocket:
-    """A connection through the proxy; a thread answers its pings, and reads the answers to those of
-    this client, which only the replica at the other end sends.
+    """A connection through the proxy. A thread answers the server's pings, and reads the answers to
+    this client's pings; only the replica at the other end sends these answers.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class ProxiedSocket:
         self._watch = watch or ReplicaWatch()
         self._watch.is_proxied = True
         self._messages: list[bytes] = []
-        self._silent = False  # whether the replica was given up
+        self._silent = False  # whether the client has left the replica
         # In websockets 17.1, `connect` must be used as a context manager.
         self._open = contextlib.ExitStack()
         connection = self._open.enter_context(
@@ -120,7 +120,7 @@ class ProxiedSocket:
         self._websocket = LimitedWebSocket(connection)
 
     def send(self, message: bytes, timeout_s: float) -> None:
-        """Send a message within a time limit, after which the connection ends."""
+        """Send a message within a time limit; if the limit passes, the connection ends."""
         self._websocket.send(message, timeout_s)
 
     def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None:
@@ -132,7 +132,7 @@ class ProxiedSocket:
 
         Raises:
             TimeoutError: No message arrived in time.
-            ReplicaSilent: The replica is given up.
+            ReplicaSilent: The client leaves the replica.
         """
         self._watch.begin()
         ping = partial(self._watch.probe, self._is_alive)
@@ -145,8 +145,8 @@ class ProxiedSocket:
         return self._messages.pop(0)
 
     def close(self) -> None:
-        """Close the connection, within the time limit of the closing handshake, and without one to
-        a replica that was given up.
+        """Close the connection, with a closing handshake that has a time limit; there is no
+        handshake if the client has left the replica.
         """
         if self._silent:
             self._websocket.shut_down()
@@ -154,7 +154,7 @@ class ProxiedSocket:
         self._open.close()
 
     def _is_received(self, limit_s: float) -> bool:
-        """Return whether a message is there, or arrives within a time limit."""
+        """Return whether a message has arrived, or arrives within a time limit."""
         if not self._messages:
             with contextlib.suppress(TimeoutError):
                 message = self._websocket.connection.recv(timeout=limit_s, decode=False)
@@ -171,7 +171,7 @@ class ProxiedSocket:
 def open_websocket(
     url: str, credentials: Credentials, timeout_s: float, watch: ReplicaWatch | None = None
 ) -> ProxiedSocket:
-    """Connect to a path of a server's port. The `watch` finds out whether its replica is frozen.
+    """Connect to a path of a server's port. The `watch` detects whether the replica is frozen.
 
     Raises:
         NoReplica: The server cannot be reached, or has no replica yet.
@@ -198,11 +198,9 @@ def open_websocket(
 
 
 class Stream:
-    """A connection to a replica's own port. The thread that waits for the answer reads and writes
-    it.
-
-    It pings the server while it waits for an answer. Nothing answers the server's pings meanwhile,
-    so the server must rely on the kernel's keep-alive.
+    """A connection to a replica's own port. Only the thread that waits for an answer reads and
+    writes the connection, and it pings the server while it waits. Between calls, nothing answers
+    the server's pings, so the server must rely on the kernel's keep-alive.
     """
 
     def __init__(
@@ -288,7 +286,7 @@ class Stream:
             ConnectionClosed: The server has closed the connection.
             OSError: The connection broke.
             TimeoutError: No message arrived in time.
-            ReplicaSilent: The server is given up.
+            ReplicaSilent: The client leaves the replica.
         """
         begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
@@ -309,9 +307,9 @@ class Stream:
     def close(self) -> None:
         """Close the connection, so that the server notices.
 
-        A message that was not answered in time is useless. Over a broken link, the kernel would
-        resend it for minutes. The server would keep the sessions until then, and execute the late
-        message. A reset of the connection prevents both.
+        A message that was not answered in time is useless. Over a broken link, however, the kernel
+        would resend the message for minutes. Until then, the server would keep the sessions, and
+        would then execute the late message. A TCP reset of the connection prevents both.
         """
         with contextlib.suppress(OSError):
             if self._silent:
@@ -418,7 +416,7 @@ class WebSocketTransport:
         return metadata
 
     def connect_to(self, metadata: dict[str, Any], timeout_s: float) -> None:
-        """Connect as `connect` does, but to the replica with this metadata."""
+        """Connect like `connect`, but to the replica with this metadata."""
         stream = read_address(StreamAddress, metadata.get("stream"))
         self._address = stream if self._base.scheme == "http" else None
         self._stream(timeout_s)
@@ -430,7 +428,7 @@ class WebSocketTransport:
         deadline = time.monotonic() + timeout_s
         pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
         size = sum(map(len, pieces))
-        if size > STREAM_BYTES:  # the server would just close the connection
+        if size > STREAM_BYTES:  # the server would close the connection
             raise MessageTooLarge(
                 f"{self._url}: expected at most {STREAM_BYTES} bytes in a WebSocket message, got "
                 f"{size}; send JPEG, or use transport='http'"
@@ -453,7 +451,7 @@ class WebSocketTransport:
             raise connection_lost(self._url, f"{error}; reset before the next act") from error
 
     def close(self) -> None:
-        """Close the connection, and with it its sessions."""
+        """Close the connection and its sessions."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -486,8 +484,8 @@ class WebSocketTransport:
         """Connect through the proxy, and retry while the proxy reports that a replica is starting
         or stopping.
 
-        If there is no answer, this also retries, as the replica that the proxy chose may hang while
-        the next one works.
+        It also retries if there is no answer, since the replica that the proxy chose may hang while
+        the next replica works.
         """
         deadline = time.monotonic() + timeout_s
         attempt_s = first_timeout_s(timeout_s)
