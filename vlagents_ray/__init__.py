@@ -1,4 +1,5 @@
 """vlagents_ray: Vision-Language-Action models served with Ray, for robots and for evaluation.
+
 Importing this package needs only numpy, simplejpeg and websockets, and loads neither ray nor torch.
 """
 

@@ -77,9 +77,10 @@ class InProcess(Protocol):
 
 class Speculative(Protocol):
     """Marks abilities that a server may call, on any thread, with an observation that waits for its
-    call of `act`. That call may never follow. A wrapper changes such an observation twice, for the
-    ability and for `act`. Therefore only wrappers that are `Wrapper.repeatable` forward these
-    abilities.
+    call of `act`. That call may never follow.
+
+    A wrapper changes such an observation twice, for the ability and for `act`. Therefore only
+    wrappers that are `Wrapper.repeatable` forward these abilities.
     """
 
 

@@ -33,8 +33,10 @@ _SHOWN_LEVELS = 3  # maximum depth of lists and dicts that an error shows
 
 def shown(value: object, max_characters: int = 80) -> str:
     """Return a text of at most `max_characters` that shows a value from the network in an error
-    message. The time and memory of this call do not depend on the size of the value, whereas `repr`
-    or `str` would first write the whole value.
+    message.
+
+    The time and memory of this call do not depend on the size of the value, whereas `repr` or `str`
+    would first write the whole value.
     """
     text = _shown(value, max_characters, _SHOWN_LEVELS)
     return text if len(text) <= max_characters else f"{text[: max_characters - 1]}…"

@@ -1,7 +1,9 @@
 """The HTTP protocol of the small servers that run without HAProxy: the page of an evaluation, and
-the operator's page. By itself, uvicorn waits for the headers of a request without a time limit, and
-accepts any number of connections. So an attacker could use up the file descriptors of the process
-that runs the robots.
+the operator's page.
+
+By itself, uvicorn waits for the headers of a request without a time limit, and accepts any number
+of connections. So an attacker could use up the file descriptors of the process that runs the
+robots.
 """
 
 from __future__ import annotations

@@ -467,7 +467,7 @@ SIMULATED = "vlagents_ray.robot.simulated:SimulatedRobot"
         (
             RELATIVE,
             [*SHORT, "--measure", "joints"],
-            "ConfigError: measure: expected none for relative actions",
+            "ConfigError: measure: expected None for relative actions",
         ),
         (None, ["http://nowhere", "--robot", SIMULATED], "safe='hold'"),
         (

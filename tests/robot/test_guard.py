@@ -77,7 +77,7 @@ def test_a_measured_pose_that_is_none_is_refused() -> None:
     ):
         Guard(measure=lambda obs: obs.state["tick"]).reference(obs, row(0, 0))
     with pytest.raises(
-        ConfigError, match=r"measure: expected none for relative actions.*, got one"
+        ConfigError, match=r"measure: expected None for relative actions.*, got a function"
     ):
         Guard(Contract(action=ActionSpec(delta=True)), measure=lambda obs: obs.state["joints"])
 

@@ -100,7 +100,7 @@ def test_the_limits_of_relative_actions_are_of_the_actions_themselves() -> None:
 def test_the_first_minutes_of_motion_have_half_of_the_limits() -> None:
     slow, fast = 0.009, 0.015  # 0.45 and 0.75 units/s
     checked = guard(MotionLimits(velocity=1.0), soft_start_s=1.0)
-    with pytest.raises(InvalidAction, match="which the soft start lowers"):
+    with pytest.raises(InvalidAction, match="lowered by the soft start"):
         run(checked, 0, fast)
     last = checked(row(0))
     for i in range(1, 51):

@@ -178,7 +178,7 @@ def test_a_subtask_that_is_too_old_holds_the_robot_until_there_is_a_newer_one(
 ) -> None:
     ticks.run(3.2)
     assert ticks.robot.holds == (
-        "planner: expected a subtask of at most 3 s, got one of 3.2 s: the planner has not answered "
+        "planner: expected a subtask of at most 3 s, got a subtask of 3.2 s: the planner has not answered "
         "yet; see the planner's server, or raise max_age_s"
     )
     ticks.answer()
@@ -200,7 +200,7 @@ def test_a_planner_that_is_down_is_named_with_its_error_and_asked_again(
     assert record.getMessage().startswith("planner: unavailable: http://gpu-box:8000/planner")
     assert "unavailable: http://gpu-box:8000/planner" in ticks.robot.holds
     assert ticks.robot.holds.startswith(
-        "planner: expected a subtask of at most 3 s, got one of 3.1"
+        "planner: expected a subtask of at most 3 s, got a subtask of 3.1"
     )
 
     ticks.planner.failure = None

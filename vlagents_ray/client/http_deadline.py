@@ -1,4 +1,5 @@
 """A socket for `http.client` with a deadline for each exchange, even if the server sends slowly.
+
 The time limit of a plain socket applies to each read, so a server that sends a byte from time to
 time could keep its client waiting forever.
 """

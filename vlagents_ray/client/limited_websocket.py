@@ -1,7 +1,9 @@
 """A WebSocket of the package `websockets` whose connection ends if sending a message exceeds a time
-limit. The package sends without a limit, and the kernel's limit is not sufficient, since it
-restarts whenever the peer has read a few bytes. A server that hangs, or reads a byte from time to
-time, would block a robot for minutes.
+limit.
+
+The package sends without a limit, and the kernel's limit is not sufficient, since it restarts
+whenever the peer has read a few bytes. A server that hangs, or reads a byte from time to time,
+would block a robot for minutes.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those
-of `client`.
+"""The control loop of a robot, with its guard, watchdog and recorder; it needs the same packages as
+`client`.
 """
 
 from vlagents_ray.chunking.control import RobotControl

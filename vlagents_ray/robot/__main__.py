@@ -1,4 +1,4 @@
-"""Name the command that drives a robot; `python -m vlagents_ray.robot` is not one."""
+"""Print the command that drives a robot, since `python -m vlagents_ray.robot` is not a command."""
 
 import sys
 

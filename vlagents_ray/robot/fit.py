@@ -1,5 +1,5 @@
-"""Whether a checkpoint fits an arm: compares the statistics of its training with the arm's present
-state and limits.
+"""Checks whether a checkpoint fits an arm: compares the statistics of the training data with the
+arm's present state and limits.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
 logger = logging.getLogger(__name__)
-# The share of the trained range by which a number may leave it: other tables and mounts differ a
+# Tolerance beyond the trained range, as a share of the range, since tables and mounts differ a
 # little.
 _TOLERANCE = 0.25
-# The numbers of a robot in other units are outside of the range by such factors: 180 / pi, 1000.
+# Factor between a robot's numbers in a wrong unit (180 / pi, 1000) and the range -> the likely
+# mistake.
 _UNIT_MISTAKES = {57.3: "degrees for radians", 1000.0: "millimetres for metres"}
-_WIDTH = 32  # the number of characters of a drawn range
+_WIDTH = 32  # width of a drawn range in characters
 _ACCEPTED_FILES = (
     "LeRobot's meta/stats.json, openpi's norm_stats.json or GR00T's statistics.json, with min "
     "and max or q01 and q99"
 )
-# What is raised for statistics of another form.
+# Exceptions that statistics of an unexpected form can raise.
 _UNREADABLE = (
     OSError,
     ArithmeticError,
@@ -39,12 +40,12 @@ _UNREADABLE = (
     AttributeError,
     RecursionError,
 )
-Span = tuple[np.ndarray, np.ndarray]  # lowest and highest of D numbers, (D,) each
+Span = tuple[np.ndarray, np.ndarray]  # lowest and highest values of D numbers, (D,) each
 
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """The ranges of the numbers on which a checkpoint was trained; None if they are not known."""
+    """The ranges of the states and actions on which a checkpoint was trained; None if unknown."""
 
     state: Span | None = None
     action: Span | None = None
@@ -55,8 +56,9 @@ class Trained:
     def read(cls, path: str | Path) -> Trained:
         """Read LeRobot's `stats.json`, openpi's `norm_stats.json` or GR00T's `statistics.json`.
 
-        A range is from `min` to `max`, or else from `q01` to `q99`. GR00T's groups of numbers are
-        joined in the order of the file, which must have the statistics of only one robot.
+        A range is from `min` to `max`; without these keys, from `q01` to `q99`. GR00T's groups of
+        numbers are joined in the order of the file, which must contain the statistics of only one
+        robot.
 
         Args:
             path: The file.
@@ -71,7 +73,7 @@ class Trained:
             statistics: Any = json.loads(Path(path).read_text(encoding="utf-8"))
             statistics = statistics.get("norm_stats", statistics)
 
-            # In GR00T's files, the robot is the only key.
+            # In GR00T's files, the only key is the name of the robot.
             if len(statistics) == 1:
                 [robot_statistics] = statistics.values()
                 if {"state", "action"} <= set(robot_statistics):
@@ -90,30 +92,30 @@ class Trained:
 
     @classmethod
     def from_statistics(cls, statistics: object) -> Trained:
-        """Return the ranges in statistics, such as those in a server's metadata
-        (`vlagents_ray.abilities.HasStatistics`), which may be of any type.
+        """Return the ranges in statistics, such as the statistics in a server's metadata
+        (`vlagents_ray.abilities.HasStatistics`), whose type is not trusted.
 
         Args:
             statistics: The ranges by the names "observation.state" or "state", and "action" or
-                "actions"; further "parts", the names of the state's parts.
+                "actions"; and "parts", the names of the state's parts.
 
         Returns:
-            The ranges of state and action, None for one that the statistics lack.
+            The ranges of state and action; None for a range that the statistics lack.
 
         Raises:
-            ConfigError: They are not statistics.
+            ConfigError: The argument is not statistics.
         """
         try:
             return cls._read(statistics)
         except _UNREADABLE as error:
             raise ConfigError(
                 "the policy's statistics: expected ranges, min and max or q01 and q99, by name, "
-                f"got {shown(statistics)} ({type(error).__name__}); name a file of them instead"
+                f"got {shown(statistics)} ({type(error).__name__}); pass a statistics file instead"
             ) from error
 
     @classmethod
     def _read(cls, statistics: Any) -> Trained:
-        """Return the ranges in statistics; raises one of `_UNREADABLE` for other values."""
+        """Return the ranges in statistics; raises one of `_UNREADABLE` for invalid statistics."""
         state = _first_range(statistics, ("observation.state", "state"))
         action = _first_range(statistics, ("action", "actions"))
         state_names = tuple(statistics["parts"]) if "parts" in statistics else None
@@ -126,7 +128,8 @@ class Trained:
 
         Args:
             obs: The observation.
-            default_names: The names of the state's parts, in order, if the training names none.
+            default_names: The names of the state's parts, in order, if the statistics contain no
+                names.
 
         Returns:
             The state, (D,); None if the observation lacks one of its parts.
@@ -148,14 +151,14 @@ class Trained:
         limits: MotionLimits | None,
         names: Sequence[str] = (),
     ) -> list[str]:
-        """List the numbers that do not fit before the first motion, one sentence each with its
-        cure.
+        """List the numbers that do not fit, before the first motion; each entry is a sentence with
+        its cure.
 
         Args:
             state: The arm's present state in the order of the training, (D,).
             chunk: The policy's first chunk, (H, D).
             limits: The limits of the arm.
-            names: The names of the numbers by the arm's driver; default: the names in `limits`.
+            names: The driver's names of the numbers; default: the names in `limits`.
 
         Returns:
             The sentences; none if everything fits.
@@ -184,7 +187,7 @@ class Trained:
     def draw(
         self, chunk: np.ndarray, limits: MotionLimits | None, names: Sequence[str] = ()
     ) -> list[str]:
-        """Draw the first chunk next to the training's actions and the limits.
+        """Draw the first chunk, the training's actions and the limits below each other.
 
         Args:
             chunk: The policy's first chunk, (H, D).
@@ -197,7 +200,7 @@ class Trained:
         dim = chunk.shape[1]
         trained = self.action
         if trained is None or len(trained[0]) != dim:
-            trained = MotionLimits().bounds(dim)  # infinite
+            trained = MotionLimits().bounds(dim)  # infinite: no limit
         spans: list[Span] = [
             (limits or MotionLimits()).bounds(dim),
             trained,
@@ -224,32 +227,32 @@ class Fit:
 
     trained: Trained
     limits: MotionLimits | None = None  # the limits of the arm
-    names: tuple[str, ...] = ()  # the names of the arm's joints, by its driver
-    # The names of the state's parts, in order, if the training names none.
+    names: tuple[str, ...] = ()  # the driver's names of the arm's joints
+    # The names of the state's parts, in order, if the statistics contain no names.
     state_names: tuple[str, ...] = ()
     accept: bool = False  # whether misfits are only logged
 
     @property
     def compares(self) -> bool:
-        """Whether there is anything to compare with."""
+        """Whether there are ranges or limits to compare with."""
         return self.trained != Trained() or self.limits is not None
 
     def draw(self, rows: np.ndarray) -> list[str]:
-        """Draw the first chunk, (H, D), next to the training's actions and the limits: a legend,
-        and a line for each number.
+        """Draw the first chunk, (H, D), the training's actions and the limits; see
+        `Trained.draw`.
         """
         return self.trained.draw(rows, self.limits, self.names)
 
     def require(self, obs: Obs | None, rows: np.ndarray | None) -> None:
         """Compare an observation of the arm at rest and the policy's first chunk with the training
-        and the limits.
+        data and the limits.
 
         Args:
             obs: The observation; None compares only the chunk.
             rows: The chunk, (H, D); None compares only the observation.
 
         Raises:
-            ContractMismatch: Something does not fit, and `accept` is off.
+            ContractMismatch: A number does not fit, and `accept` is False.
         """
         if not self.compares:
             return
@@ -266,11 +269,11 @@ def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
     """Raise an error if a checkpoint does not fit an arm.
 
     Args:
-        misfits: A sentence about each number that does not fit.
+        misfits: The sentences about the numbers that do not fit.
         accept: Whether the misfits are only logged as a warning.
 
     Raises:
-        ContractMismatch: There are misfits, and `accept` is off.
+        ContractMismatch: There are misfits, and `accept` is False.
     """
     if not misfits:
         return
@@ -281,7 +284,9 @@ def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
 
 
 def _first_range(statistics: Mapping[str, Any], keys: Sequence[str]) -> Span | None:
-    """Return the range under the first of the keys that statistics have; None if they have none."""
+    """Return the range under the first of the keys that the statistics contain; None if they
+    contain none of the keys.
+    """
     for key in keys:
         if key in statistics:
             return _range(statistics[key])
@@ -289,7 +294,7 @@ def _first_range(statistics: Mapping[str, Any], keys: Sequence[str]) -> Span | N
 
 
 def _range(statistics: Mapping[str, Any]) -> Span:
-    """Return the range of a vector's statistics, or of groups of them, which are joined."""
+    """Return the range of a vector's statistics; the ranges of several groups are joined."""
     if statistics and all(isinstance(group, Mapping) for group in statistics.values()):
         lows, highs = zip(*map(_range, statistics.values()), strict=True)
         return np.concatenate(lows), np.concatenate(highs)
@@ -303,7 +308,7 @@ def _range(statistics: Mapping[str, Any]) -> Span:
 
 
 def _bars(ranges: Sequence[tuple[float, float]]) -> str:
-    """Draw the ranges of a number in limits, training and chunk over each other, with `_WIDTH`
+    """Draw the ranges of a number in limits, training and chunk on one line of `_WIDTH`
     characters.
     """
     ends = np.ravel(ranges)
@@ -323,7 +328,7 @@ def _bars(ranges: Sequence[tuple[float, float]]) -> str:
 def _outside(
     vector: str, rows: np.ndarray, low: np.ndarray, high: np.ndarray, names: Sequence[str]
 ) -> list[str]:
-    """List the numbers of rows, (H, D), that are outside of the trained range.
+    """List the numbers in rows, (H, D), that are outside the trained range.
 
     Args:
         vector: The name of the vector for messages: "state" or "first chunk".
@@ -333,7 +338,7 @@ def _outside(
         names: The names of the numbers, if they are known.
 
     Returns:
-        A sentence about each number.
+        A sentence about each of these numbers.
     """
     if rows.shape[1] != len(low):
         sentence = (
@@ -368,7 +373,7 @@ def _outside(
 def _beyond(
     trained: np.ndarray, limits: np.ndarray, is_beyond: np.ndarray, names: Sequence[str]
 ) -> list[str]:
-    """List the ends of the trained range, (D,), that are beyond the limits, (D,)."""
+    """List the bounds of the trained range, (D,), that exceed the limits, (D,)."""
     sentences = []
     for i in np.flatnonzero(is_beyond):
         sentences.append(
@@ -379,5 +384,5 @@ def _beyond(
 
 
 def _name(i: int, names: Sequence[str]) -> str:
-    """Return the index of a number, with its name if that is known."""
+    """Return the index of a number, with the number's name if it is known."""
     return f"[{i}] ({names[i]})" if i < len(names) else f"[{i}]"

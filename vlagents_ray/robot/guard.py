@@ -16,50 +16,50 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import MotionLimits
 
 SOFT_START_S = 120.0
-# The relative rounding of a float32, with a margin for actions of earlier ticks that were larger.
+# The relative rounding error of a float32, with a margin for larger actions of earlier ticks.
 _ROUNDING = 2.0**-23
-# The first action may be as far away as this time at the limit of velocity, s.
+# The first action may be as far away as the arm moves in this time at its velocity limit, s.
 _FIRST_S = 0.5
-# The way from rest to the first action takes this many times longer than its limits require.
+# The motion from rest to the first action takes this many times longer than its limits require.
 _SLOWNESS = 2.0
 
 
 class Guard:
-    """A check that accepts an action or raises `InvalidAction`; it never clips an action, as that
-    would be another motion.
+    """A check that accepts an action or raises `InvalidAction`; it never clips an action, since a
+    clipped action is a different motion.
 
     The guard checks the action's shape, that its numbers are finite and within the bounds, and that
-    it is not too far from the previous action. Before the first action there is no previous one,
-    and after a stop the arm need not be where the last action commanded it. With `measure` these
-    actions are compared with the measured pose, and the grippers with their last command. Without
-    it, the first absolute action may be anywhere within the bounds, and an action after a stop is
-    compared with the last one. Relative actions are compared with no motion; their grippers, which
-    are positions, with the last command.
+    it is not too far from the previous action. The first action has no previous action, and after a
+    stop the arm may not be where the last action commanded it. With `measure`, the first action and
+    an action after a stop are compared with the measured pose, and their grippers with the last
+    command. Without `measure`, the first absolute action may be anywhere within the bounds, and an
+    action after a stop is compared with the last action. Relative actions are compared with zero,
+    i.e. no motion; their grippers, which are positions, are compared with the last command.
 
-    With `limits`, speed, acceleration and jerk are also checked, and the position of the tip.
-    Braking is always allowed, as the robot's own stop is harder. A chunk player then eases each
-    motion in from rest (`vlagents_ray.chunking.ease`), as rows of a plan that continue at full
-    speed could not be reached in one tick.
+    With `limits`, speed, acceleration, jerk and the position of the tip are also checked. Braking
+    is always allowed, as the robot's own stop is more abrupt. A chunk player then begins each
+    motion from rest with an ease-in (`vlagents_ray.chunking.ease`), since the arm cannot reach the
+    full speed of a plan in one tick.
 
     Args:
         contract: The policy's contract, for the action's dimension and bounds; None checks neither.
         low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest
-            of this bound, the contract's and the bound of `limits` applies. Bounds of relative
-            actions limit the actions themselves.
-        high: Upper bound, as `low`.
+            of this bound, the contract's bound and the bound in `limits` applies. Bounds of
+            relative actions limit the actions themselves.
+        high: Upper bound, in the same form as `low`.
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None
             checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units,
             e.g. `lambda obs: obs.state["joints"]`; not for relative actions.
         limits: The limits of the robot's motion, or the path that `MotionLimits.read` reads.
         hz: The control rate, Hz; needed with `limits`.
-        soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk
-            rise from half to their values, since most accidents happen in the first minutes of a
-            new checkpoint; 0 for none.
+        soft_start_s: The time of motion, s, during which the limits of speed, acceleration and jerk
+            rise from half of their values to the full values, since most accidents happen in the
+            first minutes of a new checkpoint; 0 disables the soft start.
 
     Raises:
         ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative
-            actions, `limits` without `hz`, or a limit that has no effect on the actions of the
+            actions, `limits` is given without `hz`, or a limit has no effect on the actions of the
             contract.
     """
 
@@ -88,13 +88,13 @@ class Guard:
         self._high = _strictest("high", np.minimum, spec.high, high, bounds.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
 
-        # This also rejects NaN, with which any step would pass.
+        # This also rejects NaN, which would accept any step.
         if self._max_step is not None and not (self._max_step >= 0).all():
             raise ConfigError(f"max_step: expected a number of 0 or more, or None, got {max_step}")
         if measure is not None and spec.relative:
             raise ConfigError(
-                "measure: expected none for relative actions, which cannot be compared with a "
-                "pose, got one; leave it out"
+                "measure: expected None for relative actions, which cannot be compared with a "
+                "pose, got a function; leave it out"
             )
         if limits is not None and (hz is None or not hz > 0 or not soft_start_s >= 0):
             raise ConfigError(
@@ -106,24 +106,27 @@ class Guard:
         self._soft_ticks = soft_start_s * (hz or 0.0)
         self._ticks_with_motion = 0
 
-        # For each of low, high, max_step, velocity, acceleration and jerk, the limit of each number
-        # of an action, in its units and ticks.
+        # The limits low, high, max_step, velocity, acceleration and jerk, each with a value for
+        # each number of an action, in the action's units and in ticks.
         self._columns: list[list[float]] = []
         self._grippers: list[int] = []  # the indices of the grippers in an action
         self._deltas: list[int] = []  # the indices of the relative numbers
 
         self._accepted: list[float] | None = None  # the last accepted action; None at rest
-        self._speeds: list[float] = []  # its difference from the action before, units a tick
-        self._changes: list[float] = []  # the difference of the speeds from those before
+        # speeds: differences between the last accepted action and the action before, units per
+        # tick.
+        self._speeds: list[float] = []
+        self._changes: list[float] = []  # differences between these speeds and the speeds before
         if self._dim is not None:
             self._limits_of(self._dim)
 
     def reference(self, obs: Obs, last: np.ndarray | None) -> np.ndarray | None:
-        """Return the pose with which the first action, or the first one after a stop, is compared.
+        """Return the pose with which the first action, or the first action after a stop, is
+        compared.
 
         Args:
             obs: The current observation.
-            last: The last commanded action, (D,); None before the first one.
+            last: The last commanded action, (D,); None before the first action.
 
         Returns:
             The measured pose, (D,) float32; `last` if the guard has no `measure`.
@@ -136,7 +139,7 @@ class Guard:
         if last is not None and self._spec.relative:
             self._limits_of(len(last))
             standing = last.copy()
-            standing[self._deltas] = 0.0  # the robot does not move
+            standing[self._deltas] = 0.0  # zeros: the robot does not move
             return standing
         if self._measure is None:
             return last
@@ -156,12 +159,13 @@ class Guard:
 
         if last is not None:
             self._limits_of(len(last))
-            # A stop keeps the grasp, which the measured opening loosens.
+            # Grippers keep their last command, since commanding the measured opening would loosen
+            # the grasp.
             pose[self._grippers] = last[self._grippers]
         return pose
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
-        """Return an action if it may reach the robot.
+        """Return an action if the robot may execute it.
 
         Args:
             action: The action, (D,) float32.
@@ -204,7 +208,7 @@ class Guard:
             raise InvalidAction(
                 f"action: expected the shape {np.shape(last)}, as before, got {action.shape}"
             )
-        if last is None:  # from an unknown pose, but at rest
+        if last is None:  # the arm is at rest in an unknown pose
             self._accepted = None
             last_numbers = numbers.copy()
             for i in self._deltas:
@@ -235,16 +239,16 @@ class Guard:
         """Plan the ease-in from a pose at rest to an action.
 
         Args:
-            start: The pose at rest, (D,) in the action's units; None if it is unknown. Of relative
-                actions only the grippers are used.
+            start: The pose at rest, (D,) in the action's units; None if it is unknown. For relative
+                actions, only the grippers are used.
             goal: The first action, (D,).
-            plan: The rows of the plan that begins with `goal`, (H, D); its speeds apply where the
-                limits have none.
+            plan: The rows of the plan that begins with `goal`, (H, D); its speeds are used for
+                numbers without a limit of velocity.
             far: Whether the first action may be at any distance.
 
         Returns:
-            The ease-in; None without limits of speed, acceleration and jerk, or from an unknown
-            pose.
+            The ease-in; None if there are no limits of speed, acceleration and jerk, or if the pose
+            is unknown.
 
         Raises:
             InvalidAction: The action is farther from the pose than `MotionLimits.first`.
@@ -280,7 +284,7 @@ class Guard:
             max_jerk = share * jerk[i]
 
             if i not in at_once:
-                # Half of the acceleration and jerk is left to the policy's own motion.
+                # The other half of the acceleration and jerk remains for the policy's own motion.
                 speed = max_speed if max_speed < math.inf else 2 * plan_speeds[i]
                 ramp_ticks = max(ramp_ticks, 2 * speed / max_acceleration, 2 * speed / max_jerk)
 
@@ -320,14 +324,15 @@ class Guard:
                 )
 
     def _plan_speeds(self, plan: np.ndarray) -> np.ndarray:
-        """Return the largest speed of each number in the rows of a plan, (D,) units a tick."""
+        """Return the largest speed of each number in the rows of a plan, (D,) units per tick."""
         rows = np.atleast_2d(plan).astype(np.float64)
         speeds: np.ndarray = np.abs(np.diff(rows, axis=0)).max(0, initial=0.0)
         speeds[self._deltas] = np.abs(rows[:, self._deltas]).max(0)
         return speeds
 
     def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the commands of the slow way to the rest pose; none if `limits` has no rest pose.
+        """Yield the commands of a slow motion to the rest pose; yield none if `limits` has no rest
+        pose.
 
         Args:
             last: The last command, (D,) float32.
@@ -344,20 +349,20 @@ class Guard:
                 rest_pose[i] = number
 
         ease = self.ease_in(last, rest_pose, far=True)
-        yield last  # the way begins at rest
+        yield last  # the motion begins at rest
         while ease is not None and not ease.arrived:
             command, _ = ease.step(rest_pose, None, 1)
             yield command
 
     def _limits_of(self, dim: int) -> list[list[float]]:
-        """Return the limits of each number of an action (see `_columns`), and find out which
-        numbers are grippers and which are relative.
+        """Return the limits of each number of an action (see `_columns`), and determine the indices
+        of grippers and relative numbers.
 
         Args:
-            dim: The number of numbers of an action.
+            dim: The number of values in an action.
 
         Raises:
-            ConfigError: The limits do not fit the meaning of an action.
+            ConfigError: The limits do not fit the contract's description of the actions.
         """
         if self._columns and len(self._columns[0]) == dim:
             return self._columns
@@ -399,8 +404,8 @@ class Guard:
         moved_grippers = [i for i in self._grippers if rest_pose and rest_pose[i] is not None]
         if moved_grippers:
             raise ConfigError(
-                f"rest: expected null for the grippers, numbers {moved_grippers}, as the way to "
-                f"rest keeps what they hold; got {limits.rest}"
+                f"rest: expected null for the grippers, numbers {moved_grippers}, as the motion to "
+                f"rest keeps their grasp; got {limits.rest}"
             )
         if not self._deltas:
             return
@@ -415,7 +420,7 @@ class Guard:
             raise ConfigError(
                 "limits: expected only velocity, acceleration and jerk for relative actions, "
                 f"which cannot be compared with a position, got {', '.join(without_effect)}; "
-                "remove them, or use a file without them"
+                f"remove these limits"
             )
 
     def _softness(self) -> float:
@@ -432,14 +437,14 @@ class Guard:
         Args:
             numbers: The numbers of the action.
             last_numbers: The numbers of the action or pose from which the motion begins.
-            limits: The limits of velocity, acceleration and jerk of each number, in ticks.
+            limits: The limits of velocity, acceleration and jerk of each number, per tick.
 
         Raises:
             InvalidAction: The motion exceeds a limit.
         """
         velocity_limits, acceleration_limits, jerk_limits = limits
         zeros = [0.0] * len(numbers)
-        if last_numbers == self._accepted:  # the motion continues
+        if last_numbers == self._accepted:  # the motion continues from the last action
             last_speeds, last_changes = self._speeds, self._changes
         else:
             last_speeds, last_changes = zeros.copy(), zeros
@@ -453,8 +458,8 @@ class Guard:
 
         share = self._softness()
         for i, speed in enumerate(speeds):
-            # An action's rounding to float32 counts twice in a speed, and twice as often in each
-            # further difference.
+            # A speed contains the float32 rounding error of two actions; each further difference
+            # doubles the error.
             rounding = 2 * _ROUNDING * max(abs(numbers[i]), abs(last_numbers[i]))
             limit = share * velocity_limits[i]
             if abs(speed) > limit + rounding:
@@ -476,7 +481,7 @@ class Guard:
                 raise self._refusal("jerk", i, jerk, limit, 3)
 
         has_moved = any(speeds)
-        # After a tick at rest, the deceleration before it is over.
+        # After a tick at rest, an earlier deceleration no longer counts.
         self._changes = changes if has_moved else zeros
         self._accepted = numbers
         self._speeds = speeds
@@ -485,10 +490,10 @@ class Guard:
     def _refusal(
         self, quantity: str, i: int, value: float, limit: float, order: int
     ) -> InvalidAction:
-        """Return the error for a number whose difference of that order exceeds its limit."""
+        """Return the error for a number whose difference of order `order` exceeds its limit."""
         per_s = (self.hz or 1.0) ** order
         is_soft = self._ticks_with_motion < self._soft_ticks
-        soft = ", which the soft start lowers" if is_soft else ""
+        soft = ", lowered by the soft start" if is_soft else ""
         return InvalidAction(
             f"action[{i}]: expected {quantity} of at most {limit * per_s:.3g} "
             f"(units/s^{order}{soft}), got {value * per_s:.4g}",
@@ -535,8 +540,8 @@ def measured_state(name: str | None) -> Callable[[Obs], np.ndarray] | None:
 def _strictest(
     name: str, stricter: np.ufunc, *bounds: float | np.ndarray | tuple[float, ...] | None
 ) -> np.ndarray | None:
-    """Return the strictest of the bounds as float32, the type of actions, so that a bound of 0.1
-    accepts 0.1; None if all bounds are None.
+    """Return the strictest of the bounds; None if all bounds are None. The result is float32 like
+    the actions, so that a bound of 0.1 accepts 0.1.
     """
     arrays = [np.asarray(bound, np.float32) for bound in bounds if bound is not None]
     if any(np.isnan(array).any() for array in arrays):
@@ -545,7 +550,7 @@ def _strictest(
 
 
 def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:
-    """Return the limit of each number, with a tolerance, as float32 rounds a step of 0.1 to
-    slightly more.
+    """Return the limit of each number with a tolerance, since float32 rounds a step of 0.1 to a
+    slightly larger value.
     """
     return (np.broadcast_to(limit, dim) * (1 + 1e-4) + 1e-6).tolist()  # type: ignore[no-any-return]

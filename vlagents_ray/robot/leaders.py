@@ -1,4 +1,6 @@
-"""Devices with which an operator moves a robot, by name, and an operator as an agent."""
+"""The registered devices with which an operator moves a robot, and an agent that returns an
+operator's actions.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,16 @@ from vlagents_ray.robot.loop import import_class
 
 __all__ = ["Leader", "OpenLeader", "TeleoperatedAgent", "leader_named"]
 
-LEADER = ("engaged", "action")  # the methods of a `Leader`
-Measure = Callable[[Obs], np.ndarray]  # returns the robot's pose in an observation, (D,)
+LEADER = ("engaged", "action")  # names of the methods of a `Leader`
+Measure = Callable[[Obs], np.ndarray]  # returns the robot's pose from an observation, (D,)
 
 
 class OpenLeader(Protocol):
     """The interface of a function that opens an operator's device; plug-ins register it in
     `vlagents_ray.leaders`.
 
-    If the leader has an attribute `help`, a line that explains how to use the device, the command
-    line prints it.
+    A leader may have an attribute `help`, a line that explains how to use the device; the command
+    line prints this line.
     """
 
     def __call__(
@@ -37,11 +39,12 @@ class OpenLeader(Protocol):
 
         Args:
             contract: The contract of the policy or the environment.
-            step: The change of a number of the action at a tick; None takes it from the contract.
-            measure: Returns the robot's measured pose; None reads the state's part `joints`.
+            step: The change of a number of the action per tick; None uses a value that suits the
+                contract.
+            measure: Returns the robot's measured pose; None uses the state part `joints`.
 
         Returns:
-            A context manager, which yields the leader and closes the device.
+            A context manager that yields the leader and closes the device at the end.
         """
 
 
@@ -50,8 +53,8 @@ def leader_named(option: str, name: str) -> OpenLeader:
 
     Args:
         option: The option that names the device, such as "--teleop", for errors.
-        name: A registered name, such as "keyboard", or a class "module:Class" that is made without
-            arguments.
+        name: A registered name, such as "keyboard", or "module:Class", a class whose constructor
+            needs no arguments.
 
     Returns:
         The function, which opens the device for a contract.
@@ -95,8 +98,8 @@ def _opened(where: str, make: Callable[[], Leader]) -> Iterator[Leader]:
 
 
 class TeleoperatedAgent(Agent):
-    """An agent that returns the action of a leader at each tick, whether it is engaged or not, in
-    place of a policy.
+    """An agent that returns, in place of a policy, the action of a leader at each tick, whether the
+    leader is engaged or not.
 
     Args:
         leader: The device with which the operator moves the robot.
@@ -111,11 +114,11 @@ class TeleoperatedAgent(Agent):
 
     def act(self, obs: Obs) -> Act:
         """Return the operator's action, (D,) float32, with `info["intervention"]`."""
-        self._leader.engaged()  # reads the device
+        self._leader.engaged()  # this call reads the device
         return Act(self._leader.action(obs), info={INTERVENTION: True})
 
     def interrupt(self) -> None:
-        """Let absolute targets begin at the measured pose again, as the robot was stopped."""
+        """Let absolute targets begin at the measured pose again, after the robot was stopped."""
         rebase = getattr(self._leader, "rebase", None)
         if rebase is not None:
             rebase(None)

@@ -21,16 +21,17 @@ from vlagents_ray.naming import did_you_mean, without_duplicate_keys
 from vlagents_ray.registry import require
 from vlagents_ray.yaml_text import load_yaml
 
-Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one for each
+# One limit for all numbers of an action, or one for each number.
+Numbers = float | tuple[float, ...]
 # Limits from a dataset are based on this quantile of the demonstrations' speeds, since a single
 # broken frame must not set a limit.
 QUANTILE = 0.999
 MARGIN = 2.0
-"""The factor from the quantiles of a dataset to its limits. The soft start begins at half of the
+"""The ratio of the limits to the quantiles of a dataset. The soft start begins at half of the
 limits, i.e. at the quantiles.
 """
 _PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
-_TOLERANCE = 0.1  # the share of the demonstrated range by which an action may leave it
+_TOLERANCE = 0.1  # share of the demonstrated range by which an action may exceed the range
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +39,8 @@ class MotionLimits:
     """The limits of the actions, (D,) in their units and order; None checks nothing.
 
     Raises:
-        ConfigError: A number is NaN or otherwise wrong, or has no effect without another field that
-            is not set.
+        ConfigError: A number is NaN or otherwise invalid, or a field has no effect because another
+            field is not set.
     """
 
     low: Numbers | None = None
@@ -52,15 +53,15 @@ class MotionLimits:
     0.5 s at `velocity`.
     """
     rest: tuple[float | None, ...] | None = None
-    """The pose to which the arm goes slowly at the end of a run. A number that is None, as the
-    number of a gripper must be, stays as it was commanded.
+    """The pose to which the arm moves slowly at the end of a run. A number that is None keeps its
+    last command; the numbers of grippers must be None.
     """
     joints: tuple[str, ...] = ()  # the names of the action's numbers, in order
     unit: str = "rad"  # the unit of the joints: "rad" or "deg"
     # The bounds of the tip's position in the base frame of the URDF, m.
     workspace_low: tuple[float, float, float] | None = None
     workspace_high: tuple[float, float, float] | None = None
-    chain: Chain | None = None  # from joints to the tip
+    chain: Chain | None = None  # forward kinematics from the joints to the tip
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -91,15 +92,16 @@ class MotionLimits:
 
         Args:
             path: The file or folder.
-            action: The meaning of the actions of a dataset that does not contain it; default:
-                absolute targets.
+            action: The description of the actions, for a dataset without one; default: absolute
+                targets.
 
         Returns:
-            The limits. Limits of a dataset allow somewhat more than its demonstrations.
+            The limits. Limits from a dataset allow somewhat larger motions than its demonstrations.
 
         Raises:
             ConfigError: The file is missing, or has an unknown key or a wrong value.
-            MissingDependency: YAML needs the extra "limits", a dataset "record".
+            MissingDependency: The extra "limits" (for YAML) or "record" (for a dataset) is not
+                installed.
         """
         path = Path(path)
         try:
@@ -141,15 +143,15 @@ class MotionLimits:
         if bounds_workspace != (tip is not None) or (tip is not None and urdf is None):
             raise ConfigError(
                 "tip, urdf and workspace: expected `tip` and `urdf` with `workspace_low` or "
-                "`workspace_high`, as each has no effect without the others; add what is missing, "
-                "or remove the rest"
+                "`workspace_high`, as each has no effect without the others; add the missing keys, "
+                "or remove these keys"
             )
 
         if urdf is None:
             if "unit" in document:
                 raise ConfigError(
-                    "unit: expected `urdf` with it, whose numbers it converts, got none; remove "
-                    "`unit`, as limits are in the units of the actions"
+                    "unit: expected `urdf` next to `unit`, which converts the numbers of the URDF, "
+                    "got none; remove `unit`, as limits are in the units of the actions"
                 )
             return limits
 
@@ -161,7 +163,7 @@ class MotionLimits:
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest positions, (dim,) each.
 
-        A bound is infinite if it is not set, or if it is for another number of joints.
+        A bound is infinite if it is not set, or if the number of its values is not `dim`.
         """
 
         def bound(limit: Numbers | None, unlimited: float) -> np.ndarray:
@@ -172,12 +174,12 @@ class MotionLimits:
         return bound(self.low, -np.inf), bound(self.high, np.inf)
 
     def stricter(self, other: MotionLimits) -> MotionLimits:
-        """Return the stricter of both limits, number by number; this object's rest pose, workspace,
-        unit and distance of the first action stay.
+        """Return the stricter of this object and other limits, for each number. The rest pose,
+        workspace, unit and distance of the first action are this object's.
         """
 
         def stricter_of(name: str) -> Numbers | None:
-            """Return the stricter of both values of a field."""
+            """Return the stricter of the two values of a field."""
             ours, theirs = getattr(self, name), getattr(other, name)
             if ours is None or theirs is None:
                 return theirs if ours is None else ours  # type: ignore[no-any-return]
@@ -208,20 +210,21 @@ class MotionLimits:
         paths = [_path(episode, deltas) for episode in actions_of_episodes]
 
         def fastest(order: int) -> tuple[float, ...]:
-            """Return a limit of the paths' differences of that order, in units and seconds."""
+            """Return a limit of the paths' differences of order `order`, in units and seconds."""
             changes = [np.abs(np.diff(path, order, axis=0)) for path in paths if len(path) > order]
             if not changes:
                 return tuple([math.inf] * actions.shape[1])
 
             limit: np.ndarray = np.quantile(np.concatenate(changes), QUANTILE, axis=0)
-            # A motion of deltas begins at rest, in too few frames to count among all of them.
+            # A motion of deltas begins at rest. The frames at its beginning are too few to affect
+            # the quantile of all frames, so they have their own quantile.
             if deltas:
                 starts = np.stack([episode[:order].max(0) for episode in changes])
                 start_limit = np.quantile(starts, QUANTILE, axis=0, method="higher")
                 limit = np.maximum(limit, start_limit)
             limit *= MARGIN * fps**order
-            # A gripper that hardly ever moves has the quantile 0. With this limit, it could never
-            # be moved.
+            # A gripper that rarely moves has the quantile 0, but a limit of 0 would never let it
+            # move.
             return tuple(number if number > 0 else math.inf for number in limit.tolist())
 
         low = actions.min(0) - tolerance
@@ -246,11 +249,12 @@ class MotionLimits:
 
         Args:
             file: The file.
-            joints: The joints of an action's numbers, in order; empty for all that move.
+            joints: The joints that belong to the numbers of an action, in order; empty for all
+                movable joints.
             tip: The link whose position the workspace limits.
-            scale: The units of the actions per rad.
+            scale: The factor from rad to the units of the actions.
         """
-        robot = ET.parse(file).getroot()  # noqa: S314 - a file of this robot's owner
+        robot = ET.parse(file).getroot()  # noqa: S314 - the file belongs to the robot's owner
         elements = {}
         for joint in robot.iter("joint"):
             if joint.find("child") is not None:
@@ -266,7 +270,7 @@ class MotionLimits:
             )
 
         def limit_of(name: str, key: str, default: float) -> float:
-            """Return a limit of a joint in the units of the actions."""
+            """Return the limit of a joint in the units of the actions."""
             joint = elements[name]
             joint_type = joint.attrib["type"]
             unit = 1.0 if joint_type == "prismatic" else scale
@@ -292,25 +296,25 @@ class MotionLimits:
 class _Joint(NamedTuple):
     """A joint of a kinematic chain."""
 
-    rotation: list[float]  # from the child's frame to the parent's, (9,), row by row
-    offset: list[float]  # offset of the child's frame in the parent's, (3,), m
-    axis: list[float]  # unit vector, (3,)
-    action_index: int  # index of its number in an action; -1 without one
+    rotation: list[float]  # rotation from the child's frame to the parent's frame, (9,), row by row
+    offset: list[float]  # offset of the child's frame in the parent's frame, (3,), m
+    axis: list[float]  # axis of the joint, unit vector, (3,)
+    action_index: int  # index of the joint's number in an action; -1 if it has none
     slides: bool
 
 
 class Chain:
-    """The forward kinematics from joints to the position of a link, in plain floats: numpy is
-    slower for one point.
+    """The forward kinematics from joints to the position of a link, computed with plain floats,
+    since numpy is slower for one point.
 
     Args:
         joints: The elements of the URDF's joints, by name.
         tip: The link at the end of the chain.
-        names: The joints of an action's numbers, in order.
+        names: The joints that belong to the numbers of an action, in order.
         to_rad: The factor from the units of the actions to rad.
 
     Raises:
-        ConfigError: There is no such link.
+        ConfigError: The URDF has no such link.
     """
 
     def __init__(
@@ -349,7 +353,7 @@ class Chain:
             link = joint.find("parent").attrib["link"]
 
     def tip(self, joints: Sequence[float]) -> tuple[float, float, float]:
-        """Return the position of the tip in the base frame, m, at the numbers of an action."""
+        """Return the position of the tip in the base frame, m, for an absolute action."""
         x = y = z = 0.0
         for rotation, (ox, oy, oz), (ax, ay, az), index, slides in self._joints:
             if index >= 0 and slides:
@@ -392,14 +396,15 @@ def _three(text: str) -> list[float]:
 
 
 def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
-    """Return the path of an episode, whose differences are speeds for deltas as well.
+    """Return the path of an episode, whose differences are speeds, also for deltas.
 
     Args:
         actions: The actions of the episode, (T, D).
         deltas: The indices of the relative numbers.
 
     Returns:
-        The actions, (T, D); with deltas, (T + 3, D), their sum, which begins at rest.
+        The actions, (T, D). If there are deltas, the result is the cumulative sum of the deltas,
+        which begins at rest, (T + 3, D).
     """
     if not deltas:
         return actions
@@ -414,7 +419,7 @@ def _numbers(name: str, value: object) -> np.ndarray:
     """Return the numbers of a limit, which is one number, a list of numbers, or None.
 
     Raises:
-        ConfigError: The value is something else, or NaN.
+        ConfigError: The value has another type, or is NaN.
     """
     if value is None:
         return np.array([], np.float64)
@@ -431,8 +436,8 @@ def _numbers(name: str, value: object) -> np.ndarray:
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return the value of a key of a file, with infinity in place of null, which is no limit; null
-    in `rest` stays.
+    """Return the value of a key of a file. Null, which means no limit, becomes infinity, except in
+    `rest`.
     """
     if not isinstance(value, list):
         return value

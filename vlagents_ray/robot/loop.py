@@ -63,34 +63,34 @@ Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
-ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
+ROBOT = ("observe", "apply", "stop")  # names of the methods of a `Robot`
 
 
 class Robot(Protocol):
     """The interface of a robot that the control loop drives.
 
-    A simulated robot may have the attribute `simulated = True`: it starts again by itself after a
-    stop (see `LoopOptions.restart`). A robot may have an attribute `holds`, the reason why it
-    must not move now, such as a camera that hangs. While it is not None the robot is stopped; then
-    the loop continues with a new observation. A class around another robot derives from
-    `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
+    A simulated robot may have the attribute `simulated = True`: it then restarts automatically
+    after a stop (see `LoopOptions.restart`). A robot may have an attribute `holds`, the reason why
+    it must not move now, such as a camera that hangs. While `holds` is not None, the loop keeps the
+    robot stopped; then the loop continues with a new observation. A class around another robot
+    derives from `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
 
     `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them:
 
     - `contract`: its observations and actions.
     - `joint_names`: its joints in the order of an action, without grippers.
     - `joint_limits`: the range of each joint, (D, 2) in the joints' units.
-    - `dates_pictures`: whether `captured_at` is from the time stamps of its sensors, so that they
-      show when a camera hangs.
+    - `dates_pictures`: whether `captured_at` is derived from the time stamps of the sensors, which
+      reveal a camera that hangs.
     - `operator`: of a simulated robot, an object that answers the questions of the check in place
       of the operator.
     - `clock`: of a simulated robot, a replacement of the module `time` with the simulated time.
-    - `close`: called at the end. A robot that is a context manager is entered before its first use
-      and left at the end instead.
+    - `close`: called at the end. If the robot is a context manager, it is entered before its first
+      use and exited at the end, and `close` is not called.
     """
 
     def observe(self) -> Obs:
-        """Return the current sensor readings, within a fraction of a tick."""
+        """Return the current sensor readings; must take only a fraction of a tick."""
 
     def apply(self, action: np.ndarray) -> None:
         """Command an action without waiting for the motion.
@@ -123,17 +123,17 @@ def fit_of(
     trained: Trained | None = None,
     accept: bool = False,
 ) -> Fit:
-    """Compare a policy's contract with a robot's, and return the comparison of their numbers for
-    the first motion.
+    """Compare a policy's contract with a robot's contract, and return the object that compares
+    their numbers before the first motion.
 
     Args:
         agent: The policy, after `initialize`.
         robot: The robot.
         limits: The limits of the robot.
-        trained: The ranges of the policy's training; default: the agent's `HasStatistics`.
-            A simulated robot without a contract is not compared with them, as it follows numbers of
-            any unit.
-        accept: Whether numbers that do not fit are only logged.
+        trained: The ranges of the policy's training data; default: the agent's `HasStatistics`. A
+            simulated robot without a contract is not compared with them, since it executes numbers
+            of any unit.
+        accept: Whether numbers that do not fit are only logged as a warning.
 
     Returns:
         The comparison, whose `require` raises if numbers do not fit.
@@ -166,14 +166,14 @@ def robot_watchdog(
     """Return a watchdog that also watches the robot's own sources.
 
     Args:
-        robot: The robot. Its attribute `silent_s`, if any, has further sources and their longest
-            silences, s; its attribute `watchdog`, if any, is set, so that the robot records their
-            signs of life.
+        robot: The robot. Its attribute `silent_s`, if any, contains further sources and their
+            longest silences, s. Its attribute `watchdog`, if any, is set to the watchdog, so that
+            the robot can record signs of life of these sources.
         stop: Stops the robot; its argument is the reason (see `Watchdog`).
         silent_s: The longest silence of each source by name, s.
 
     Returns:
-        The watchdog, which is not started yet.
+        The watchdog, not yet started.
     """
     limits_s = {**getattr(robot, "silent_s", {}), **silent_s}
     watchdog = Watchdog(stop, limits_s)
@@ -194,7 +194,7 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         The class.
 
     Raises:
-        ConfigError: There is no such class, its module cannot be imported, or it lacks a method.
+        ConfigError: The class does not exist, its module cannot be imported, or it lacks a method.
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -206,7 +206,7 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
             f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this "
             "one), add that to PYTHONPATH, or install it"
         ) from error
-    except Exception as error:  # whatever the module raises, a syntax error among them
+    except Exception as error:  # the module may raise any error, including a SyntaxError
         raise ConfigError(
             f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}"
         ) from error
@@ -220,10 +220,10 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
 
 
 def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
-    """Return a class, after a check that it has all the methods.
+    """Return a class after checking that it has all methods.
 
     Raises:
-        ConfigError: It lacks a method.
+        ConfigError: The class lacks a method.
     """
     missing = [method for method in methods if not callable(getattr(cls, method, None))]
     if missing:
@@ -238,7 +238,7 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
     """Return a function that makes a robot.
 
     Args:
-        option: The option of the command line that names the robot, for messages.
+        option: The command-line option that names the robot, for messages.
         name: "module:Class", or a registered name and its argument, such as "mujoco:so101".
         settings: Further arguments of the robot as KEY=VALUE; a value that is not JSON is text.
 
@@ -246,7 +246,7 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
         The function, which takes no arguments.
 
     Raises:
-        ConfigError: The name is unknown, its class is no robot, or a setting is wrong.
+        ConfigError: The name is unknown, its class is not a robot class, or a setting is wrong.
     """
     arguments: dict[str, Any] = {}
     for text in settings:
@@ -276,8 +276,8 @@ def robot_factory(option: str, name: str, settings: Iterable[str] = ()) -> Calla
 def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
     """Make a robot, yield it, and close it at the end.
 
-    A robot that is a context manager is entered and left; another one's `close` is called, if it
-    has this method.
+    A robot that is a context manager is entered and exited; for any other robot, `close` is called
+    if the robot has this method.
 
     Args:
         make: Makes the robot.
@@ -305,7 +305,7 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
 
 
 def _cure(cause: Cause) -> str:
-    """Return what to do about ticks without an action of the policy, in a sentence."""
+    """Return a sentence with the cure for ticks without an action of the policy."""
     match cause:
         case "waiting" | "late" | "old":
             return (
@@ -316,8 +316,9 @@ def _cure(cause: Cause) -> str:
             return "Read the server's log"
         case "limits" | "max_step" | "dynamics":
             return (
-                "Compare the robot's pose with the policy's actions (units, order of joints, a "
-                "start far from the first action), and the limits with both; see docs/guard.md"
+                "Compare the robot's pose with the policy's actions (units, order of joints, "
+                "distance to the first action), and the limits with the pose and the actions; see "
+                "docs/guard.md"
             )
         case "stopped":
             return (
@@ -336,31 +337,34 @@ class LoopReport:
 
     hz: float
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
-    work_p50_ms: float = 0.0  # from the due time of a tick to its applied action
+    work_p50_ms: float = 0.0  # time from the due time of a tick to its applied action
     work_p99_ms: float = 0.0
     apply_p50_ms: float = 0.0  # the time of `robot.apply` alone
-    # The number of ticks with the safe action or without any, by cause.
+    # The number of ticks with the safe action or without any action, by cause.
     safe: dict[Cause, int] = field(default_factory=dict)
-    # The first reason of each cause, in words.
+    # The first reason for each cause, in words.
     reasons: dict[Cause, str] = field(default_factory=dict)
-    # The number of ticks at which the robot held still, as all rows were executed and the next
-    # answer had not arrived.
+    # The number of ticks at which the robot did not move because all rows were executed and the
+    # next answer had not arrived.
     waiting: int = 0
     barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
     interventions: int = 0  # ticks at which an operator moved the robot
-    # The number of ticks at which the robot was paused (see `vlagents_ray.chunking.control`); they
-    # are not among `safe`.
+    # The number of ticks at which the robot was paused (see `vlagents_ray.chunking.control`);
+    # `safe` does not count them.
     paused: int = 0
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
-    outcome: str = ""  # "success" or "failure", if it was marked on the live page
+    outcome: str = ""  # "success" or "failure", if the episode was marked on the live page
     timeliness: Timeliness = field(default_factory=Timeliness)
-    # The server's answer to the SLO of the run: `load`, `in_time`, `reason`; empty if it gave none.
+    # The server's answer to the SLO of the run: `load`, `in_time`, `reason`; empty if there was no
+    # answer.
     slo: dict[str, Any] = field(default_factory=dict)
 
     @property
     def safe_ticks(self) -> int:
-        """The number of ticks without an action of the policy: `waiting`, and those of `safe`."""
+        """The number of ticks without an action of the policy: the sum of `waiting` and all counts
+        in `safe`.
+        """
         return self.waiting + sum(self.safe.values())
 
     @property
@@ -403,7 +407,7 @@ class LoopReport:
         """Count a tick without an action of the policy.
 
         Args:
-            hold: The reason why the tick has none.
+            hold: The reason why the tick has no action of the policy.
         """
         self.reasons.setdefault(hold.cause, hold.reason)
         if hold.cause == "paused":
@@ -420,23 +424,24 @@ class LoopOptions:
 
     Args:
         guard: Checks every action; a rejected action ends the loop. The default is the agent's own
-            `check`, such as a chunk player's, which continues with a safe action instead; else a
-            guard of the agent's contract.
-        restart: With "manual", `watchdog.restart()` restarts motion after a stop; only an operator
-            who sees the robot may call it, and it has no effect while the silence lasts. With
-            "auto", the end of the silence restarts motion; a stop by a command still needs the
-            call. The default is "auto" for a simulated robot and "manual" for any other.
+            `check`, if it has one; a chunk player replaces an action that its check rejects with a
+            safe action. Otherwise the default is a guard with the bounds of the agent's contract.
+        restart: With "manual", the robot stays at rest after a stop until `watchdog.restart()` is
+            called. Only an operator who sees the robot may call it, and it has no effect while a
+            source is silent. With "auto", motion restarts when the silence ends; only a stop by a
+            command still needs the call. The default is "auto" for a simulated robot and "manual"
+            for any other robot.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop,
             mark.
-        fit: The comparison of policy and robot, for misfits that are accepted; default:
+        fit: The comparison of policy and robot, e.g. one that accepts misfits; default:
             `fit_of(agent, robot, limits)`.
         reset_options: Further arguments of `agent.reset`.
         viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
-        report: A new report, for a caller that reads it also if the loop ends with an exception;
-            by default the loop makes one.
-        slo: What the robot needs of its server, which says at the reset whether it can be served
-            in time; by default, the rate of the loop.
+        report: A new report, which the caller can read even if the loop ends with an exception; by
+            default the loop makes a report.
+        slo: The service level objective that is sent with the reset; the server reports whether it
+            can meet it. By default it contains only the rate of the loop.
 
     Raises:
         ConfigError: `restart` has a wrong value.
@@ -471,18 +476,18 @@ def run_loop(
     recorder: Recorder | None = None,
     options: LoopOptions | None = None,
 ) -> LoopReport:
-    """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is
-    over.
+    """Reset an agent and let it drive a robot at a fixed rate, until the agent is done or the time
+    is over.
 
-    With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without
-    a stop, a pause, a mark or an exception. (A mark may come over a network, and nothing from there
-    may start a motion.) A stop ends this motion as it ends any other. `robot.stop()` is called
-    however the loop ends.
+    If `Guard.limits` has a rest pose, the robot moves there slowly after a run that ended without a
+    stop, a pause, a mark or an exception. (A mark may come from the network, and a command from the
+    network must never start a motion.) A stop also ends this motion. `robot.stop()` is always
+    called at the end, even after an exception.
 
-    The schedule is absolute, so there is no drift; a tick that is over before it could begin is
-    skipped and counted as missed. If more than half of the ticks had no action of the policy,
-    `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the
-    caller turns them into an exception.
+    The schedule is absolute, so there is no drift; a tick whose time has passed before it could
+    begin is skipped and counted as missed. If more than half of the ticks had no action of the
+    policy, `LoopReport.mostly_safe` is logged as a warning. A signal such as SIGTERM ends the loop
+    if the caller converts it into an exception.
 
     Args:
         robot: The robot.
@@ -491,17 +496,17 @@ def run_loop(
         hz: The control rate, Hz.
         seconds: The length of the run, s; None runs until the policy or `until` ends it.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
-            This is not a stop: with a rest pose the robot goes there. Use `Watchdog.trip` or
+            This is not a stop: the robot still moves to its rest pose. Use `Watchdog.trip` or
             `RobotControl.stop` for a stop.
         instruction: The task in words.
         watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's
             answers (`act.info["silent_s"]`) are signs of life of "server". After the watchdog has
-            stopped the robot, nothing is commanded until motion is restarted, in this run or a
-            later one. A chunk player then has discarded its plan (`ChunkPlayer.interrupt`), so that
-            the first command is computed from new observations; a guard with `measure` compares it
-            with the measured pose.
-        recorder: Records the run as one episode, also if it ends with an exception. A player with
-            `override` needs a recorder with `interventions=True`.
+            stopped the robot, the loop commands nothing until motion is restarted, in this run or a
+            later run. A chunk player discards its plan at the stop (`ChunkPlayer.interrupt`), so
+            that the first command after the restart is computed from new observations; a guard with
+            `measure` compares this command with the measured pose.
+        recorder: Records the run as one episode, even if the run ends with an exception. A player
+            with `override` needs a recorder with `interventions=True`.
         options: The guard, the restart after a stop, commands of the live page, and other options.
 
     Returns:
@@ -510,8 +515,9 @@ def run_loop(
     Raises:
         ConfigError: `hz` or `seconds` has a wrong value, the guard differs from the agent's own or
             has limits for another rate, or the recorder has no columns for interventions.
-        ContractMismatch: Before the first motion of the policy: it does not fit the robot.
-        InvalidAction: An action is a chunk, or the guard rejects it.
+        ContractMismatch: The policy does not fit the robot; raised before the policy's first
+            motion.
+        InvalidAction: An action is a chunk, or the guard rejects an action.
     """
     options = options or LoopOptions()
     restart = options.restart
@@ -523,8 +529,8 @@ def run_loop(
     control = _shared_control(agent, watchdog, options.commands)
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
-            "recorder: expected one with interventions for a player with override=, got one "
-            "without; make Recorder(…, interventions=True)"
+            "recorder: expected a recorder with interventions for a player with override=, got a "
+            "recorder without; make Recorder(…, interventions=True)"
         )
 
     report = options.report or LoopReport(hz)
@@ -565,7 +571,7 @@ def run_loop(
             if counts_ticks is not None:
                 report.timeliness = counts_ticks.timeliness
                 run.agent_counts_ticks = True
-            # A policy in this process may return anything.
+            # A policy in this process may return values of any type.
             told: object = reset_info.get(SLO) if isinstance(reset_info, dict) else None
             report.slo = read_answer(told)
             if not report.slo.get("in_time", True):
@@ -588,7 +594,7 @@ def run_loop(
         finally:
             control.running = False
             report.barks = control.stops[earlier_stops:]
-            robot.stop()  # before the watchdog and the recorder end
+            robot.stop()  # before the watchdog and the recorder are closed
     report.log_warnings()
     return report
 
@@ -596,8 +602,8 @@ def run_loop(
 def _shared_control(
     agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None
 ) -> RobotControl:
-    """Return the control of a robot that agent, watchdog and commands share from now on: the
-    agent's, else the watchdog's, else the control of the commands.
+    """Return the `RobotControl` that agent, watchdog and commands share from now on: the agent's
+    control, else the watchdog's, else the control of the commands.
     """
     has_control = ability(agent, HasControl)
     control: RobotControl | None = None if has_control is None else has_control.control
@@ -617,7 +623,8 @@ def _shared_control(
 
 
 def _guard_of(agent: Agent, guard: Guard | None, hz: float) -> Guard:
-    """Return the guard of a run: the caller's, the agent's, or a new one of the agent's contract.
+    """Return the guard of a run: the caller's guard, the agent's guard, or a new guard for the
+    agent's contract.
 
     Raises:
         ConfigError: There are two guards, or the guard has limits for another rate.
@@ -646,26 +653,27 @@ class _Run:
 
     robot: Robot
     agent: Agent
-    interruptible: Interruptible | None  # the agent, if it has a plan to drop
+    interruptible: Interruptible | None  # the agent, if it has planned actions that it can drop
     control: RobotControl
-    agent_has_control: bool  # whether `act` updates the control
+    agent_has_control: bool  # whether the agent's `act` updates the control
     guard: Guard
-    agent_has_guard: bool  # whether `act` checks its action with the guard
+    agent_has_guard: bool  # whether the agent's `act` checks its action with the guard
     watchdog: Watchdog | None
     recorder: Recorder | None
     commands: CommandInbox | None
     view: LoopView
     report: LoopReport
     fit: Fit | None  # None after the policy's first action
-    counts: bool = False  # whether the policy was to act at the last tick
+    counts: bool = False  # whether the last tick needed an action of the policy
     agent_counts_ticks: bool = False  # whether `act` counts its tick in the report's timeliness
-    standing: bool = True  # before the first action, and after a stop until the next one
+    # Whether the robot is at rest: before the first action, and from a stop until the next action.
+    standing: bool = True
     last: np.ndarray | None = None  # the last action that was applied, (D,)
     apply_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TICKS))
 
     def drive(self, pacer: Pacer, seconds: float | None, until: Callable[[], bool]) -> None:
-        """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the
-        timing in any case.
+        """Run ticks until the policy, `until`, a mark or the time ends the run. The timing is
+        always written to the report.
         """
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
         missed = pacer.missed
@@ -673,7 +681,8 @@ class _Run:
         end_tick = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
             while not (until() or self.report.done):
-                # Collect the cycles of failed requests, as automatic collection is off.
+                # Free the reference cycles of failed requests, as automatic garbage collection is
+                # off.
                 if time.monotonic() - collected_at > _COLLECT_S:
                     gc.collect()
                     collected_at = time.monotonic()
@@ -699,7 +708,7 @@ class _Run:
                 self._count_missed(pacer.missed - missed)
                 missed = pacer.missed
 
-                # This comes before the sign of life of this tick, which may be late.
+                # These ticks are recorded before this tick's sign of life, which may be late.
                 hold = self._reason_to_hold(act)
                 if self.control.over:
                     break
@@ -726,7 +735,7 @@ class _Run:
         """Count whether the tick had an action of the policy in time."""
         info: Mapping[str, Any] = act.info
         if not self.agent_has_control and self.control.state == "autonomous":
-            # An agent without a plan answers at the tick itself.
+            # An agent without a plan computes its action within the tick.
             info = {IN_TIME: SAFE not in info, **info}
         if not self.agent_counts_ticks:
             self.report.timeliness.count(info)
@@ -738,7 +747,9 @@ class _Run:
             self.report.timeliness.count_missed(ticks)
 
     def _give_signs_of_life(self, act: Act) -> None:
-        """Report to the watchdog that the loop is alive, and when the server last was."""
+        """Report to the watchdog that the loop is alive, and the time since the server's last sign
+        of life.
+        """
         if self.watchdog is None:
             return
         self.watchdog.heard("loop")
@@ -761,7 +772,7 @@ class _Run:
             )
 
     def go_to_rest(self, pacer: Pacer) -> None:
-        """Move slowly to the guard's rest pose, unless the robot is held or the episode was
+        """Move slowly to the guard's rest pose, unless the robot must hold or the episode was
         marked.
         """
         last = self.last
@@ -770,7 +781,7 @@ class _Run:
         try:
             for command in self.guard.way_to_rest(last):
                 pacer.wait()
-                _observed(self.robot)  # the robot may notice that it must not move (`holds`)
+                _observed(self.robot)  # `observe` may update the robot's `holds`
                 self.control.update()
                 hold = self._reason_to_hold(Act(last))
                 if hold is not None or self.control.state == "human" or self.control.over:
@@ -786,7 +797,7 @@ class _Run:
             logger.warning("the robot stops on its way to the rest pose: %s", error)
 
     def _reason_to_hold(self, act: Act) -> Held | None:
-        """Apply new commands; return why this tick may command nothing, or None."""
+        """Apply new commands; return the reason why the robot must hold at this tick, or None."""
         if self.commands is not None:
             self.commands.apply(self.control)
 
@@ -797,7 +808,8 @@ class _Run:
         if robot_reason is not None:
             return Held("robot", str(robot_reason))
 
-        # The cause of a safe action may have ended after the player's decision.
+        # The player may have chosen a safe action because of a stop or a pause that has ended
+        # since.
         safe = _safe(act)
         if safe is not None and safe.cause in ("stopped", "paused"):
             return safe
@@ -806,7 +818,7 @@ class _Run:
     def _keep_still(self, hold: Held) -> None:
         """Keep the robot at rest for this tick."""
         if not self.standing:
-            # Stop it again, as the watchdog may have stopped it just before the last action.
+            # Stop the robot again, as the watchdog may have stopped it just before the last action.
             self.robot.stop()
         self.standing = True
         if self.interruptible is not None:
@@ -818,7 +830,8 @@ class _Run:
 
         Returns:
             The applied action, (D,), and None; or None and the reason why the robot was stopped
-            meanwhile. Both are None for a robot at rest, which gets no safe action.
+            meanwhile. Both are None if the action is a safe action and the robot is at rest; the
+            action is then not applied.
         """
         safe = _safe(act)
         action = act.action
@@ -843,8 +856,8 @@ class _Run:
         return action, None
 
     def _command(self, action: np.ndarray) -> Held | None:
-        """Apply an action, unless the robot has been stopped since this tick's check; return why
-        it was not applied.
+        """Apply an action, unless the robot has been stopped since this tick's check; return the
+        reason if the action was not applied.
         """
         with self.control.command() as hold:
             if hold is not None:
@@ -856,14 +869,14 @@ class _Run:
             self.robot.apply(action)
             self.apply_s.append(time.perf_counter() - began_s)
 
-        if self.control.held is not None:  # the command may have ended after the stop
+        if self.control.held is not None:  # the action may have been applied after the stop
             self.robot.stop()
         return None
 
 
 def _safe(act: Act) -> Held | None:
-    """Return why the action of an agent is the safe one; None if it is the policy's or an
-    operator's.
+    """Return the reason why an agent's action is the safe action; None if the action is the
+    policy's or an operator's.
     """
     if SAFE not in act.info:
         return None

@@ -1,4 +1,4 @@
-"""Ticks at a fixed rate, statistics of their lateness, and measures of this process against it."""
+"""Ticks at a fixed rate, statistics of their lateness, and measures that reduce the lateness."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 
 SPIN_S = 0.001
-"""The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of
-microseconds late or more.
+"""The last part of a wait, s, during which the thread spins, since a sleeping thread wakes up tens
+of microseconds late or more.
 """
-KEPT_TICKS = 200_000  # the number of ticks whose lateness is kept, as a loop may run for days
-# Longest time for which another thread keeps the interpreter; Python's default is 5 ms.
+# The number of last ticks whose lateness is stored, as a loop may run for days.
+KEPT_TICKS = 200_000
+# Longest time, s, for which another thread keeps the interpreter lock; Python's default is 5 ms.
 _SWITCH_S = 0.0005
 _NICE = -10
 _FIFO = 10
@@ -30,7 +31,7 @@ _FIFO = 10
 class Pacer:
     """A schedule of ticks without drift: tick k is due at begin + k * period.
 
-    A tick that is over before it could begin is skipped and counted as missed.
+    A tick whose time has passed before it could begin is skipped and counted as missed.
 
     Args:
         hz: The rate, Hz.
@@ -64,7 +65,7 @@ class Pacer:
             time.sleep(due - now - SPIN_S)
         now = time.perf_counter()
         while now < due:
-            time.sleep(0)  # lets other threads have the interpreter and the core
+            time.sleep(0)  # other threads can use the interpreter and the core
             now = time.perf_counter()
 
         self.late_s.append(now - due)
@@ -72,8 +73,8 @@ class Pacer:
         return self._tick
 
     def forget(self, end: int) -> None:
-        """Exclude the tick that just began from the statistics, and the missed ticks from number
-        `end` to it.
+        """Exclude the tick that has just begun from the statistics, and all missed ticks since tick
+        number `end`.
         """
         self.late_s.pop()
         self.ticks -= 1
@@ -85,7 +86,7 @@ class Pacer:
 
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
-    """Compute the punctuality of a loop.
+    """Compute statistics of the lateness of a loop.
 
     Args:
         late_s: The lateness of the last ticks, s.
@@ -110,23 +111,24 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
 
 @contextlib.contextmanager
 def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
-    """Reduce the delays that the process causes to the calling thread, within the context.
+    """Reduce, within the context, the delays of the calling thread that its own process causes.
 
     Automatic garbage collection is off within the context, as a collection of a large heap takes
-    tens of milliseconds; objects that exist before are excluded from explicit collections. Other
-    threads yield the interpreter within 0.5 ms. If the user may set it (root, or `ulimit -e`), the
-    thread has a higher priority than others on the machine. With `real_time` it has SCHED_FIFO
-    instead, before all threads that are not real-time (`ulimit -r`).
+    tens of milliseconds; existing objects are excluded from explicit collections. Other threads
+    yield the interpreter lock within 0.5 ms. If the user is permitted (root, or `ulimit -e`), the
+    thread gets a higher priority than other threads on the machine. With `real_time` it gets the
+    scheduling policy SCHED_FIFO instead, which precedes all threads that are not real-time (`ulimit
+    -r`).
 
-    Lateness, p99, measured on 2 cores at 50 Hz: next to two busy processes 2.8 ms without measures,
-    0.6 ms with the priority, 0.02 ms with SCHED_FIFO; next to a busy Python thread of the same
-    process 5.3 ms without measures, 1.3 ms with them.
+    The p99 of the lateness was measured on 2 cores at 50 Hz. Next to two busy processes, it is 2.8
+    ms without these measures, 0.6 ms with the priority, and 0.02 ms with SCHED_FIFO. Next to a busy
+    Python thread of the same process, it is 5.3 ms without and 1.3 ms with the measures.
 
     Args:
-        real_time: Whether the thread gets SCHED_FIFO.
+        real_time: Whether to use SCHED_FIFO.
 
     Yields:
-        The measures that were taken, in words.
+        Descriptions of the measures that were taken.
     """
     was_collecting = gc.isenabled()
     had_frozen_objects = gc.get_freeze_count() > 0
@@ -139,7 +141,7 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     measures = ["garbage collection off", "switch interval 0.5 ms"]
 
     with contextlib.ExitStack() as undo:
-        # `unfreeze` would also undo what the process itself froze.
+        # `unfreeze` would also unfreeze objects that the program itself has frozen.
         if not had_frozen_objects:
             undo.callback(gc.unfreeze)
         if was_collecting:
@@ -151,7 +153,7 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
     """Raise the priority of the calling thread, and return the measure in words."""
-    if not sys.platform.startswith("linux"):  # other systems have no priority of a thread
+    if not sys.platform.startswith("linux"):  # other systems have no priorities of threads
         return "no priority (only on Linux)"
     thread = threading.get_native_id()
     try:

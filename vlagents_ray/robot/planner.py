@@ -1,8 +1,8 @@
-"""A robot with two models: a slow planner chooses the subtask, and a fast policy acts on it.
+"""A robot with two models: a slow planner chooses the subtask, and a fast policy executes it.
 
-The planner is a policy in a deployment of its own, and has a separate session. It is part of the
-robot here, like a slow sensor: its newest answer is in each observation. So the policy of the
-control loop remains the only agent that moves the robot, with its guard and its watchdog.
+The planner is a policy in another deployment, with a separate session. Here it is part of the
+robot, like a slow sensor: each observation contains the planner's newest answer. Thus the policy of
+the control loop, with its guard and its watchdog, is the only agent that moves the robot.
 """
 
 from __future__ import annotations
@@ -47,31 +47,32 @@ logger = logging.getLogger(__name__)
 
 
 class RobotWithPlanner(RobotWrapper):
-    """A robot whose observations have the newest answer of a planner.
+    """A robot whose observations contain the newest answer of a planner.
 
-    Use it as a context manager around each episode; outside of its context it is the inner robot.
-    Entering it waits for the planner's first answer. From then on the planner gets an observation
-    `hz` times a second in the background, so that no tick waits for it. `observe` adds to the
-    observation's info:
+    Use it as a context manager around each episode; outside the context it behaves like the inner
+    robot. Entering the context waits for the planner's first answer. Afterwards, the robot sends an
+    observation to the planner `hz` times per second in the background, so that no tick waits for
+    the planner. `observe` adds to the observation's info:
 
     - `goal`: the action of the planner's answer, (D,) float32;
-    - `subtask`: its text, if the planner's `Act.info` has one of this name;
+    - `subtask`: the text `subtask` in the planner's `Act.info`, if there is one;
     - `subtask_age_ms`: the time since the observation from which the answer was computed.
 
-    While the planner is late or down, the last answer stays. Once it is older than `max_age_s`,
-    `holds` is the reason, so that the control loop holds the robot until there is a newer answer.
+    While the planner is late or down, its last answer remains in use. When this answer is older
+    than `max_age_s`, `holds` becomes the reason, so that the control loop holds the robot until
+    there is a newer answer.
 
     Args:
         robot: The robot, which the caller opens and closes.
-        planner: The planner, such as a `RemoteAgent`; leaving the context closes it. It answers
-            with one action, (D,); of a chunk, the first row counts.
+        planner: The planner, such as a `RemoteAgent`; leaving the context closes it. It returns one
+            action, (D,); only the first row of a chunk is used.
         instruction: The task in words, for the planner.
-        hz: The rate of its requests, Hz; at most one is under way.
-        max_age_s: The largest age of an answer on which the policy may act, s; at least one period
-            of the planner.
+        hz: The rate of requests to the planner, Hz; at most one request is pending.
+        max_age_s: The largest age of an answer that the policy may use, s; at least one period of
+            the planner.
 
     Raises:
-        ConfigError: A number is out of its range.
+        ConfigError: A number is out of range.
     """
 
     def __init__(
@@ -89,13 +90,13 @@ class RobotWithPlanner(RobotWrapper):
         if not max_age_s >= 1 / hz:
             raise ConfigError(
                 f"max_age_s: expected at least the period of the planner, {1 / hz:g} s, got "
-                f"{max_age_s}; the robot would hold between any two answers"
+                f"{max_age_s}; otherwise the robot holds between any two answers"
             )
         self._planner = planner
         self._instruction = instruction
         self._hz, self._period_s = hz, 1 / hz
         self._max_age_s = max_age_s
-        self._caller: AsyncCaller | None = None  # None outside of the context
+        self._caller: AsyncCaller | None = None  # None outside the context
         self._contract: Contract | None = None
         self._begin()
 
@@ -104,8 +105,8 @@ class RobotWithPlanner(RobotWrapper):
         self._asked_s = 0.0  # time of the observation of the last request
         self._due_s = 0.0  # time of the next request
         self._answer: dict[str, Any] = {}  # the newest answer, as the info of an observation
-        self._seen_s = 0.0  # time of its observation
-        self._failure = ""  # why the last request has no answer; empty if it has one
+        self._seen_s = 0.0  # time of the observation of the newest answer
+        self._failure = ""  # reason why the last request has no answer; empty if it has an answer
         self._task_done = False
 
     @property
@@ -115,8 +116,8 @@ class RobotWithPlanner(RobotWrapper):
 
     @property
     def planner_timeliness(self) -> Timeliness:
-        """The share of the planner's own ticks, `hz` a second, at which its answer to the one
-        before had arrived.
+        """The share of the planner's ticks, `hz` per second, at which the answer to the previous
+        tick's request had arrived.
         """
         return self._timeliness
 
@@ -140,7 +141,7 @@ class RobotWithPlanner(RobotWrapper):
             except VLAgentsError as error:
                 error.args = (f"planner: {error}",)
                 raise
-            self._caller = AsyncCaller(self._planner)  # its `close` closes the planner
+            self._caller = AsyncCaller(self._planner)  # closing the caller closes the planner
             stack.pop_all()
         self._due_s = self._asked_s + self._period_s
         return self
@@ -167,7 +168,8 @@ class RobotWithPlanner(RobotWrapper):
         return replace(obs, info={**obs.info, **self._answer, SUBTASK_AGE: age_ms})
 
     def __getattr__(self, name: str) -> Any:
-        # Not a property, as a robot without `holds` has no such attribute while it may move.
+        # This is not a property, since a robot without `holds` must not have this attribute while
+        # it may move.
         if name == "holds":
             reason = self._reason_to_hold()
             if reason is not None:
@@ -175,7 +177,9 @@ class RobotWithPlanner(RobotWrapper):
         return super().__getattr__(name)
 
     def _reset(self, obs: Obs) -> None:
-        """Begin the planner's episode; log if its server cannot serve it in time."""
+        """Begin the planner's episode; log a warning if the server cannot serve the planner in
+        time.
+        """
         options: dict[str, Any] = {}
         reads = ability(self._planner, ReadsSlo)
         if reads is not None and reads.reads_slo:
@@ -186,7 +190,7 @@ class RobotWithPlanner(RobotWrapper):
             logger.warning("planner: slo: %s", answer.get("reason"))
 
     def _receive(self, caller: AsyncCaller) -> None:
-        """Take the planner's answer, or its error, if there is one."""
+        """Process the planner's answer or error, if one has arrived."""
         answer = caller.take()
         if answer is None:
             return
@@ -200,7 +204,7 @@ class RobotWithPlanner(RobotWrapper):
             self._fail(answer)
 
     def _take(self, act: Act) -> None:
-        """Use an answer of the planner from now on."""
+        """Check an answer of the planner, and store it as the newest answer."""
         goal = Act(check_action(act.action, self._contract)).rows()[0]
         answer: dict[str, Any] = {GOAL: goal}
         subtask = act.info.get(SUBTASK)
@@ -218,17 +222,17 @@ class RobotWithPlanner(RobotWrapper):
 
     def _fail(self, error: Exception) -> None:
         code = error.code if isinstance(error, VLAgentsError) else type(error).__name__
-        if not self._failure:  # else the planner is still down
+        if not self._failure:  # otherwise the failure is already logged
             logger.warning("planner: %s: %s; the last subtask stays", code, error)
         self._failure = f"{code}: {error}"
 
     def _ask(self, caller: AsyncCaller, obs: Obs, now: float) -> None:
-        """Count a tick of the planner, and send it an observation, unless the last request is still
-        under way.
+        """Count a tick of the planner, and send an observation to the planner unless the last
+        request is still pending.
         """
         is_answered = caller.idle and not self._failure
         self._timeliness.count({IN_TIME: is_answered})
-        # A tick that the control loop has missed is not made up for.
+        # Ticks that the control loop has missed are not repeated.
         passed = math.floor((now - self._due_s) / self._period_s)
         self._due_s += (passed + 1) * self._period_s
         if not caller.idle:
@@ -236,11 +240,11 @@ class RobotWithPlanner(RobotWrapper):
 
         self._asked_s = now
         request = {
-            # A later answer would be too old to be used.
+            # An answer after this deadline would be too old to be used.
             DEADLINE: 1e3 * self._max_age_s,
             SLACK: 1e3 * self._period_s,
             TICKS: self._timeliness.report(),
-            FURTHER_MODEL: True,  # the policy's server counts the robot
+            FURTHER_MODEL: True,  # the server of the policy already counts this robot
         }
         caller.ask(stamped(copied(obs), request))
 
@@ -248,7 +252,7 @@ class RobotWithPlanner(RobotWrapper):
         return time.monotonic() - self._seen_s
 
     def _reason_to_hold(self) -> str | None:
-        """Return why the policy may not act on the planner's last answer, or None."""
+        """Return the reason why the policy may not use the planner's last answer, or None."""
         if self._caller is None:
             return None
         age_s = self._age_s()
@@ -256,6 +260,6 @@ class RobotWithPlanner(RobotWrapper):
             return None
         why = self._failure or "the planner has not answered yet"
         return (
-            f"planner: expected a subtask of at most {self._max_age_s:g} s, got one of {age_s:.1f} "
-            f"s: {why}; see the planner's server, or raise max_age_s"
+            f"planner: expected a subtask of at most {self._max_age_s:g} s, got a subtask of "
+            f"{age_s:.1f} s: {why}; see the planner's server, or raise max_age_s"
         )

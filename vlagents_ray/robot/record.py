@@ -1,4 +1,4 @@
-"""A recorder of a robot's observations and actions, which does not delay the control loop."""
+"""A recorder of a robot's observations and actions that does not delay the control loop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
 
-_NICE = 5  # the writing thread has a lower priority than the control loop
+_NICE = 5  # niceness of the writing thread, so that its priority is lower than the control loop's
 
 
 class Recorder:
@@ -31,20 +31,21 @@ class Recorder:
 
     `add` copies the frame into a queue and returns; a thread encodes and writes it. If the queue is
     full, the frame is dropped and counted in `dropped`, and the column `tick` shows the gap. An
-    episode is part of the dataset as soon as it ends, so a crash loses at most the running one. If
-    writing fails, for instance on a full disk, the episode is lost, and `close` raises the error.
+    episode is part of the dataset as soon as it ends, so a crash loses at most the running episode.
+    If writing fails, for instance on a full disk, the episode is lost, and `close` raises the
+    error.
 
     Args:
         root: The dataset's folder, which is created or continued.
         fps: The rate of the frames, Hz.
         frames: The largest number of frames in the queue.
         interventions: Whether an operator may take over: frames then also have `intervention`
-            (bool), `policy_action` and `policy_known` (bool), and episodes a label. A dataset that
-            has these columns keeps them in any case.
+            (bool), `policy_action` and `policy_known` (bool), and episodes a label. If an existing
+            dataset has these columns, they are always written.
 
     Raises:
-        ConfigError: The folder cannot be written to, or has other files, or a dataset of another
-            rate or version, or without these columns.
+        ConfigError: The folder is not writable, contains other files, or contains a dataset with
+            another rate or version or without these columns.
         MissingDependency: The extra "record" is not installed.
     """
 
@@ -52,13 +53,13 @@ class Recorder:
         self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False
     ) -> None:
         self.dropped = 0
-        self.error: Exception | None = None  # the first error in writing
+        self.error: Exception | None = None  # the first error of writing
         try:
             self._dataset = Dataset(Path(root), fps, interventions=interventions)
-            # Without this, an unusable folder would raise only with the first frame.
+            # This raises the error of an unusable folder now, not with the first frame.
             Path(root).mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError, KeyError) as error:
-            # There is no such folder, no permission, or its files are damaged.
+            # The folder does not exist, is not accessible, or has damaged files.
             raise ConfigError(
                 f"recorder {root}: {type(error).__name__}: {error}; record into a new folder that "
                 "can be written to"
@@ -66,8 +67,8 @@ class Recorder:
         self._label: Label | None = None
         self._frames = frames
 
-        # The next steps of the thread: functions of the running episode that return the episode
-        # that runs afterwards. None ends the thread.
+        # The steps that the writing thread executes: functions that take the running episode and
+        # return the episode that runs afterwards. None ends the thread.
         self._queue: queue.SimpleQueue[
             Callable[[RunningEpisode | None], RunningEpisode | None] | None
         ]
@@ -90,9 +91,10 @@ class Recorder:
 
     @contextlib.contextmanager
     def episode(self, instruction: str) -> Iterator[None]:
-        """Make the frames that are added within the context one episode.
+        """Record the frames that are added within the context as one episode.
 
-        The episode is kept however the context ends, unless it has the label "discard".
+        The episode is saved even if the context ends with an exception, unless it has the label
+        "discard".
 
         Args:
             instruction: The task in words.
@@ -105,7 +107,8 @@ class Recorder:
             self._queue.put(partial(self._end, self._label))
 
     def label(self, label: Label) -> None:
-        """Label the running episode; the last label counts. May be called from any thread.
+        """Label the running episode; a later label replaces an earlier one. May be called from any
+        thread.
 
         Args:
             label: "success" or "failure", which is written to the column `label` of the dataset's
@@ -139,10 +142,10 @@ class Recorder:
             obs: The observation.
             action: The action that was applied after it, (D,) float32.
             tick: The tick of the control loop.
-            safe: Whether the action is a safe one, not the policy's.
+            safe: Whether the action is a safe action, not the policy's action.
             intervention: Whether an operator moved the robot at this tick.
-            policy_action: The policy's action, (D,), if another one was applied; None if it is not
-                known.
+            policy_action: The policy's action, (D,), if another action was applied; None if
+                unknown.
         """
         if self._added - self._taken >= self._frames:
             self.dropped += 1
@@ -154,7 +157,7 @@ class Recorder:
         def write(episode: RunningEpisode | None) -> RunningEpisode | None:
             """Add the frame to the running episode."""
             self._taken += 1
-            if episode is not None:  # else it was abandoned after an error
+            if episode is not None:  # None: it was abandoned after an error
                 captured_at = float(obs_copy.info[CAPTURED])
                 episode.add(
                     obs_copy, action_copy, captured_at, tick, safe, intervention, policy_action
@@ -177,7 +180,7 @@ class Recorder:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        has_failed = exc[0] is not None  # then an error of `close` would hide the first one
+        has_failed = exc[0] is not None  # otherwise an error of `close` would hide the first error
         with contextlib.suppress(Exception) if has_failed else contextlib.nullcontext():
             self.close()
 
@@ -203,7 +206,7 @@ class Recorder:
             episode.abandon()
 
     def _end(self, label: Label | None, episode: RunningEpisode | None) -> None:
-        """Save the running episode, or abandon it if it is empty or is to be discarded."""
+        """Save the running episode, or abandon it if it is empty or has the label "discard"."""
         if episode is not None and episode.rows and label != "discard":
             self._dataset.save(episode.finish(label))
         elif episode is not None:

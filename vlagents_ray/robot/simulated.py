@@ -1,4 +1,4 @@
-"""Robots without hardware: a simulated arm for trying the control loop, and an environment as a
+"""Robots without hardware: a simulated arm for tests of the control loop, and an environment as a
 robot.
 """
 
@@ -16,11 +16,12 @@ if TYPE_CHECKING:
 
 _SIDE = 224  # side of an image whose size the contract does not declare, px
 _DOT = 16  # side of the dot, px
-_SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
+_SMOOTHING = 0.5  # share of the distance to its target that a joint moves per tick
 
 
 class SimulatedRobot:
-    """An arm whose joints follow their commands, shown as a dot on a still image by its cameras.
+    """An arm whose joints follow their commands. Its cameras show the first joint as a dot on a
+    still image.
 
     Actions have the `dim` numbers of the policy's contract. They are deltas of the joints, or
     absolute targets (also if the contract declares neither), with the grippers of
@@ -40,7 +41,7 @@ class SimulatedRobot:
         state = contract.state or {"joints": StateSpec()}
         self._state_dims = {name: spec.dim for name, spec in state.items()}
 
-        # Gradients with a little noise, which codecs compress like a camera's.
+        # Gradients with a little noise, which codecs compress like real camera images.
         self._pictures: dict[str, np.ndarray] = {}
         cameras = contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}
         for name, camera in cameras.items():
@@ -98,14 +99,14 @@ class SimulatedRobot:
 
 
 class EnvRobot:
-    """One episode of an environment as a `Robot`: each command is a step; without commands, time
-    does not pass.
+    """One episode of an environment as a `Robot`: each command executes a step; without commands,
+    simulated time does not pass.
 
     Args:
         env: The environment, which the caller closes.
         seed: The seed of the episode.
-        endless: Whether the environment's step limit is ignored, as an operator takes longer than a
-            policy.
+        endless: Whether to ignore the environment's step limit, since an operator needs more time
+            than a policy.
     """
 
     simulated = True
@@ -123,7 +124,7 @@ class EnvRobot:
         return self._obs
 
     def apply(self, action: np.ndarray) -> None:
-        """Make a step, if the episode has not ended."""
+        """Execute a step, if the episode has not ended."""
         if self.ended:
             return
         self._obs, _, terminated, truncated, info = self._env.step(Act(action))
@@ -132,4 +133,4 @@ class EnvRobot:
         self.ended = self.success or terminated or (truncated and not self._endless)
 
     def stop(self) -> None:
-        """Do nothing: the simulation makes a step only at a command."""
+        """Do nothing: the simulation executes steps only on command."""

@@ -1,4 +1,4 @@
-"""The keys typed at a terminal, each of which has exactly one consumer."""
+"""Delivery of the keys typed at a terminal to consumers; each key goes to exactly one consumer."""
 
 from __future__ import annotations
 
@@ -11,29 +11,31 @@ from collections.abc import Callable, Iterator
 
 from vlagents_ray.errors import ConfigError
 
-# A function that handles a key in lower case, and returns whether the key has a meaning for it.
+# A function that receives a key in lower case, and returns whether it handles the key.
 Consumer = Callable[[str], bool]
 
 
 class Terminal:
-    """A terminal whose keys go to the newest consumer, such as a keyboard that moves the robot.
+    """A terminal whose keys go to the newest consumer, such as a keyboard leader that moves the
+    robot.
 
-    A key that has no meaning for it goes to the consumer before, and last to one that reads in the
-    background. Two objects of one terminal share its consumers.
+    A key that this consumer does not handle goes to the consumer before it, and so on; a consumer
+    that reads in the background is the last. All objects for the same terminal share its consumers.
 
     Args:
-        descriptor: The file descriptor of the terminal; default: the one of standard input.
+        descriptor: The file descriptor of the terminal; default: standard input.
 
     Raises:
         ConfigError: The descriptor is not a terminal.
     """
 
-    _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - of all terminals of this process
+    # The consumers of all terminals of this process, by the terminal's device and inode.
+    _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - shared on purpose
     _lock = threading.RLock()
 
     def __init__(self, descriptor: int | None = None) -> None:
         if descriptor is None and sys.stdin is not None:
-            # A replacement of standard input need not be a file.
+            # A replacement of `sys.stdin` need not be a file.
             with contextlib.suppress(OSError, ValueError):
                 descriptor = sys.stdin.fileno()
         if descriptor is None or not os.isatty(descriptor):
@@ -42,7 +44,8 @@ class Terminal:
             )
         self.descriptor = descriptor
         status = os.fstat(descriptor)
-        # The consumers of this terminal, oldest first, which all objects of it share.
+        # The consumers of this terminal, oldest first; all objects for this terminal share the
+        # list.
         self._own_consumers = self._consumers.setdefault((status.st_dev, status.st_ino), [])
 
     @contextlib.contextmanager
@@ -51,7 +54,8 @@ class Terminal:
         import termios
         import tty
 
-        if not self._is_in_foreground():  # else changing the terminal would suspend the process
+        # In the background, changing the terminal would suspend the process.
+        if not self._is_in_foreground():
             yield
             return
         before = termios.tcgetattr(self.descriptor)
@@ -63,8 +67,8 @@ class Terminal:
 
     @contextlib.contextmanager
     def consumed_by(self, consumer: Consumer, *, last: bool = False) -> Iterator[None]:
-        """Pass the keys to a consumer within the context, as the newest or, with `last`, after
-        all others.
+        """Pass the keys to a consumer within the context, as the newest consumer or, with `last`,
+        after all others.
         """
         with self._lock:
             self._own_consumers.insert(0 if last else len(self._own_consumers), consumer)
@@ -81,7 +85,7 @@ class Terminal:
             consumer: The consumer that reads.
 
         Returns:
-            Whether the terminal is open.
+            Whether the terminal is still open.
 
         Raises:
             ConfigError: The context of `consumed_by` has not begun for this consumer.
@@ -89,8 +93,8 @@ class Terminal:
         with self._lock:
             if consumer not in self._own_consumers:
                 raise ConfigError(
-                    "terminal: expected a consumer in use, got one that has not begun; put "
-                    "`with` around its use"
+                    "terminal: expected a consumer within its context, got one whose context has "
+                    "not begun; use it in a `with` block"
                 )
             if self._own_consumers[-1] != consumer:
                 return True
@@ -106,14 +110,16 @@ class Terminal:
             return True
 
     def _pass_key(self, key: str) -> None:
-        """Pass a key to the consumers, the newest first, until one has a meaning for it."""
+        """Pass a key to the consumers, newest first, until one handles it."""
         for consumer in reversed(self._own_consumers):
             if consumer(key):
                 return
 
     @contextlib.contextmanager
     def read_in_background(self, consumer: Consumer) -> Iterator[None]:
-        """Pass keys without another consumer to this one, from a thread, within the context."""
+        """Pass keys that no other consumer handles to this consumer, from a thread, within the
+        context.
+        """
         over = threading.Event()
 
         def read() -> None:
@@ -136,14 +142,16 @@ class Terminal:
         """
         try:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
-        except OSError:  # not this process's controlling terminal, so reading suspends nothing
+        # The terminal is not this process's controlling terminal, so reading does not suspend the
+        # process.
+        except OSError:
             return True
 
 
 @contextlib.contextmanager
 def typed_keys(consumer: Consumer) -> Iterator[bool]:
-    """Pass the keys typed at the terminal to a consumer within the context, unless they have a
-    meaning for a newer consumer.
+    """Pass the keys typed at the terminal to a consumer within the context, unless a newer consumer
+    handles them.
 
     Args:
         consumer: The consumer, which may be called from a thread.
@@ -152,7 +160,7 @@ def typed_keys(consumer: Consumer) -> Iterator[bool]:
         Whether there is a terminal.
     """
     terminal = None
-    with contextlib.suppress(ConfigError):  # standard input is no terminal
+    with contextlib.suppress(ConfigError):  # standard input is not a terminal
         terminal = Terminal()
     if terminal is None:
         yield False

@@ -20,7 +20,7 @@ class Watchdog:
     `stop` is called once for each silence, on the watchdog's own thread, which also detects a
     control loop that hangs. The time limits begin to run at `start` (or `with`). After a stop,
     `control.stopped` is true until `restart` is called, also in later runs of the control loop. If
-    `stop` raises an exception, it is kept in `error`, and the watchdog continues.
+    `stop` raises an exception, the exception is stored in `error`, and the watchdog continues.
 
     Args:
         stop: Stops the robot; its argument is the reason as text, which is also appended to
@@ -35,13 +35,14 @@ class Watchdog:
         for name, limit_s in silent_s.items():
             if not limit_s > 0:
                 raise ConfigError(f"watchdog: {name!r}: expected a limit above 0 s, got {limit_s}")
-        self.barks: list[str] = []  # the reasons given to `stop`
+        self.barks: list[str] = []  # the reasons passed to `stop`
         self.error: Exception | None = None
         self.control = RobotControl()
-        """The state of the robot, which `run_loop` lets it share with a chunk player."""
+        """The state of the robot; in `run_loop`, the watchdog and a chunk player share it."""
         self._stop = stop
         self._limits = dict(silent_s)  # s
-        self._heard_at = dict.fromkeys(silent_s, 0.0)  # on the clock `time.monotonic`
+        # Time of each source's last sign of life, time.monotonic().
+        self._heard_at = dict.fromkeys(silent_s, 0.0)
         self._changed = threading.Condition()  # reentrant
         self._thread: threading.Thread | None = None
 
@@ -71,7 +72,7 @@ class Watchdog:
                 self._changed.notify_all()
 
     def share(self, control: RobotControl) -> None:
-        """Use the robot control of a chunk player from now on, and move earlier stops to it."""
+        """Use the `RobotControl` of a chunk player from now on, and copy earlier stops to it."""
         with self._changed:
             if control is not self.control:
                 control.adopt(self.control)
@@ -89,29 +90,30 @@ class Watchdog:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
 
         Returns:
-            Whether motion is allowed. While a source is silent (`control.silent`), it is not: call
-            this again later.
+            Whether motion is allowed. Motion is not allowed while a source is silent
+            (`control.silent`): call this again later.
         """
         with self._changed:
             return self.control.restart()
 
     def start(self) -> None:
-        """Start the thread and the time limits of all sources, unless they run. Stops and
-        silences persist.
+        """Start the thread and the time limits of all sources, unless they are running. Earlier
+        stops and silences remain in effect.
         """
         with self._changed:
             if self._thread is not None:
                 return
             self._heard_at = dict.fromkeys(self._limits, time.monotonic())
             for name in set(self.control.silent) - self._limits.keys():
-                self.control.heard(name)  # no later sign of life would end its silence
+                # The source is no longer watched, so no sign of life would end its silence.
+                self.control.heard(name)
             self._thread = threading.Thread(
                 target=self._watch, name="vlagents-ray-watchdog", daemon=True
             )
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, after any running call of `stop`."""
+        """End the thread; wait for a running call of `stop`."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._changed.notify_all()
@@ -126,11 +128,11 @@ class Watchdog:
         self.close()
 
     def overdue(self) -> tuple[str | None, float | None]:
-        """Record the silence of a source whose time limit is over.
+        """Record the silence of a source whose time limit has passed.
 
         Returns:
-            The reason for `bark`, or None if no source is overdue; and the time until the next
-            limit may be over, s, or None if no source is watched now.
+            The reason for `bark`, or None if no source is overdue; and the time until the next time
+            limit may pass, s, or None if no source is watched now.
         """
         with self._changed:
             now = time.monotonic()
@@ -151,7 +153,7 @@ class Watchdog:
             return reason, None
 
     def bark(self, reason: str) -> None:
-        """Stop the robot for a reason, and keep an error that `stop` raises in `error`."""
+        """Stop the robot for a reason, and store an error that `stop` raises in `error`."""
         self.barks.append(reason)
         try:
             with self.control.stopping():

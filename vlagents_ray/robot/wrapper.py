@@ -11,10 +11,10 @@ from vlagents_ray.robot.loop import Robot
 
 
 class RobotWrapper(Robot):
-    """A robot around another one, with all attributes of the inner robot.
+    """A robot that wraps another robot, and has all attributes of this inner robot.
 
-    Optional attributes of a `Robot`, such as `holds`, are read from the inner robot at each access
-    and set there. A subclass overrides the methods that it changes. The attributes of a subclass
+    Optional attributes of a `Robot`, such as `holds`, are read from and written to the inner robot
+    at each access. A subclass overrides the methods that it changes. The attributes of a subclass
     begin with an underscore or are declared in the class.
 
     Args:
@@ -34,7 +34,7 @@ class RobotWrapper(Robot):
         self._robot.stop()
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # also `_robot` itself, before `__init__` or in a copy
+        if name.startswith("_"):  # includes `_robot` itself, before `__init__` or in a copy
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self._robot, name)
 

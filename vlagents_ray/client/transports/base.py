@@ -57,8 +57,9 @@ def connection_lost(address: str, reason: object) -> ConnectionLost:
 
 class ReplicaSilent(ConnectionLost):
     """The client has left a replica that does not even answer pings: the replica's process is
-    frozen, or its machine cannot be reached. The connection is closed, so that the replica does not
-    execute the request later.
+    frozen, or its machine cannot be reached.
+
+    The connection is closed, so that the replica does not execute the request later.
     """
 
 
@@ -236,8 +237,10 @@ class ConnectReport:
 
 def first_timeout_s(timeout_s: float) -> float:
     """Return the time limit for the first byte of the first replica's answer, s, a part of
-    `timeout_s`. The time limit of the next replica is twice as long. So each attempt to connect,
-    however short, tries at least two replicas, since the first replica may hang.
+    `timeout_s`.
+
+    The time limit of the next replica is twice as long. So each attempt to connect, however short,
+    tries at least two replicas, since the first replica may hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 

@@ -570,6 +570,7 @@ def _address_of_link(header: str, op: str) -> StreamAddress | None:
 
 def _is_executed(answer: tuple[int, str, bytes]) -> bool:
     """Return whether a replica may have executed a request, given the answer at its own port.
+
     Otherwise another server has the port, or the replica accepts no further connection.
     """
     status, kind, _ = answer

@@ -198,9 +198,11 @@ def open_websocket(
 
 
 class Stream:
-    """A connection to a replica's own port. Only the thread that waits for an answer reads and
-    writes the connection, and it pings the server while it waits. Between calls, nothing answers
-    the server's pings, so the server must rely on the kernel's keep-alive.
+    """A connection to a replica's own port.
+
+    Only the thread that waits for an answer reads and writes the connection, and it pings the
+    server while it waits. Between calls, nothing answers the server's pings, so the server must
+    rely on the kernel's keep-alive.
     """
 
     def __init__(
