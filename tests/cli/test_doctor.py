@@ -258,7 +258,7 @@ class TestAPolicysPython:
         (["gcc", "clang"], True, "gcc"),
         (["clang"], True, "clang"),
         (["gcc"], False, "no "),
-        ([], True, "none, which torch.compile needs on a GPU"),
+        ([], True, "none; torch.compile needs a compiler on a GPU"),
     ],
 )
 def test_triton_needs_a_compiler_and_pythons_headers(

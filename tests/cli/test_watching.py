@@ -32,11 +32,11 @@ FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
 @pytest.mark.parametrize(
     ("policies", "file", "text"),
     [
-        ([FIXED], None, r"expected \{step\} in the checkpoint of one policy, .*, got it in 0"),
+        ([FIXED], None, r"expected \{step\} in the checkpoint of one policy, .*, got 0 such policies"),
         (
             [SWEPT, SWEPT | {"name": "other"}],
             None,
-            r"expected \{step\} in the checkpoint of one policy, .*, got it in 2",
+            r"expected \{step\} in the checkpoint of one policy, .*, got 2 such policies",
         ),
         ([SWEPT | {"steps": [10]}], None, "expected no `steps` with --watch"),
         ([SWEPT], "runs/training_finished", "ended without a checkpoint"),

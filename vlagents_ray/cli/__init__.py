@@ -11,27 +11,25 @@ from types import FrameType
 
 from vlagents_ray.naming import did_you_mean
 
-# A collection goes through all modules that were imported before. At Python's threshold of 700
-# new objects, collections take a tenth of the time of the imports, and find nothing.
+# Garbage collection traverses all modules imported so far. With Python's threshold of 700 new
+# objects, collections take a tenth of the time of the imports, and free nothing.
 _COLLECT_AT = 10_000
 
 
 def main() -> None:
-    """Run the console script; print which packages to install if only the light install is
-    there.
-    """
+    """Run the console script; if only the light install exists, print which packages to install."""
     gc.set_threshold(_COLLECT_AT)
 
-    # This handler applies until a command has its own, see `cli.console.errors`.
+    # This handler applies until a command installs its own handler, see `cli.console.errors`.
     default = signal.signal(signal.SIGINT, _end_at_once)
 
-    if sys.argv[1:] == ["--version"]:  # also in the light install
+    if sys.argv[1:] == ["--version"]:  # this module is also in the light install
         from vlagents_ray.cli.help_page import version_line
 
         sys.stdout.write(f"{version_line()}\n")
         return
 
-    # This command is in the light install, and Ctrl-C in it stops the robot.
+    # This command is in the light install; during the command, Ctrl-C stops the robot.
     if sys.argv[1:2] == ["robot"]:
         from vlagents_ray.cli.robot import main as robot
 
@@ -60,26 +58,26 @@ def main() -> None:
         sys.exit(1)
 
     find_modules_here()
-    # Otherwise Python would collect all of Ray at its end, which takes half a second.
+    # Otherwise Python would free all objects of Ray when it exits, which takes half a second.
     atexit.register(gc.freeze)
     app()
 
 
 def _end_at_once(_number: int, _frame: FrameType | None) -> None:
-    """End the process at Ctrl-C, while it imports the commands."""
+    """End the process at Ctrl-C while it imports the commands."""
     os.write(2, b"error interrupted before the command began; nothing was started or written\n")
     os._exit(130)
 
 
 def find_modules_here() -> None:
-    """Import modules of the working directory, as `python -m` and Ray's workers do, unless
-    PYTHONSAFEPATH is set.
+    """Let Python import modules from the working directory, as `python -m` and Ray's workers do,
+    unless PYTHONSAFEPATH is set.
     """
     if getattr(sys.flags, "safe_path", False):  # Python 3.10 has no such flag
         return
     try:
         folder = os.getcwd()
-    except FileNotFoundError:  # it was removed
+    except FileNotFoundError:  # the working directory was removed
         return
     if folder not in sys.path:
         sys.path.insert(0, folder)

@@ -1,5 +1,5 @@
-"""Arguments of the commands in the light install: readers for argparse, whose errors name the
-cure.
+"""Arguments of the commands in the light install: parsing with argparse, with errors that contain
+the cure.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from vlagents_ray.naming import did_you_mean
 class CommandParser(argparse.ArgumentParser):
     """A parser whose help and errors look like those of Typer's commands.
 
-    Its groups of arguments have a title and, as description, a note that follows the rows.
+    Each group of arguments has a title and, as its description, a note that is shown after the
+    rows.
     """
 
     def __init__(self, command: str, description: str, examples: Sequence[str] = ()) -> None:
         """Create a parser with the options --help and --version.
 
         Args:
-            command: The command as it is typed.
+            command: The command as the user types it.
             description: The description, in paragraphs.
             examples: Command lines without "vlagents-ray".
         """
@@ -56,7 +57,8 @@ class CommandParser(argparse.ArgumentParser):
         groups = [group for group in self._action_groups if group is not self.general]
         for group in (*groups, self.general):
             actions = [action for action in group._group_actions if action.option_strings]
-            actions.sort(key=lambda action: action.dest in ("version", "help"))  # these are last
+            # The general options are last.
+            actions.sort(key=lambda action: action.dest in ("version", "help"))
             if actions:
                 rows = tuple(_option_row(action) for action in actions)
                 panels.append(HelpPanel(group.title or "", rows, group.description or ""))
@@ -80,7 +82,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """The option that prints the version, which is looked up only then."""
+    """The option that prints the version; the version is looked up only when the option is used."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
         sys.stdout.write(f"{version_line()}\n")
@@ -88,7 +90,7 @@ class _Version(argparse.Action):
 
 
 def _term(action: argparse.Action) -> str:
-    """Return an argument of the command line as the help shows it."""
+    """Return the text with which the help shows an argument."""
     metavar = str(action.metavar or action.dest.upper())
     if not action.option_strings:
         return metavar
@@ -108,7 +110,7 @@ def number(
     above: bool = False,
     maximum: float = 1e9,
 ) -> Callable[[str], float]:
-    """Return a function with which argparse reads a number.
+    """Return a function that argparse calls to read a number.
 
     Args:
         number_type: The type of the number.
@@ -117,7 +119,7 @@ def number(
         maximum: The largest number.
 
     Returns:
-        The function, which raises `ArgumentTypeError` for another text.
+        The function, which raises `ArgumentTypeError` for an invalid text.
     """
 
     def read(text: str) -> float:
@@ -139,12 +141,12 @@ def number(
 
 
 def one_of(*names: str) -> dict[str, Any]:
-    """Return the settings for `add_argument` of an argument that is one of `names`; unlike with
-    `choices`, an error has a suggestion.
+    """Return the keyword arguments of `add_argument` for an argument that is one of `names`; unlike
+    with `choices`, an error contains a suggestion.
     """
 
     def read(text: str) -> str:
-        """Read a name; raise `ArgumentTypeError` for an unknown one."""
+        """Read a name; raise `ArgumentTypeError` for an unknown name."""
         if text not in names:
             raise argparse.ArgumentTypeError(
                 f"expected one of {list(names)}, got {text!r}{did_you_mean(text, names)}"
@@ -159,12 +161,13 @@ def parse_all(
     arguments: Sequence[str],
     cures: Mapping[str, str] = MappingProxyType({}),
 ) -> argparse.Namespace:
-    """Parse arguments; the process ends with status 2 and a suggestion if one of them is unknown.
+    """Parse arguments; if an argument is unknown, the process ends with status 2 and a
+    suggestion.
 
     Args:
         parser: The parser.
         arguments: The arguments.
-        cures: The messages for options that users expect and that do not exist, by option.
+        cures: Messages for options that users may expect but that do not exist, by option.
 
     Returns:
         The values of the arguments.
@@ -181,7 +184,7 @@ def parse_all(
 
 
 def _guesses(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> str:
-    """Return the options that the user may have meant by unknown ones."""
+    """Return the options that the user may have meant instead of unknown options."""
     words = parser.format_help().replace(",", " ").split()
     options = [word.removeprefix("--") for word in words if word.startswith("--")]
     guesses = ""

@@ -24,11 +24,11 @@ from vlagents_ray.settings import wrong_settings
 
 
 class PlainConsole(Console):
-    """A console that shows text as it is, so that it can be copied: `[serve]` is not markup,
+    """A console that prints text unchanged, so that it can be copied: `[serve]` is not markup,
     `:boat:` is not an emoji, and lines are not cut.
 
-    Styled output is a `Text`, or has a `style`. On a terminal a table is as wide as the terminal,
-    and breaks words that are too long for its cells; elsewhere it is as wide as its content.
+    Styled output is a `Text`, or has a `style`. On a terminal, a table is as wide as the terminal,
+    and words that are too long for a cell are broken; elsewhere a table is as wide as its content.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -37,8 +37,8 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Render without the control characters of the text, which may come from a server or from
-        somebody else's results.
+        """Render without control characters, since the text may come from a server or from the
+        results of another person.
         """
         for segment in super().render(renderable, options):
             is_plain = segment.text.isprintable() or segment.text == "\n"
@@ -85,11 +85,12 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
     """Print an error of this package as one message on stderr, and end the command with an exit
     code: 2 for wrong settings, 130 for Ctrl-C, else 1.
 
-    SIGTERM is treated as Ctrl-C, so that started processes end in order.
+    SIGTERM has the effect of Ctrl-C, so that processes that the command has started are shut down
+    properly.
 
     Args:
-        settings: Further models of settings that a user writes. If a field is unknown, the message
-            lists the fields of its model.
+        settings: Further pydantic models of settings that a user writes. If a field is unknown, the
+            message lists the fields of its model.
     """
     try:
         with interrupts():
@@ -125,7 +126,7 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Print an error, and end with that exit code."""
+    """Print an error, and end the process with `code`."""
     say_error(message)
     raise typer.Exit(code)
 
@@ -160,7 +161,7 @@ def fresh(folder: Path) -> Path:
 
 
 def print_json(document: Any) -> None:
-    """Print the JSON document of a command with `--json` on stdout, which has nothing else."""
+    """Print the JSON document of a command with `--json`; stdout contains nothing else."""
     out.print(json.dumps(document, indent=2, default=str))
 
 

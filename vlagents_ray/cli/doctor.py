@@ -39,21 +39,21 @@ if TYPE_CHECKING:
 
 
 GB = 1e9
-SHM = Path("/dev/shm")  # noqa: S108 - where Linux has its shared memory, not a temporary file
+SHM = Path("/dev/shm")  # noqa: S108 - the shared memory of Linux, not a temporary file
 # Ray's rules for the size of its object store (ray/_private/ray_constants.py, utils.py, worker.py).
 _STORE_SHARE, _STORE_MAX, _STORE_UNCAPPED = 0.3, 200 * GB, 10 * GB
-# Limits of open files: the recommended one, the one to which Ray raises its own, and the lowest one
-# without a warning.
+# Limits of open files: the recommended limit, the limit to which Ray raises its own, and the lowest
+# limit without a warning.
 _FILES_RECOMMENDED, _FILES_RAISED_TO, _FILES_ENOUGH = 8192, 65536, 4096
-_SOCKET_PATH_MAX = 107  # bytes of a Unix socket's path, without its final NUL
+_SOCKET_PATH_MAX = 107  # maximum length of a Unix socket's path in bytes, without the final NUL
 _SESSION_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store"
 _DISK_FULL = 0.95  # the share of a disk above which Ray stops spilling to it
 DEFAULT_PORT = 8000
 _FIRST_FREE = 1024  # lower ports are reserved for root
-_WIDTH = 120  # columns of the table in a file or a pipe
+_WIDTH = 120  # width of the table in a file or a pipe, in columns
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-# A program that prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU
-# that they use or the reason why they use none.
+# A program that prints, for torch and JAX in an interpreter, the version, the CUDA version, and the
+# GPU in use or the reason why none is used.
 _LIBRARIES = """
 import json, os, sysconfig
 from importlib.metadata import distributions
@@ -79,20 +79,20 @@ for name in ("torch", "jax"):
 print("\\n" + json.dumps(report))
 """
 
-SUPPORTED = (3, 11)  # the version of Python that the tests of servers run
+SUPPORTED = (3, 11)  # the version of Python with which servers are tested
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
     """One row of `vlagents-ray doctor`.
 
-    The status "fail" means that serving a policy or evaluating it on `tabletop` will not work here;
-    "warn" means that something optional is missing, or will be slow.
+    The status "fail" means that serving a policy or evaluating it on `tabletop` will not work on
+    this machine; "warn" means that an optional feature is missing or slow.
     """
 
     status: Literal["ok", "warn", "fail"]
-    detail: str  # the finding
-    cure: str = ""  # empty if there is no problem
+    detail: str  # the result of the check in words
+    cure: str = ""  # the cure; empty if there is no problem
 
 
 def shared_memory() -> Check:
@@ -107,7 +107,7 @@ def shared_memory() -> Check:
 
 
 def judge_shared_memory(total: float, free: float, memory: float) -> Check:
-    """Judge the size of the shared memory.
+    """Return the result of a check of the shared memory's size.
 
     Args:
         total: The size of /dev/shm, bytes.
@@ -127,8 +127,8 @@ def judge_shared_memory(total: float, free: float, memory: float) -> Check:
 
 
 def memory_bytes(limit_file: Path = Path("/sys/fs/cgroup/memory.max")) -> float:
-    """Return the memory of the machine in bytes, or the limit of the container (cgroup v2) if
-    that is less.
+    """Return the memory of the machine in bytes, or the limit of the container (cgroup v2) if the
+    limit is lower.
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
@@ -151,7 +151,7 @@ def temp_dir() -> Check:
 
 
 def judge_temp_dir(path: str, total: float, free: float) -> Check:
-    """Judge the folder of Ray's session files.
+    """Return the result of a check of the folder of Ray's session files.
 
     Args:
         path: The folder.
@@ -181,7 +181,7 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
 
 
 def open_files() -> Check:
-    """Check that one process may hold as many sockets and files as a server needs."""
+    """Check that one process may open as many sockets and files as a server needs."""
     limits = []
     for limit in resource.getrlimit(resource.RLIMIT_NOFILE):
         limits.append(sys.maxsize if limit == resource.RLIM_INFINITY else limit)
@@ -190,10 +190,10 @@ def open_files() -> Check:
 
 
 def judge_open_files(soft: int, hard: int) -> Check:
-    """Judge the limits of open files of a process.
+    """Return the result of a check of a process's limits of open files.
 
     Args:
-        soft: The limit that applies now. Ray raises it up to the hard limit or 65536.
+        soft: The present limit. Ray raises it up to the hard limit, but at most to 65536.
         hard: The limit that only root can raise.
     """
     effective = max(soft, min(hard, _FILES_RAISED_TO))
@@ -209,7 +209,7 @@ def judge_open_files(soft: int, hard: int) -> Check:
 def port_free(port: int) -> Check:
     """Check that the TCP port is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        # A port in the state TIME_WAIT counts as free.
+        # SO_REUSEADDR lets the check treat a port in the state TIME_WAIT as free.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", port))
@@ -239,7 +239,7 @@ def run(
         console: The console on which the table is printed.
         port: The port that a server would listen on.
         pythons: The interpreters whose libraries are checked, see `checks`.
-        as_json: Whether a JSON document is printed instead of a table.
+        as_json: Whether to print a JSON document instead of a table.
 
     Returns:
         The exit code: 1 if any check failed, else 0.
@@ -318,14 +318,14 @@ def guarded(check: Callable[[], Check]) -> Check:
     except MissingDependency as error:
         detail, _, cure = str(error).partition("; ")
         return Check("warn", detail, cure)
-    except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
+    except Exception as error:  # noqa: BLE001 - drivers may raise any error; other checks must run
         return Check(
             "warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this"
         )
 
 
 def ray() -> Check:
-    """Check that Ray has the tested version; all nodes of a cluster need the same one."""
+    """Check that Ray has the tested version; all nodes of a cluster need the same version."""
     from packaging.requirements import Requirement
     from packaging.specifiers import SpecifierSet
 
@@ -334,7 +334,7 @@ def ray() -> Check:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
         return Check(
-            "fail", "not installed: robots can do without, servers and evaluations cannot", cure
+            "fail", "not installed: robots do not need it, servers and evaluations do", cure
         )
 
     tested = SpecifierSet()
@@ -349,7 +349,7 @@ def ray() -> Check:
 
 
 def plugins() -> Check:
-    """List the installed plug-ins, and those of the project that are not installed."""
+    """List the installed plug-ins, and the plug-ins of this project that are not installed."""
     missing: set[str] = set()
     for group in published():
         missing.update(not_installed(group).values())
@@ -397,7 +397,7 @@ def gpu() -> Check:
 
 
 def python_version() -> Check:
-    """Check that this is the version of Python for which a server is supported."""
+    """Check that this is the version of Python that is supported for servers."""
     detail = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] == SUPPORTED:
         return Check("ok", detail)
@@ -441,15 +441,15 @@ def libraries(
 def judge_library(
     name: str, driver: str | None, version: str, cuda: str | None, device: str | None, why: str
 ) -> Check:
-    """Judge an installed library.
+    """Return the result of a check of an installed library.
 
     Args:
         name: "torch" or "jax".
         driver: The version of NVIDIA's driver; None without a GPU.
         version: The version of the library.
-        cuda: The version of CUDA that it was built for; None for CPUs only.
-        device: The name of the GPU that it uses; None if it uses none.
-        why: The reason why it does not use a GPU.
+        cuda: The version of CUDA for which the library was built; None for CPUs only.
+        device: The name of the GPU that the library uses; None if it uses no GPU.
+        why: The reason why the library does not use a GPU.
     """
     build = f"for CUDA {cuda}" if cuda else "for CPUs only"
     detail = f"{version}, {build}"
@@ -487,7 +487,7 @@ def triton_compiler(headers: Path) -> Check:
     compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         return Check(
-            "warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev"
+            "warn", "none; torch.compile needs a compiler on a GPU", "apt-get install gcc libc6-dev"
         )
     if not (headers / "Python.h").exists():
         return Check(
@@ -520,7 +520,7 @@ def egl() -> Check:
 
 
 def _rendered(simulator: str, probe: RenderProbe) -> Check:
-    """Judge the attempt to render a frame."""
+    """Return the result of a check from an attempt to render a frame."""
     if probe.ok:
         return Check(
             "ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}"
@@ -529,7 +529,7 @@ def _rendered(simulator: str, probe: RenderProbe) -> Check:
 
 
 def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
-    """Run a program, and return its output; a program that cannot run has failed."""
+    """Run a program, and return its result; a program that cannot run counts as failed."""
     try:
         return subprocess.run(  # noqa: S603
             command, capture_output=True, text=True, timeout=timeout_s, check=False

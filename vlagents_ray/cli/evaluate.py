@@ -1,4 +1,4 @@
-"""`vlagents-ray eval`: evaluations by a file or by options."""
+"""`vlagents-ray eval`: evaluations from a run file or from options."""
 
 from __future__ import annotations
 
@@ -300,7 +300,7 @@ class EvalOptions:
     live_at: LiveAt = None
 
     def options_set(self, *names: str) -> list[str]:
-        """Return the options that are set, as they are written on the command line.
+        """Return the names of the options that are set, as they are written on the command line.
 
         Args:
             names: The names of the fields of the options. The value 0 counts as set, False does
@@ -320,7 +320,8 @@ class EvalOptions:
             on_robot: Whether the evaluation runs on a real robot.
 
         Raises:
-            ConfigError: An option needs another one that is not set, or two exclude each other.
+            ConfigError: An option needs another option that is not set, or two options exclude each
+                other.
         """
         watch_options = self.options_set("until", "settle_s", "marker")
         if self.watch is None and watch_options:
@@ -338,8 +339,7 @@ class EvalOptions:
             )
         if self.replica_per_gpu and self.address is None:
             raise ConfigError(
-                "--replica-per-gpu: expected --address, a cluster whose GPUs can be counted, got "
-                "none; add it"
+                "--replica-per-gpu: expected --address of a cluster, got none; add it"
             )
         if self.dry_run and self.options_set("live", "live_at"):
             raise ConfigError(
@@ -376,7 +376,7 @@ _PANELS = {
     ),
     "Workers and cluster": ("workers", "cpus", "gpus", "address", "replica_per_gpu"),
     "Time": ("dry_run", "end_at"),
-    "Checkpoints of a training": ("watch", "until", "settle_s", "marker"),
+    "Checkpoints of a training run": ("watch", "until", "settle_s", "marker"),
     "A real robot": ("arm", "operator", "unblind"),
 }
 
@@ -495,11 +495,11 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
 
 
 def _new_folder(env: str, *, resume: bool) -> Path:
-    """Return the folder of the results of an evaluation without a file and without --out, which
-    has the name of the environment and the time.
+    """Return a folder for the results of an evaluation without a run file and without --out; its
+    name consists of the environment and the time.
 
     Raises:
-        ConfigError: The evaluation is to continue, which needs the folder.
+        ConfigError: --resume is set, which needs the folder in --out.
     """
     if resume:
         raise ConfigError(
@@ -510,8 +510,8 @@ def _new_folder(env: str, *, resume: bool) -> Path:
 
 
 def _with_files_found(document: dict[str, Any], config_dir: Path | None) -> dict[str, Any]:
-    """Return a run file in which the deployment files of policies are paths, which may be
-    names of files in the folder `config_dir`.
+    """Return the settings of a run file, in which names of deployment files in the folder
+    `config_dir` are replaced with their paths.
     """
     policies = document.get("policies")
     if config_dir is None or not isinstance(policies, list):
@@ -528,10 +528,12 @@ def _with_files_found(document: dict[str, Any], config_dir: Path | None) -> dict
 
 
 def _with_worker(config: EvalConfig, options: dict[str, Any]) -> EvalConfig:
-    """Return the configuration, with the options of workers that it does not set."""
+    """Return the configuration with the workers' options added, except for options that it already
+    sets.
+    """
 
     def fill(worker: WorkerConfig) -> WorkerConfig:
-        """Return the settings of a worker, with the options that they lack."""
+        """Return the settings of a worker with the missing options added."""
         missing = {}
         for name, value in options.items():
             if name not in worker.model_fields_set:
@@ -548,20 +550,20 @@ def _with_worker(config: EvalConfig, options: dict[str, Any]) -> EvalConfig:
 
 
 def _settings_of(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
-    """Select the options that are fields of `model` and are set."""
+    """Return the options that are fields of `model` and are set."""
     selected = {}
     for name in model.model_fields:
         value = options.get(name)
-        # 0 is a value, although it equals False.
+        # 0 counts as set, although it equals False.
         if value not in (None, {}, []) and value is not False:
             selected[name] = value
     return selected
 
 
 def read_run(file: Path, overrides: Sequence[Override] = ()) -> dict[str, Any]:
-    """Read a run file, and return its settings, changed by `overrides`.
+    """Read a run file, apply `overrides`, and return the settings.
 
     Raises:
-        ConfigError: There is no such file, it is not a mapping, or it cannot be changed so.
+        ConfigError: The file does not exist or is not a mapping, or a change is not possible.
     """
     return read_run_file(file, "run file", "`policies` and `suites`", overrides)

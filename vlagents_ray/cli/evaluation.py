@@ -1,5 +1,5 @@
-"""Evaluations from their configuration: in simulation, as a plan, of a running training, or on a
-robot; and the live page of `--live`.
+"""The modes of an evaluation (in simulation, as a printed plan, of a running training, on a robot),
+and the live page of `--live`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from vlagents_ray.serve.ports import LOOPBACK, is_free
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a case
 LOOK_S = 1.0  # the period at which the folder of checkpoints is read
-_PORT = 8050  # the port of the live page, if it is free
+_PORT = 8050  # preferred port of the live page
 _PAGE = "live"  # the name of the live page in the registry
 
 
@@ -69,11 +69,11 @@ def live_address(at: str | None) -> tuple[str, int]:
         at: The value of `--live-at`, "HOST:PORT"; None for `--live` alone.
 
     Returns:
-        The host and the port; port 0 is any free one.
+        The host and the port; port 0 selects a free port.
 
     Raises:
-        ConfigError: The plug-in with the page is not installed, or other machines would reach it
-            without a key.
+        ConfigError: The plug-in with the page is not installed, or other machines could reach the
+            page without a key.
     """
     registered_class("pages", _PAGE)
     if at is None:
@@ -85,7 +85,7 @@ def live_address(at: str | None) -> tuple[str, int]:
         host = port = None
     if host is None or port is None or url.netloc != at:
         raise ConfigError(f"--live-at: expected HOST:PORT, as in 127.0.0.1:{_PORT}, got {at!r}")
-    require_watch_keys(host, load_keys())  # before anything is served
+    require_watch_keys(host, load_keys())  # raised before a policy is served
     return host, port
 
 
@@ -95,13 +95,13 @@ def shown_progress(
 ) -> Iterator[Progress]:
     """Show the progress of an evaluation on the terminal and on the live page.
 
-    Without workers the terminal shows lines, as a table that is drawn again would disturb a
+    Without workers, the terminal shows plain lines, since a table that is redrawn would disturb a
     debugger.
 
     Args:
-        plan: The plan of the evaluation. Its Ray must be running already.
+        plan: The plan of the evaluation. If it needs Ray, Ray must already be running.
         live: The address of the live page; None for no page.
-        goes_on: Whether further evaluations in the same folder follow.
+        goes_on: Whether more evaluations with the same folder of results follow.
 
     Yields:
         The progress, for `evaluate_plan`.
@@ -166,7 +166,7 @@ def run_evaluation(
         replica_per_gpu: Whether each policy has a replica on each GPU of the cluster.
         live: The host and port of the live page; None for no page.
     """
-    # The page also shows the sessions of replicas, which only Ray has.
+    # The page also shows the sessions of replicas, which exist only with Ray.
     if live is not None and config.workers is None:
         config = config.model_copy(update={"workers": 1})
 
@@ -187,7 +187,7 @@ def run_evaluation(
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
-    """Serve the policy unless it is at a URL, and run one episode of it.
+    """Serve the policy, unless it is at a URL, and run one of its episodes.
 
     Args:
         config: The evaluation of one policy in one environment.
@@ -204,7 +204,8 @@ def evaluate_and_print(
     end_at: float | None = None,
     agents: Agents | None = None,
 ) -> Summary:
-    """Evaluate policies, and print the table of the results, also if the evaluation is interrupted.
+    """Evaluate policies, and print the table of the results, even if the evaluation is
+    interrupted.
 
     Args:
         plan: The plan of the evaluation, as `served` yields it.
@@ -237,7 +238,7 @@ def require_results(cases: Sequence[EvalCase], summary: Summary) -> None:
     cases, and with status 1 if infrastructure lost an episode.
 
     Args:
-        cases: The cases that this command has planned; others are not considered.
+        cases: The cases that this command has planned; other cases are ignored.
         summary: The summary of the results.
     """
     planned = {case.fingerprint for case in cases}
@@ -283,11 +284,12 @@ def watch_training(
     marker: str | None = None,
     live: tuple[str, int] | None = None,
 ) -> None:
-    """Evaluate each checkpoint of a running training as soon as it is complete.
+    """Evaluate each checkpoint of a running training as soon as the checkpoint is complete.
 
-    All results go into one folder, and one server stays up. Policies without `{step}` are evaluated
-    in the first round. The evaluation ends after the step `until`, or by Ctrl-C; it can be resumed.
-    An episode without a result ends the command with status 1, after the last round.
+    All results are in one folder, and one server runs for all checkpoints. Policies without
+    `{step}` are evaluated in the first round. The evaluation ends after the step `until`, or by
+    Ctrl-C; it can be resumed. An episode without a result ends the command with status 1, after the
+    last round.
 
     Args:
         config: The evaluation, in which the checkpoint of one policy contains `{step}`.
@@ -299,11 +301,11 @@ def watch_training(
         live: The host and port of the live page; None for no page.
 
     Raises:
-        ConfigError: The folder has results and `resume` is off, or no policy has `{step}` in its
+        ConfigError: The folder has results and `resume` is False, or no policy has `{step}` in its
             checkpoint, or watching ended without a checkpoint.
     """
     trained, pattern = _trained_policy(config)
-    # These errors are raised now, not at the first checkpoint.
+    # Raise errors of the plan now, not at the first checkpoint.
     if (config.out / FILE).is_file() and not config.resume:
         raise ConfigError(
             f"{config.out} already has results: resume them (--resume), or choose another out "
@@ -318,14 +320,16 @@ def watch_training(
     printed: dict[int, str] = {}  # the last printed reason for waiting, by step
 
     def pause() -> None:
-        """Print why steps are not evaluated yet, and wait until the folder is read again."""
+        """Print the reasons why steps are not evaluated yet, and wait until the next reading of the
+        folder.
+        """
         for step, reason in watcher.waiting().items():
             if printed.get(step) != reason:
                 printed[step] = reason
                 out.print(f"step {step}: not yet: {reason}")
         threading.Event().wait(LOOK_S)
 
-    suffix = "" if watcher.folder.is_dir() else ", which is not there yet"
+    suffix = "" if watcher.folder.is_dir() else ", which does not exist yet"
     out.print(f"watching {watcher.folder}{suffix}")
     rounds_of_steps = rounds(watcher, until, pause)
     first = next(rounds_of_steps, None)
@@ -335,7 +339,7 @@ def watch_training(
             f"{watcher.waiting()}"
         )
 
-    workers = 1 if config.workers is None else config.workers  # a training is long
+    workers = 1 if config.workers is None else config.workers  # 1: a training run is long
     planned = _with_steps(config, trained, first).model_copy(update={"workers": workers})
     with contextlib.ExitStack() as stack:
         plan, agents = stack.enter_context(served(planned, address))
@@ -357,7 +361,7 @@ def watch_training(
 
 
 def _trained_policy(config: EvalConfig) -> tuple[int, str]:
-    """Return the index of the policy that is trained, and the pattern of its checkpoints."""
+    """Return the index of the trained policy, and the pattern of its checkpoints."""
     patterns = {}
     for index, policy in enumerate(config.policies):
         settings: dict[str, Any] = {CHOICE: policy.checkpoint}
@@ -372,13 +376,13 @@ def _trained_policy(config: EvalConfig) -> tuple[int, str]:
     if len(patterns) != 1:
         raise ConfigError(
             f"--watch: expected {STEP} in the checkpoint of one policy, such as checkpoint: "
-            f"/runs/a/{STEP}, got it in {len(patterns)}"
+            f"/runs/a/{STEP}, got {len(patterns)} such policies"
         )
     [(index, pattern)] = patterns.items()
     if config.policies[index].steps:
         raise ConfigError(
             f"policy {config.policies[index].name!r}: expected no `steps` with --watch, which "
-            "finds them, got some; leave them out"
+            f"finds the steps itself, got some; leave them out"
         )
     return index, pattern
 
@@ -399,7 +403,8 @@ def run_on_robot(
         config: The evaluation, with the settings of the robot.
         address: The Ray cluster, see `served`.
         operator: Where the operator answers questions, "page" or "terminal".
-        unblinded: Whether only the results so far are printed, with the names of the policies.
+        unblinded: Whether to run no trials, and only print the results so far, with the names of
+            the policies.
     """
     from vlagents_ray.evaluate.robot import (
         PageOperator,
@@ -414,7 +419,7 @@ def run_on_robot(
         print_summary(out, unblind(config.out, key))
         return
 
-    require_trials(config)  # before anything starts
+    require_trials(config)  # before any process starts
     with served(config, address) as (plan, _), contextlib.ExitStack() as stack:
         if operator == "terminal":
             summary = play_trials(plan, TerminalOperator())
@@ -426,7 +431,7 @@ def run_on_robot(
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The remaining episodes of a case, and the time that one of them takes."""
+    """The remaining episodes of a case, and the mean time of an episode."""
 
     case: EvalCase
     finished: int  # the number of planned episodes that are finished
@@ -435,8 +440,8 @@ class Forecast:
 
 
 def print_plan(config: EvalConfig, address: str | None = None) -> None:
-    """Print a row for each case of an evaluation, and the sum, without serving a policy, running an
-    episode or writing a file.
+    """Print a row for each case of an evaluation, and the totals, without serving a policy, running
+    an episode or writing a file.
 
     Args:
         config: The evaluation.
@@ -457,7 +462,7 @@ def print_plan(config: EvalConfig, address: str | None = None) -> None:
 
 
 def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> None:
-    """Print the number of cases and episodes, and the time that they take."""
+    """Print the number of cases and episodes, and the estimated time."""
     cases = [row.case for row in forecast]
     policies = len({case.policy_id for case in cases})
     envs = len({(case.suite.name, case.env) for case in cases})
@@ -471,7 +476,7 @@ def _print_sums(forecast: Sequence[Forecast], folder: Path, workers: int) -> Non
         f"{counted(planned, 'episode')}: {finished} finished in {folder}, {remaining} remaining"
     )
 
-    # Workers share one queue, so that at most one episode's time is lost at the end.
+    # All workers take episodes from one queue, so they finish at most one episode's time apart.
     total_s = sum(row.remaining * (row.seconds or 0.0) for row in forecast)
     seconds = total_s / max(1, min(workers, remaining))
     time = _time(seconds)
@@ -550,7 +555,7 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
 
 
 def _finished(case: EvalCase, results: Sequence[EpisodeResult]) -> int:
-    """Return the number of a case's planned episodes that have a result."""
+    """Return the number of planned episodes of a case that already have a result."""
     first_seeds = set(case.suite.seeds)
     finished: set[tuple[int, int]] = set()
     for result in results:

@@ -1,11 +1,12 @@
-"""Examples of the commands, for the end of their help."""
+"""Example command lines, shown at the end of each command's help."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 PROMPT = "$ "
-# Command -> command lines, without "vlagents-ray". Those of plug-ins are in their registry.
+# Command -> example command lines, without "vlagents-ray". Examples of plug-ins are in their
+# registry entries.
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "serve": (
         "serve scripted",

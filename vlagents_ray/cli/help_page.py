@@ -1,6 +1,6 @@
-"""The help of a command: one layout for the commands of argparse and of Typer.
+"""The help of a command, in one layout for commands of argparse and of Typer.
 
-This module is in the light install, which has neither Typer nor Rich.
+This module is in the light install, so it uses neither Typer nor Rich.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 _MOST_COLUMNS = 100
-_TERM_COLUMNS = 26  # a longer term is on a separate line
+_TERM_COLUMNS = 26  # maximum width of a term on the same line as its description
 _BOLD, _PLAIN = "\033[1m", "\033[0m"
 HELP = "Show this help and exit."
 VERSION = "Print the version and exit."
@@ -27,9 +27,9 @@ class HelpRow:
 
     Attributes:
         term: The text that a user types, such as "--out FOLDER".
-        about: Its description, a sentence.
-        default: Its default in words; empty if there is none, or if it is obvious.
-        required: Whether a user has to give it.
+        about: The description, a sentence.
+        default: The default in words; empty if there is no default, or if it is obvious.
+        required: Whether the argument is required.
     """
 
     term: str
@@ -113,13 +113,13 @@ class HelpPage:
 
 
 def row(term: str, about: str, default: str = "", *, required: bool = False) -> HelpRow:
-    """Return a row, whose default may be at the end of its description.
+    """Return a row; its default may be given at the end of the description.
 
     Args:
         term: The text that a user types.
-        about: The description; a default in it follows "; default: ".
-        default: The default, if the description has none.
-        required: Whether a user has to give it.
+        about: The description, which may end with "; default: " and the default.
+        default: The default, if the description does not contain it.
+        required: Whether the argument is required.
     """
     about, separator, stated = about.partition("; default: ")
     if separator:
@@ -129,7 +129,9 @@ def row(term: str, about: str, default: str = "", *, required: bool = False) -> 
 
 
 def default_text(value: Any) -> str:
-    """Return a default as a user would type it; empty if there is none, or if it is empty."""
+    """Return a default value as a user would type it; empty if there is no default, or if it is an
+    empty value.
+    """
     if value is None or isinstance(value, bool) or value in ("", [], ()) or value is Ellipsis:
         return ""
     if isinstance(value, float):
@@ -149,7 +151,7 @@ def version_line() -> str:
 
 
 def usage_error(usage: str, command: str, message: str) -> str:
-    """Return the message about arguments that cannot be used.
+    """Return the error message for invalid arguments.
 
     Args:
         usage: The usage of the command, on one line.
@@ -160,7 +162,7 @@ def usage_error(usage: str, command: str, message: str) -> str:
 
 
 def _row_lines(row: HelpRow, term_columns: int, columns: int) -> Iterable[str]:
-    """Return the lines of a row, of which the first begins with its term."""
+    """Return the lines of a row; the first line begins with the term."""
     indent = " " * (term_columns + 4)
     lines = _wrapped(row.sentence, columns, indent)
     if len(row.term) > term_columns:

@@ -1,8 +1,8 @@
-"""Skeletons of a policy, an environment, a dialect and a plug-in, which work at once and pass their
-own tests.
+"""Writes skeletons of a policy, an environment, a dialect or a plug-in; each skeleton works
+unchanged and passes its own tests.
 
-`skeletons/KIND/` has their templates, in which `$name` is the name of the module and `$title` the
-name of its class.
+The folder `skeletons/KIND/` contains the templates, in which `$name` is the name of the module and
+`$title` the name of its class.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vlagents_ray.registry import names
 init = typer.Typer(
     no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder."
 )
-# By kind of skeleton: the files that are written, in whose paths $name is the name of the module,
-# and their templates in skeletons/KIND.
+# Kind of skeleton -> the path of each file to write, in which $name is the name of the module ->
+# the file's template in skeletons/KIND.
 _MODULE = {"$name.py": "module.py", "test_$name.py": "test.py", "$name.yaml": "run.yaml"}
 _FILES = {
     "policy": _MODULE,
@@ -85,10 +85,10 @@ def dialect(name: Name) -> None:
     with errors():
         _write(name, "dialect")
         _print_steps(
-            (f"{as_typed('vlagents-ray')} serve {name}.yaml", "serves a policy that does nothing"),
+            (f"{as_typed('vlagents-ray')} serve {name}.yaml", "serves a policy that returns zeros"),
             (
                 f'curl -d \'{{"q": [0, 0], "task": "lift the cup"}}\' http://localhost:8000/{name}',
-                "calls it, in a second terminal",
+                "calls the policy, in a second terminal",
             ),
         )
 
@@ -108,14 +108,14 @@ def plugin(name: Name, context: typer.Context) -> None:
         for noun, registered_names in registered.items():
             if name in registered_names:
                 raise ConfigError(
-                    f"NAME: {name!r} is the name of a {noun} already; choose another one"
+                    f"NAME: {name!r} is already the name of a {noun}; choose another name"
                 )
         _write(name, "plugin")
         command = as_typed("vlagents-ray")
         python = as_typed("python")
         _print_steps(
             (f"cd {name}", "the folder of the plug-in"),
-            (f"{python} -m pip install --editable .", "registers it in this environment"),
+            (f"{python} -m pip install --editable .", "registers the plug-in in this environment"),
             (f"{python} test_{name}.py", "checks it; so does pytest"),
             (f"{command} serve {name}.yaml", "serves it"),
         )
@@ -141,7 +141,7 @@ def render(name: str, kind: Kind) -> dict[Path, str]:
 
 
 def _write(name: str, kind: Kind) -> None:
-    """Write the files of a skeleton into the current folder, or none of them.
+    """Write the files of a skeleton into the current folder; if an error occurs, write no file.
 
     Raises:
         ConfigError: The name is invalid, or a file or module of this name exists.
@@ -160,11 +160,11 @@ def _write(name: str, kind: Kind) -> None:
         )
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(
-            f"NAME: {name!r} is a module that is installed, and yours would hide it; choose "
-            "another one"
+            f"NAME: {name!r} is an installed module, which your module would hide; choose another "
+            f"name"
         )
 
-    created: list[Path] = []  # files and folders, in order
+    created: list[Path] = []  # written files and folders, in order
     try:
         for path, text in texts.items():
             for folder in reversed(path.parents[:-1]):
@@ -188,13 +188,13 @@ def _write(name: str, kind: Kind) -> None:
 
 
 def as_typed(program: str) -> str:
-    """Return a program of this environment as the user types it.
+    """Return the command with which the user runs a program of this environment.
 
     Args:
         program: The name of the program.
 
     Returns:
-        The name if the shell finds this program by it; else its path.
+        The name, if the shell finds this program under its name; otherwise the path.
     """
     path = Path(sys.executable).with_name(program)
     on_path = shutil.which(program)

@@ -1,4 +1,4 @@
-"""`vlagents-ray keys`: makes, lists and revokes the API keys of a server."""
+"""`vlagents-ray keys`: creates, lists and revokes the API keys of a server."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def revoke_(name: Name, file: File = None) -> None:
 
 
 def _state(key: Key) -> Text:
-    """Return a text that says whether a key is valid, and until when."""
+    """Return a text that describes whether a key is valid, and until when."""
     if key.revoked:
         return Text("revoked", "red")
     if key.expires is None:

@@ -32,24 +32,24 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.launch.deployment_file import Deployment
 
 
-_SHORT = 5  # most ranges of tasks in a line of the listing
+_SHORT = 5  # maximum number of task ranges in a line of the listing
 
 
 @dataclass(frozen=True)
 class Listed:
     """One entry of a listing."""
 
-    # The names of the fields are keys of the JSON document.
+    # The names of the fields are the keys of the JSON document.
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # the registered name
     what: str  # a description, or the tasks of an environment, in one line
-    # The reason why it cannot run in this Python, with the cure; None if it is ready.
+    # The reason why the entry cannot run in this Python, with the cure; None if it can run.
     missing: str | None
-    # The settings of a policy or wrapper as `name=default`, the tasks of an environment.
+    # The settings of a policy or wrapper as `name=default`, or the tasks of an environment.
     details: list[str]
 
     def lines(self) -> Iterator[str]:
-        """Yield the full description, in whole lines, which can be copied and searched."""
+        """Yield the full description, in lines without breaks, which can be copied and searched."""
         title = "tasks" if self.kind == "environment" else "settings"
         yield f"{self.name}: {self.what}"
         yield f"  {'ready' if self.missing is None else self.missing}"
@@ -57,7 +57,7 @@ class Listed:
 
 
 def policies_and_wrappers() -> Iterator[Listed]:
-    """Yield the policies, then the wrappers."""
+    """Yield the entries of policies, then the entries of wrappers."""
     for noun, group, find_class in (
         ("policy", "policies", policy_class),
         ("wrapper", "wrappers", wrapper_class),
@@ -75,8 +75,8 @@ def policies_and_wrappers() -> Iterator[Listed]:
 
 
 def _description(group: str, name: str) -> str:
-    """Return the description of a registered policy or wrapper, or its module's first sentence if
-    its entry has none.
+    """Return the description of a registered policy or wrapper. If the registry entry has no
+    description, return the first sentence of the module's docstring.
     """
     entry = find_entry(group, name)
     if entry is not None and entry.about:
@@ -86,7 +86,7 @@ def _description(group: str, name: str) -> str:
 
 
 def environments() -> Iterator[Listed]:
-    """Yield the simulators, with the ranges of their tasks."""
+    """Yield the entries of simulators, with the ranges of their tasks."""
     for name in sorted(names("envs")):
         try:
             cls = env_class(name)
@@ -109,7 +109,7 @@ def environments() -> Iterator[Listed]:
 
 
 def _in_other_plugins(noun: str, group: str) -> Iterator[Listed]:
-    """Yield the names in plug-ins of the project that are not installed."""
+    """Yield the names in this project's plug-ins that are not installed."""
     for name, distribution in sorted(not_installed(group).items()):
         cure = pip_install(distribution=distribution)
         yield Listed(noun, name, f"in {distribution}", f"not installed: {cure}", [])
@@ -122,10 +122,10 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
         listed: The entries of a listing.
 
     Yields:
-        A line for each command, with the policies that need it, or for each environment with its
-        cure.
+        A line for each command, with the policies that need it, and a line for each environment,
+        with its cure.
     """
-    names_by_line: dict[str, list[str]] = {}  # a line has {} in place of the names
+    names_by_line: dict[str, list[str]] = {}  # the line, with {} in place of the names -> the names
     for entry in listed:
         modules: list[str] = []
         sources: list[str] = []
@@ -169,11 +169,12 @@ def require_packages(config: Deployment) -> None:
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Return the packages that a model family lacks in this environment, with the cure.
+    """Return a text with the packages that a model family lacks in this environment, and the
+    cure.
 
     Args:
         name: The registered name of the policy.
-        checkout: Whether a missing checkout of the source counts.
+        checkout: Whether a missing checkout of the source also counts as missing.
 
     Returns:
         The packages and the cure in words; None if nothing is missing.
@@ -201,20 +202,20 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
-    """Return the packages that a model family lacks; none for a family that an extra installs.
+    """Return the packages that a model family lacks; empty for a family that an extra installs.
 
     Args:
         name: The registered name of the policy.
 
     Returns:
-        The missing modules, the variables of which one must name a checkout, and the name of the
-        family's requirements, which is empty if it has none.
+        The missing modules; the environment variables, one of which must contain the path of a
+        checkout; and the name of the family's requirements file, empty if there is none.
     """
     entry = find_entry("policies", name)
     if entry is None or entry.extra:
         return [], [], ""
 
-    # The first of the needed modules is in the checkout, if there is one.
+    # If the family needs a checkout, the checkout contains the first of the needed modules.
     has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
     needed = entry.needs[1:] if has_checkout else entry.needs
     lacking = [module for module in needed if importlib.util.find_spec(module) is None]
@@ -226,8 +227,8 @@ def _lacking(name: str) -> tuple[list[str], list[str], str]:
 
 
 def settings_of(cls: type) -> Iterator[str]:
-    """Yield each setting of a policy or wrapper as `name=default`, or only its name if it is
-    required.
+    """Yield each setting of a policy or wrapper as `name=default`, or only the name of a required
+    setting.
     """
     fields: Mapping[str, Any] | None = getattr(getattr(cls, "Config", None), "model_fields", None)
     if fields is not None:
@@ -263,6 +264,6 @@ def ranges(tasks: list[str]) -> Iterator[str]:
 
 
 def _stem(task: str) -> str | None:
-    """Return the name of a numbered task up to its number; None for a task without a number."""
+    """Return the part of a task's name before its number; None for a task without a number."""
     numbered = re.fullmatch(r"(.*/)\d+", task)
     return None if numbered is None else numbered[1]

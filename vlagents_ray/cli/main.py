@@ -1,6 +1,4 @@
-"""The commands of `vlagents-ray`, which call other folders of the package. This module does not
-import Ray.
-"""
+"""The commands of `vlagents-ray`, which call other subpackages. This module does not import Ray."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    # Errors are plain text, as those of `vlagents-ray robot`.
+    # Errors are plain text, like the errors of `vlagents-ray robot`.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
@@ -113,7 +111,7 @@ def demo(
         successes = sum(count[0] for count in counts)
         episodes = sum(count[1] for count in counts)
         out.print(
-            "The policy was learned from demonstrations, and solves "
+            "The policy was trained on demonstrations, and solves "
             f"{100 * successes / episodes:.0f} % of {episodes} such episodes; its card is "
             f"{rates.parent}/README.md."
         )
@@ -164,7 +162,7 @@ def doctor(
     raise typer.Exit(status)
 
 
-# The short descriptions fit into 80 columns, so that all commands are on one screen.
+# The short descriptions fit into 80 columns, so that the list of all commands fits on one screen.
 for _command, _name, _short_help in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
@@ -180,7 +178,7 @@ for _commands, _name, _short_help in (
 
 
 def _add_commands_of_plugins() -> None:
-    """Add the commands of installed plug-ins; one that cannot be imported fails when it is
+    """Add the commands of installed plug-ins; a command that cannot be imported fails when it is
     called.
     """
     for name in names("commands"):
@@ -254,7 +252,7 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
         listed: The entries.
         name: The name whose details are printed; None prints a line for each entry, and the
             commands that install missing packages.
-        as_json: Whether a JSON document is printed.
+        as_json: Whether to print a JSON document.
     """
     from vlagents_ray.cli.listing import installing
 

@@ -100,21 +100,21 @@ StateDims = Annotated[
         help="Number of values in a part of the state, if the policy does not declare it.",
     ),
 ]
-_MOST_DIMS = 1_000_000  # most numbers in a part of the state
+_MOST_DIMS = 1_000_000  # maximum number of values in a part of the state
 _Options = TypeVar("_Options")
 
 
 def command_of(
     options: type[_Options], panels: Mapping[str, Sequence[str]] = MappingProxyType({})
 ) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
-    """Return a decorator that makes a command for Typer from a function that takes its options as
-    one object.
+    """Return a decorator that makes a Typer command from a function that accepts its options as one
+    object.
 
     Args:
         options: The dataclass of the options. Each field is annotated with its `typer.Option` or
             `typer.Argument`.
-        panels: The fields that each panel of the help shows, by the title of the panel; all others
-            are in the panel "Options".
+        panels: The fields that each panel of the help shows, by the title of the panel; all other
+            fields are in the panel "Options".
     """
     hints = get_type_hints(options, include_extras=True)
     for title, names_of_fields in panels.items():
@@ -142,7 +142,7 @@ def command_of(
         parameters.append(parameter)
 
     def decorate(command: Callable[[_Options], None]) -> Callable[..., None]:
-        """Return the command as a function that takes each option as an argument."""
+        """Return the command as a function with a parameter for each option."""
 
         @functools.wraps(command)
         def run(**values: Any) -> None:
@@ -156,9 +156,9 @@ def command_of(
 
 
 def _in_panel(hint: Any, title: str) -> Any:
-    """Return an annotation whose `typer.Option` is shown in a panel of the help."""
+    """Return a copy of an annotation whose `typer.Option` is shown in a panel of the help."""
     hinted_type, *metadata = get_args(hint)
-    # The annotation may be one that several commands share.
+    # Copy the option, since several commands may share the annotation.
     in_panel = [copy.copy(data) for data in metadata]
     for data in in_panel:
         data.rich_help_panel = title
@@ -166,20 +166,22 @@ def _in_panel(hint: Any, title: str) -> Any:
 
 
 class Commands(HelpGroup):
-    """The group of all commands, whose errors name the value of an option that cannot be read."""
+    """The group of all commands; its errors contain the value of an option that cannot be
+    parsed.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command, as Typer does."""
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            if isinstance(error.__cause__, ValidationError):  # its message lacks the value
+            if isinstance(error.__cause__, ValidationError):  # Typer's message lacks the value
                 error.message = wrong_settings(error.__cause__)
             raise
 
 
 def finite(value: float | None) -> float | None:
-    """Reject NaN and infinity, for Typer, whose bounds accept them.
+    """Reject NaN and infinity, which Typer's bounds accept.
 
     Args:
         value: The value of an option.
@@ -196,17 +198,17 @@ def finite(value: float | None) -> float | None:
 
 
 def policy_overrides(settings: Iterable[str], serve_settings: Iterable[str]) -> list[Override]:
-    """Parse the changes of a policy's args on a command line.
+    """Parse the changes of a deployment's `args` on a command line.
 
     Args:
-        settings: The texts of `--set`, which change the policy's own settings.
-        serve_settings: The texts of `--serve-set`, which change the other args.
+        settings: The values of `--set`, which change the policy's own settings.
+        serve_settings: The values of `--serve-set`, which change the other settings in `args`.
 
     Returns:
-        The changes of the args, see `read_deployment`.
+        The changes of `args`, see `read_deployment`.
 
     Raises:
-        ConfigError: A text cannot be parsed, or --serve-set has settings of the policy.
+        ConfigError: A value cannot be parsed, or --serve-set contains settings of the policy.
     """
     overrides = parse_overrides(serve_settings, "--serve-set")
     for override in overrides:
@@ -224,20 +226,20 @@ def find_policy(source: str, config_dir: Path | None) -> str:
     is another policy.
 
     Raises:
-        ConfigError: There is neither such a file nor such a policy.
+        ConfigError: Neither a file nor a policy has this name.
     """
     return find_file(source, config_dir, others=names("policies"))
 
 
 def changed_settings(source: str | None, overrides: Sequence[Override]) -> dict[str, Any]:
-    """Return the settings that `--set` changes of a policy.
+    """Return the settings of a policy after the changes of `--set`.
 
     Args:
         source: The policy.
-        overrides: The changes of its settings, or of those in its deployment file.
+        overrides: The changes of the policy's settings, or of the settings in its deployment file.
 
     Returns:
-        The changed settings, with all settings of the file if there are changes.
+        The changed settings; for a deployment file with changes, all settings of the file.
 
     Raises:
         ConfigError: A change is not possible, or removes a setting of a deployment file.
@@ -266,7 +268,7 @@ def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
         option: The name of the option, for errors.
 
     Returns:
-        The number of numbers in each part.
+        The number of values in each part.
 
     Raises:
         ConfigError: A size is not a whole number above 0.
@@ -315,19 +317,19 @@ def parse_time(text: str, option: str) -> float:
 def read_run_file(
     file: Path | str, noun: str, keys: str, overrides: Iterable[Override] = ()
 ) -> dict[str, Any]:
-    """Read a YAML file with the settings of a run, and change it.
+    """Read a YAML file with the settings of a run, and apply changes to the settings.
 
     Args:
         file: The file.
-        noun: A name of this type of file, for errors, such as "run file".
-        keys: The keys that such a file has, for errors.
+        noun: The type of the file, for errors, such as "run file".
+        keys: The usual keys of such a file, for errors.
         overrides: The changes, as `parse_overrides` returns them.
 
     Returns:
-        The settings. `out` is runs/NAME, unless the file names a folder.
+        The settings; `out` is runs/NAME, unless the file contains a folder.
 
     Raises:
-        ConfigError: The file does not exist, is not a mapping, or cannot be changed so.
+        ConfigError: The file does not exist or is not a mapping, or a change is not possible.
     """
     document = read_config_file(file, noun, keys, overrides=overrides)
     return {"out": Path("runs") / Path(file).stem} | document

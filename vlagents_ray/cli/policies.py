@@ -1,4 +1,4 @@
-"""The policies of an evaluation: at their URLs, or served while the evaluation runs."""
+"""The policies of an evaluation, which are at URLs or are served while the evaluation runs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _STARTING_S = 30.0  # time limit for a server at a URL
 def served(
     config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
 ) -> Iterator[tuple[ResolvedPlan, Agents]]:
-    """Resolve an evaluation, and serve the policies that are not at a URL within the context, or
+    """Resolve an evaluation and, within the context, serve its policies that are not at a URL, or
     run them in this process.
 
     Args:
@@ -62,7 +62,7 @@ def served(
     """
     _require_cluster_workers(config, address)
     with contextlib.ExitStack() as stack:
-        # Ray is joined before the policies are resolved, as one may be served in its cluster.
+        # Join Ray before the policies are resolved, since a policy may be served in Ray's cluster.
         on_ray = address is not None or config.real_robot is not None
         if not on_ray:
             on_ray = chosen_workers(config, plan_cases(config)) > 0
@@ -81,7 +81,7 @@ def served(
             in_process, agents = _in_process(ready, local)
             plan = resolve(in_process, workers=0)
 
-        # Errors are raised before anything starts.
+        # Raise errors before any process starts.
         if address is None:
             _require_resources(plan, deployments)
         _require_fit(plan, _by_policy(ready, deployments))
@@ -112,10 +112,10 @@ def planned_workers(
         address: A running Ray cluster, as in `served`.
 
     Returns:
-        The number of workers; 0 runs the evaluation in this process.
+        The number of workers; 0 if the evaluation runs in this process.
 
     Raises:
-        ConfigError: `workers` is 0, and something needs Ray, as in `served`.
+        ConfigError: `workers` is 0, but the evaluation needs Ray.
     """
     _require_cluster_workers(config, address)
     workers = chosen_workers(config, plan_cases(config))
@@ -136,10 +136,11 @@ def _require_resources(plan: ResolvedPlan, deployments: Mapping[str, Deployment]
     """Raise `ConfigError` or `MissingDependency` unless this machine has the GPUs and packages."""
     needed = max(case.worker.gpus for case in plan.cases)
     available = gpus_here() if needed else 0.0
-    if needed > available:  # Ray would never start these workers here
+    if needed > available:  # Ray would never start these workers on this machine
         raise ConfigError(
             f"worker.gpus: expected at most the {available:g} GPUs of this machine, got "
-            f"{needed:g} for a worker; set less (0 draws in software), or give the --address of a "
+            f"{needed:g} for a worker; set less (0 renders in software), or give the --address of "
+            f"a "
             "cluster that has them"
         )
     for deployment in deployments.values():
@@ -147,8 +148,8 @@ def _require_resources(plan: ResolvedPlan, deployments: Mapping[str, Deployment]
 
 
 def _by_policy(config: EvalConfig, deployments: Mapping[str, Deployment]) -> dict[str, Deployment]:
-    """Return the deployments by the policy's name in the evaluation, in place of the
-    application's.
+    """Return the deployments by the name of the policy in the evaluation, not by the name of the
+    application.
     """
     by_policy = {}
     for policy in config.policies:
@@ -176,20 +177,20 @@ def _require_fit(plan: ResolvedPlan, deployments: Mapping[str, Deployment]) -> N
 
 
 def _variables(config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]) -> dict[str, str]:
-    """Return the environment variables of workers and replicas, with which this process gives the
-    same results.
+    """Return the environment variables that workers and replicas have, and with which this process
+    computes the same results.
     """
     environment = dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads))
     if not any(policy.args[0].resources.num_gpus for policy in local.values()):
-        environment[VISIBLE] = ""  # hides the GPUs
+        environment[VISIBLE] = ""  # hides the GPUs from this process
     return environment
 
 
 def _in_process(
     config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]
 ) -> tuple[EvalConfig, Agents]:
-    """Return the evaluation without the URLs of the policies that run in this process, and their
-    agents.
+    """Return the evaluation without the URLs of the policies that run in this process, and the
+    agents of these policies.
     """
     agents = {}
     policies = []
@@ -217,14 +218,14 @@ def _serve_on_ray(
     workers = max(1, plan.workers)
     if replica_per_gpu:
         deployments = spread_over_gpus(deployments, reserved=workers * most_gpus(plan.cases))
-    # Ray's CPUs are logical here: the requested number of workers must fit.
+    # The number of CPUs that Ray gets is logical: the requested number of workers must fit.
     cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(plan.cases)))
     return running_server(together(deployments), address=address, num_cpus=cpus, ingress=False)
 
 
 def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
-    """Keep Ray's logs off the terminal, and join the cluster at `address`, within the context of
-    `stack`.
+    """Within the context of `stack`, keep Ray's logs off the terminal, and join the cluster at
+    `address`.
     """
     stack.enter_context(quiet_ray(None))
     stack.enter_context(exit_if_ray_is_lost(RESUME))
@@ -242,7 +243,7 @@ def _local_policies(
         workers: The number of workers that the user has chosen, or None.
 
     Returns:
-        The policies; None if one of them needs Ray.
+        The policies; None if any policy needs Ray.
 
     Raises:
         ConfigError: `workers` is 0, and a policy needs Ray.
@@ -259,7 +260,7 @@ def _local_policies(
         if workers == 0 and obstacle:
             raise ConfigError(
                 f"workers: expected 1 or more, as {name!r} has {obstacle}, got 0, which runs the "
-                "episodes in this Python; raise it"
+                f"episodes in this process; raise it"
             )
         if args is None or obstacle or (args.resources.num_gpus and workers is None):
             return None
@@ -274,13 +275,14 @@ def resolve_policies(
 
     Args:
         config: The evaluation.
-        ask: Whether servers are asked for the names, settings and checkpoints of their policies.
+        ask: Whether to request the names, settings and checkpoints of policies from their servers.
 
     Returns:
         The evaluation with names and URLs, and the deployments to start, by application.
 
     Raises:
-        ConfigError: A policy has neither a source nor a URL, or settings although a server has it.
+        ConfigError: A policy has neither a source nor a URL, or has settings although it is at a
+            URL.
     """
     deployments: dict[str, Deployment] = {}
     policies = [_resolve_policy(policy, deployments, ask=ask) for policy in config.policies]
@@ -291,8 +293,8 @@ def resolve_policies(
 def _resolve_policy(
     policy: PolicyConfig, deployments: dict[str, Deployment], *, ask: bool
 ) -> PolicyConfig:
-    """Return the policy with its name and URL; add its deployment to `deployments` unless a
-    server has it.
+    """Return the policy with its name and URL; add its deployment to `deployments` unless a running
+    server serves it.
     """
     url = policy.url
     if policy.source is not None and "://" in policy.source:
@@ -332,8 +334,8 @@ def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
     Args:
         url: The URL of the server.
         policy: The policy in the configuration.
-        ask: Whether the policy gets the name, the settings and the checkpoint that the server
-            reports, since a result belongs to the served policy, not to an address.
+        ask: Whether to take the name, the settings and the checkpoint from the server's metadata,
+            since a result belongs to the served policy, not to an address.
     """
     fields: dict[str, Any] = {"url": url, "source": None}
     if not ask:
@@ -345,7 +347,7 @@ def _policy_at(url: str, policy: PolicyConfig, *, ask: bool) -> PolicyConfig:
             f"policy {policy.name!r}: expected no settings with a `url`, got {names}; set them in "
             f"the server at {url}"
         )
-    # The server may be starting.
+    # The server may still be starting.
     with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
         metadata = agent.metadata
     name, config = metadata.get("policy"), metadata.get("config", {})
@@ -369,9 +371,9 @@ def policy_deployment(
     """Read the deployment of a policy that an evaluation serves.
 
     Args:
-        policy: The policy in the configuration, whose settings are added.
+        policy: The policy in the configuration; its settings are added to the deployment.
         source: A registered policy, "module:Class", or a deployment file.
-        step_follows: Whether the checkpoint's step is set later, as in `read_deployment`.
+        step_follows: Whether the step of the checkpoint is set later, as in `read_deployment`.
     """
     args = None
     if policy.config and not source.endswith(YAML_SUFFIXES):

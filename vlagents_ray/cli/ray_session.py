@@ -1,4 +1,6 @@
-"""Ray under a command: its logs go to a file, and the command ends if Ray is lost."""
+"""Management of Ray in a command: Ray's logs are written to a file, and the command ends if Ray is
+lost.
+"""
 
 from __future__ import annotations
 
@@ -23,30 +25,33 @@ from vlagents_ray.ray_tools.signals import is_interrupted, raise_dropped_interru
 
 log = logging.getLogger(__name__)
 
-_LEAVE_S = 10.0  # time limit for a command to end in order
+_LEAVE_S = 10.0  # time limit for the orderly end of a command
 # Time limit for the process to end after the command: Ray's shutdown may wait for lost processes.
 _EXIT_S = 3.0
 _LOOK_S = 1.0  # period of the check for an interrupt that Python dropped
-_END_S = 90.0  # from Ctrl-C to the end: a third for Serve, the rest for Ray's shutdown
+_END_S = 90.0  # time limit after Ctrl-C: a third for Serve, the rest for Ray's shutdown
 RESTART = "start it again"
 RESUME = "finished episodes are kept: continue with --resume when a cluster is running again"
 
-_FILE_BYTES = 10_000_000  # Serve logs each request; two files of this size are kept
+# Maximum size of a log file, since Serve logs each request; two such files are kept.
+_FILE_BYTES = 10_000_000
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
-_LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
+# Patterns of file names in the folder of Ray's logs.
+_LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")
 _DAEMON = "raylet"
 _SERVE_ACTORS = ("HAProxyManager", "ProxyActor", "ServeController")
-_ACTOR = ":actor_name:"  # the beginning of the line that names the actor of the file
-_TITLES = (_ACTOR, ":task_name:", ":job_id:")  # the beginnings of lines that name the process
+_ACTOR = ":actor_name:"  # beginning of the line that contains the name of the file's actor
+_TITLES = (_ACTOR, ":task_name:", ":job_id:")  # beginnings of lines that identify the process
 _LOAD_FAILURES = (
     "Exception in Replica(",
     "Failed to update the deployments",
     "the policy did not load",
 )
-# The beginnings of lines in the logs of Serve's processes: of all, and of those without a problem.
+# Patterns of the beginning of a line in the logs of Serve's processes: of any line, and of a line
+# that is not a problem.
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
 _SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")
-# Warnings about intended settings of `own_ray`: it listens on loopback, has a token and does not
+# Warnings about intended settings of `own_ray`: Ray listens on loopback, has a token and does not
 # handle signals.
 _INTENDED = (
     "won't accept connections from HAProxy on other nodes",
@@ -64,8 +69,8 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     Args:
         name: The prefix of the log file's name; None keeps no log.
         started: An event that is set when the server is ready. Until then, the traceback of a
-            policy that does not load is kept off the terminal as well, since the command ends with
-            its last line.
+            policy that does not load is also kept off the terminal, since the error of the command
+            contains the last line of the traceback.
 
     Yields:
         The log file, which only this user can read, and which is removed at the end if it is empty;
@@ -104,7 +109,7 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
         if file is not None and handler is not None:
             follower.join()
             handler.close()
-            if file.stat().st_size == 0:  # for instance if the port is taken
+            if file.stat().st_size == 0:  # e.g. if the port is in use
                 file.unlink()
 
 
@@ -114,7 +119,7 @@ class _Terminal:
     """
 
     def __init__(self, log_file: logging.Handler | None, started: threading.Event | None) -> None:
-        self.failing: set[str] = set()  # processes in the middle of a policy's traceback
+        self.failing: set[str] = set()  # processes that are printing a policy's traceback
         self._log_file = log_file
         self._started = started
 
@@ -145,8 +150,8 @@ class _Terminal:
 
         is_starting = self._started is not None and not self._started.is_set()
         is_traceback = is_starting and process in self.failing
-        # A signal to the whole process group also ends Ray's daemon, which then prints possible
-        # causes, and HAProxy, so that Serve's actors print that HAProxy crashed.
+        # A signal to the whole process group also ends Ray's daemon and HAProxy. The daemon then
+        # prints possible causes, and Serve's actors print that HAProxy crashed.
         is_consequence = is_interrupted() and (process == _DAEMON or actor in _SERVE_ACTORS)
         if is_consequence or is_traceback or not _is_problem(line, level):
             self._write_log(text)
@@ -182,24 +187,26 @@ def _follow(terminal: _Terminal, ended: threading.Event) -> None:
 
 
 class _LogFile:
-    """A log file of a process of Ray, which is read as it grows."""
+    """A log file of a Ray process, which is read while the process writes it."""
 
     def __init__(self, path: Path) -> None:
         self.actor = "ray"
-        # The last part of the name "worker-WORKER-JOB-PID", or "raylet".
+        # "raylet", or the last part of the name "worker-WORKER-JOB-PID".
         self.process = path.stem.rpartition("-")[2]
         self._path = path
         self._offset = 0
 
     def new_lines(self) -> Iterator[str]:
-        """Yield the complete lines since the last call, without the lines that name the process."""
+        """Yield the complete lines since the last call, without the lines that identify the
+        process.
+        """
         try:
-            if self._path.stat().st_size < self._offset:  # rotated
+            if self._path.stat().st_size < self._offset:  # the file was rotated
                 self._offset = 0
             with self._path.open("rb") as file:
                 file.seek(self._offset)
                 text, end, _ = file.read().rpartition(b"\n")
-        except OSError:  # it has been removed
+        except OSError:  # the file was removed
             return
 
         self._offset += len(text) + len(end)
@@ -211,16 +218,16 @@ class _LogFile:
 
 
 def _is_problem(text: str, level: int) -> bool:
-    """Return whether a line of a log is a warning or an error that is not intended."""
+    """Return whether a log line is a warning or an error, other than the intended warnings."""
     is_intended = any(warning in text for warning in _INTENDED)
     return level >= logging.WARNING and not is_intended
 
 
 @contextlib.contextmanager
 def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
-    """End the process with status 1 if its Ray is lost within the context.
+    """End the process with status 1 if Ray is lost within the context.
 
-    The command can end in order if that takes at most 10 s.
+    The command has 10 s for an orderly end.
 
     Args:
         cure: The advice in the error.
@@ -228,8 +235,8 @@ def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
     Yields:
         The observer of Ray.
     """
-    # Ray is imported before the thread starts: a module that two threads import at the same time is
-    # incomplete in one of them.
+    # Import Ray before the thread starts: a module that two threads import at the same time is
+    # incomplete in one of the threads.
     import ray  # noqa: F401
 
     loss = RayLoss(cure)
@@ -239,11 +246,11 @@ def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
     except ClusterLost as error:
         loss.error = error
         raise
-    except KeyboardInterrupt:  # or SIGTERM, which may also have ended Ray
+    except KeyboardInterrupt:  # includes SIGTERM, which may also have ended Ray
         loss.interrupted = True
         raise
     except Exception as error:
-        if loss.error is not None:  # the error of Ray is a consequence
+        if loss.error is not None:  # Ray's error is a consequence of the interrupt
             raise loss.error from error
         raise
     finally:
@@ -260,7 +267,8 @@ class RayLoss:
     def __init__(self, cure: str) -> None:
         self.error: ClusterLost | None = None
         self.interrupted = False
-        self.ending = threading.Event()  # the command has ended, or is about to print its error
+        # Set when the command has ended, or is about to print its error.
+        self.ending = threading.Event()
         self._cure = cure
         self._lost = threading.Event()
 
@@ -276,7 +284,7 @@ class RayLoss:
                 raise_dropped_interrupt()
         except KeyboardInterrupt:
             self.ending.set()
-            # This also prints the stacks of all threads.
+            # `faulthandler` also prints the stacks of all threads.
             faulthandler.dump_traceback_later(_END_S, exit=True)
             raise
         if self.error is not None:
@@ -317,8 +325,8 @@ class RayLoss:
                     head = HeadMonitor(self._cure)
                 head.answers()
             except ClusterLost as error:
-                if node_of_this_process() is node:  # this process is not just leaving it
+                if node_of_this_process() is node:  # Ray is lost, unless this process is leaving it
                     self.error = error
                 return
-            except Exception as error:  # noqa: BLE001 - whatever Ray raises while it is being joined or left
+            except Exception as error:  # noqa: BLE001 - Ray may raise any error at its start or end
                 log.debug("Ray was not watched: %s", error)

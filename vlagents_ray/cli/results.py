@@ -94,7 +94,7 @@ def report_command(
 
 
 def _described_formats() -> Iterator[str]:
-    """Yield each export format with its description."""
+    """Yield the name of each export format with its description."""
     for name, entry in entries("exports").items():
         yield f"{name}: {entry.about}"
 
@@ -130,7 +130,7 @@ def export_command(
             metavar="KEY=VALUE",
             help="A setting of the format, such as successes=true. May be repeated.",
         ),
-    ] = [],  # noqa: B006 - typer reads it
+    ] = [],  # noqa: B006 - typer reads the default
 ) -> None:
     """Write the episodes of an evaluation in a format for other programs, such as CSV, a
     LeRobotDataset or MCAP.
@@ -198,12 +198,14 @@ def settings_of_export(
 
 
 def _is_dataset(folder: Path) -> bool:
-    """Return whether a folder is a LeRobotDataset, or contains some."""
+    """Return whether a folder is a LeRobotDataset, or contains LeRobotDatasets."""
     return any(folder.glob("meta/info.json")) or any(folder.glob("*/meta/info.json"))
 
 
 def _require_no_dataset(folder: Path) -> None:
-    """Raise `ConfigError` if a folder holds LeRobotDatasets, which `open-loop` reads."""
+    """Raise `ConfigError` if a folder is or contains LeRobotDatasets, which only `open-loop`
+    reads.
+    """
     if _is_dataset(folder):
         raise ConfigError(
             f"{folder}: expected results of an evaluation, got a LeRobotDataset; run "

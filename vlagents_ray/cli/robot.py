@@ -62,18 +62,18 @@ from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
-# Deadline of a tick in the modes that wait for an answer; half of the default of --silent-s.
+# Deadline of a tick, s, in the modes that wait for an answer: half of the default of --silent-s.
 WAIT_S = 1.0
-_HZ = 50.0  # the control rate of a robot, unless --hz sets it
-_MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
+_HZ = 50.0  # default control rate of a robot
+_MOST_HZ = 10_000.0  # maximum control rate; no arm and no loop in Python is faster
 _PLANNER_HZ, _PLANNER_MAX_AGE_S = 1.0, 5.0
 _LABELS = {"y": "success", "n": "failure"}
 KEYS = (
     "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and "
     "stop the robot; c or Enter restarts it after a stop"
 )
-# Messages for options that other programs have. An option with a key would be readable in the list
-# of processes.
+# Messages for options that users may expect. A key in an option would be visible in the list of
+# processes.
 _OF_KEYS = "the API key is read from a variable: export VLAGENTS_RAY_API_KEY=vlr_..."
 _OF_CAS = "the file of your CA is read from a variable: export SSL_CERT_FILE=ca.pem"
 _CURES = {
@@ -83,7 +83,8 @@ _CURES = {
     "--cacert": _OF_CAS,
     "--tls-ca": _OF_CAS,
 }
-RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
+# Keys that restart motion: C needs no Enter while the keyboard moves the robot.
+RESTART_KEYS = "c\n"
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
@@ -112,9 +113,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
-    """Run a subcommand that a plug-in registers, such as "robot.check", and return its exit
-    status.
-    """
+    """Run a subcommand of a plug-in, such as "robot.check", and return its exit status."""
     try:
         run: Callable[[Sequence[str]], int] = registered_function("commands", name)
     except VLAgentsError as error:
@@ -137,7 +136,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if refused:
         condition = "with" if in_env else "without"
         parser.error(
-            f"expected no {', '.join(refused)} {condition} --env, got them; leave them out"
+            f"expected no {', '.join(refused)} {condition} --env, got some; leave them out"
         )
 
     if not in_env and options.policy is None:
@@ -165,13 +164,14 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """End the loop at SIGTERM (systemd), SIGHUP (a closed terminal) and Ctrl-C, which stops the
-    robot.
+    """End the loop, and so stop the robot, at SIGTERM (systemd), SIGHUP (a closed terminal) and
+    Ctrl-C.
     """
 
     def end(number: int, _: object) -> None:
         """Raise the exception that ends the loop."""
-        signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
+        # Ignore further signals, which would interrupt the stop.
+        signal.signal(number, signal.SIG_IGN)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         sys.exit(128 + number)
@@ -179,7 +179,8 @@ def _ended_by_signals() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
-                # Keep a signal that is ignored, as SIGHUP under nohup, and the caller's handler.
+                # Leave ignored signals (such as SIGHUP under nohup) and the caller's own handlers
+                # unchanged.
                 if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                     undo.callback(signal.signal, number, signal.signal(number, end))
         yield
@@ -197,7 +198,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     report = LoopReport(hz)
     failure: BaseException | None = None
 
-    # Wrong names are errors before anything is connected.
+    # Raise errors for wrong names before any connection.
     make_robot = None
     if options.robot:
         make_robot = robot_factory("--robot", options.robot, options.robot_set)
@@ -205,7 +206,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
     with contextlib.ExitStack() as stack:
         commands = CommandInbox() if options.allow_remote_stop else None
-        agent = RemoteAgent(  # the player closes it
+        agent = RemoteAgent(  # the chunk player closes the agent
             options.policy,
             transport=options.transport,
             timeout_s=options.timeout_s,
@@ -221,7 +222,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         settings = _player_settings(options, contract, deadline_s)
         guard = _guard(options, contract, hz)
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
-        player.initialize()  # rejects unfit settings before anything is timed or moves
+        player.initialize()  # raises for unsuitable settings before the robot moves
 
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot = stack.enter_context(_opened_robot(options, make_robot))
@@ -236,7 +237,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             viewer = stack.enter_context(open_viewer(options.rerun))
 
         def stop(reason: str) -> None:
-            """Stop the robot, and print why."""
+            """Stop the robot, and print the reason."""
             robot.stop()
             say(f"stopped by the watchdog: {reason}")
 
@@ -270,14 +271,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 recorder=recorder,
                 options=loop_options,
             )
-        except BaseException as error:  # noqa: BLE001 - raised again below, after the report
+        except BaseException as error:  # noqa: BLE001 - raised again after the report
             failure = error
 
         _say_report(report, f"{options.mode}, {agent.transport}", say, led=leader is not None)
         if report.jitter:
             _say_planner(robot, say)
 
-    if recorder is not None:  # it is closed, so that everything is written
+    if recorder is not None:  # the recorder is closed, so that all frames are written
         say(
             f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} "
             "frames dropped"
@@ -333,7 +334,7 @@ def _is_task_done(robot: Robot) -> bool:
 
 
 def _say_planner(robot: Robot, say: Callable[[str], None]) -> None:
-    """Print how punctual the planner of a robot was, if it has one."""
+    """Print the share of the planner's answers that arrived in time, if the robot has a planner."""
     if isinstance(robot, RobotWithPlanner):
         figures = robot.planner_timeliness.time_share
         if figures.share is not None:
@@ -353,7 +354,7 @@ def _guard(options: argparse.Namespace, contract: Contract | None, hz: float) ->
 
 
 def _deadline_s(options: argparse.Namespace) -> float:
-    """Return the time for which a tick waits for an action, s."""
+    """Return how long a tick waits for an action, s."""
     if options.deadline_ms is not None:
         return float(options.deadline_ms / 1e3)
     return 0.0 if options.mode == "async" else WAIT_S
@@ -366,7 +367,8 @@ def _player_settings(
     safe = options.safe
     is_relative_known = contract is not None and contract.action.relative is not None
     if safe == "auto" and not options.robot and not is_relative_known:
-        safe = "hold"  # the simulated robot uses such actions as absolute targets
+        # The simulated robot uses actions without a declared type as absolute targets.
+        safe = "hold"
 
     return PlayerSettings(
         options.mode,
@@ -381,8 +383,8 @@ def _player_settings(
 
 
 def _require_part(name: str | None, robot: Robot) -> None:
-    """Raise `ConfigError`, before the robot moves, if --measure names a part that its state does
-    not have.
+    """Raise `ConfigError`, before the robot moves, if the robot's state lacks the part that
+    --measure names.
     """
     if name is None:
         return
@@ -401,8 +403,8 @@ def _require_fit(
     limits: MotionLimits | None,
     say: Callable[[str], None],
 ) -> Fit:
-    """Compare the policy's first chunk with the training of the checkpoint and the limits of the
-    arm, and print all three.
+    """Compare the policy's first chunk with the training data of the checkpoint and the limits of
+    the arm, and print all three.
 
     Raises:
         ContractMismatch: They do not fit, and --ignore-mismatch is not given.
@@ -413,8 +415,8 @@ def _require_fit(
     is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
         message = (
-            "the policy declares no ranges of its training, so this arm's pose and the first "
-            "chunk are not compared with them; give them with --stats FILE"
+            "the policy declares no ranges of its training data, so the arm's pose and the first "
+            "chunk cannot be checked against them; give the ranges with --stats FILE"
         )
         say(message)
         logger.info("%s", message)
@@ -431,13 +433,13 @@ def _require_fit(
 
 
 def _say_report(report: LoopReport, name: str, say: Callable[[str], None], *, led: bool) -> None:
-    """Print the report of a run; without its timing if the run ended before the first tick.
+    """Print the report of a run, without the timing if the run ended before the first tick.
 
     Args:
         report: The report of the loop.
         name: The title of the row of numbers.
         say: Prints a line.
-        led: Whether an operator could move the robot.
+        led: Whether an operator could take over.
     """
     if report.outcome:
         say(f"marked as a {report.outcome}")
@@ -481,7 +483,7 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     for cause, ticks in sorted(causes.items(), key=lambda item: -item[1]):
         if ticks:
             say(f"  {ticks} x {cause}, first: {report.reasons[cause]}")
-    if report.mostly_safe is not None:  # `run_loop` has logged the reason and the cure
+    if report.mostly_safe is not None:  # `run_loop` has already logged the reason and the cure
         say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
     if report.blocking is not None:
         say(report.blocking)
@@ -501,8 +503,8 @@ def _say_timeliness(report: LoopReport, say: Callable[[str], None]) -> None:
 
 
 class _RunKeys:
-    """The operator's keys at the terminal of a run on a robot. A key that ends the run also
-    stops the robot.
+    """Handles the operator's keys at the terminal during a run on a robot. A key that ends the run
+    also stops the robot.
     """
 
     def __init__(self, recorder: Recorder | None, say: Callable[[str], None]) -> None:
@@ -511,7 +513,7 @@ class _RunKeys:
         self._say = say
 
     def press(self, key: str, control: RobotControl) -> bool:
-        """Handle a key; return whether it has a meaning."""
+        """Handle a key; return whether the key is known."""
         if key == "p" and control.reason is None:
             control.pause()
             self._say("paused; p continues")
@@ -536,21 +538,21 @@ def _restarting(
     say: Callable[[str], None],
     press: Callable[[str, RobotControl], bool] = lambda *_: False,
 ) -> Iterator[bool]:
-    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or
-    SIGUSR1.
+    """Let the operator restart motion after a stop or a pause: with Enter or C at the terminal, or
+    with SIGUSR1.
 
     Other keys are passed to `press`. Yields whether there is a terminal.
     """
 
     def restart() -> bool:
-        """Restart motion; return False if a signal that the watchdog needs is still missing."""
+        """Restart motion; return False if a source of the watchdog is still silent."""
         if not watchdog.restart():
             return False
         watchdog.control.resume()
         return True
 
     def handle_key(key: str) -> bool:
-        """Handle a key of the terminal; return whether it has a meaning."""
+        """Handle a key of the terminal; return whether the key is known."""
         if key not in RESTART_KEYS:
             return press(key, watchdog.control)
         was_standing = watchdog.control.stopped or watchdog.control.reason is not None
@@ -575,7 +577,7 @@ def _restarting(
 
 
 def _panels_of_plugins() -> Iterator[HelpPanel]:
-    """Yield the subcommands, robots and devices of plug-ins, also of those that are not
+    """Yield the subcommands, robots and devices of plug-ins, including plug-ins that are not
     installed.
     """
     for title, group, prefix in (
@@ -597,7 +599,7 @@ def _panels_of_plugins() -> Iterator[HelpPanel]:
 
 
 class _RobotParser(CommandParser):
-    """A parser whose help has the names of plug-ins, which are read then."""
+    """A parser whose help lists the names of plug-ins; they are read only for the help."""
 
     def help_page(self) -> HelpPage:
         """Return the help, with the names of plug-ins at its end."""
@@ -606,7 +608,7 @@ class _RobotParser(CommandParser):
 
 
 class _Options:
-    """The options of the command, which are added to one parser in groups.
+    """Adds the options of the command to one parser, in groups.
 
     Attributes:
         only_robot: The options that are rejected with --env.
@@ -620,24 +622,24 @@ class _Options:
         self._group = parser.add_argument_group("Options")
 
     def begin(self, title: str, note: str = "") -> None:
-        """Begin a group, to which further options belong.
+        """Begin a group, to which the options added next belong.
 
         Args:
             title: The title of the group.
-            note: A sentence about it.
+            note: A sentence about the group.
         """
         self._group = self._parser.add_argument_group(title, note)
 
     def both(self, *names: str, **settings: Any) -> None:
-        """Add an option of a robot and of a simulation."""
+        """Add an option for a robot and for a simulation."""
         self._group.add_argument(*names, **settings)
 
     def robot(self, *names: str, **settings: Any) -> None:
-        """Add an option of a robot."""
+        """Add an option for a robot."""
         self.only_robot.append(self._group.add_argument(*names, **settings))
 
     def env(self, *names: str, **settings: Any) -> None:
-        """Add an option of a simulation."""
+        """Add an option for a simulation."""
         self.only_env.append(self._group.add_argument(*names, **settings))
 
 

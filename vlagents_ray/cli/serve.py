@@ -1,4 +1,4 @@
-"""`vlagents-ray serve`: serves a policy, and prints the addresses for clients and a browser."""
+"""`vlagents-ray serve`: serves a policy, and prints the addresses for clients and browsers."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class ServeOptions:
         return read_deployment(find_policy(self.source, self.config_dir), overrides=overrides)
 
     def tls(self) -> Tls | None:
-        """Return the certificates that the options name; None if there are none.
+        """Return the certificates that the options name; None if no option names a certificate.
 
         Raises:
             ConfigError: The certificate or its key is missing.
@@ -199,7 +199,7 @@ def connection_lines(
         config: The deployment.
         urls: The URL of each application.
         host: The address on which the server listens.
-        keys: The file of the API keys, if an option names it.
+        keys: The file of the API keys, if an option sets it.
         insecure: Whether the server accepts every client.
 
     Yields:
@@ -225,7 +225,7 @@ def connection_lines(
 
         needs_key = not insecure
         if needs_key and keys is None:
-            with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
+            with contextlib.suppress(ConfigError):  # the key file is on the cluster's machines
                 needs_key = args.access.keys() is not None
         curl = ""
         if needs_key:
@@ -233,7 +233,7 @@ def connection_lines(
             curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" '
         yield f"  API: {curl}{url}/docs"
 
-        if not (insecure or args.access.insecure):  # --insecure shows no live page
+        if not (insecure or args.access.insecure):  # with --insecure, there is no live page
             for name in args.parts.on():
                 for title, path in registered_class("replica", name).pages.items():
                     yield f"  {title}: {url}{path}"

@@ -1,4 +1,4 @@
-"""Episodes of an environment in the control loop of a robot: driven by a policy, an operator, or
+"""Episodes of an environment in a robot's control loop, driven by a policy, an operator, or
 both.
 """
 
@@ -31,7 +31,7 @@ from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.viewers import EpisodeViewer, open_viewer
 
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
-_HZ = 10.0  # the control rate of environments whose contract declares none
+_HZ = 10.0  # control rate of environments whose contract declares no rate
 _LABELS: dict[str, Label] = {"y": "success", "n": "failure", "x": "discard"}
 _MOVES = {
     "autonomous": "the policy moves the robot",
@@ -41,7 +41,8 @@ _MOVES = {
 
 
 class EnvPolicy(Wrapper):
-    """A policy in an environment, whose contract replaces the policy's if that has no actions.
+    """A policy in an environment. If the policy's contract describes no actions, the environment's
+    contract replaces it.
 
     Args:
         agent: The policy.
@@ -54,14 +55,18 @@ class EnvPolicy(Wrapper):
         self._loaded = False
 
     def initialize(self) -> None:
-        """Load the policy once, although each run of the control loop initializes its agent."""
+        """Load the policy, but only once, although each run of the control loop calls
+        `initialize`.
+        """
         if not self._loaded:
             super().initialize()
         self._loaded = True
 
     @property
     def contract(self) -> Contract:
-        """The policy's contract, or the environment's if that has no actions."""
+        """The policy's contract, or the environment's contract if the policy's describes no
+        actions.
+        """
         contract = self.agent.contract
         if contract is None or contract.action.relative is None:
             return self._env_contract
@@ -93,7 +98,7 @@ def drive(options: argparse.Namespace) -> int:
 
 
 class RobotRun:
-    """A run of `vlagents-ray robot --env`.
+    """One run of `vlagents-ray robot --env`.
 
     Args:
         options: The options of the command.
@@ -108,12 +113,12 @@ class RobotRun:
         self._settings = parse_settings(options.set, "--set")
 
         self.verdict: Label | None = None  # the operator's label of the running episode
-        self.over = False  # the operator has ended the run
+        self.over = False  # whether the operator has ended the run
         self.recorder: Recorder | None = None
 
         self._control: RobotControl | None = None
         self._viewer: EpisodeViewer | None = None
-        self._printed: str | None = None  # the printed source of motion
+        self._printed: str | None = None  # the last printed source of motion
 
     def play(self, seeds: Iterable[int]) -> None:
         """Run an episode for each seed, and print its outcome.
@@ -148,7 +153,7 @@ class RobotRun:
                     break
                 self._play(env, agent, seed, hz, guard)
 
-        if self.recorder is not None:  # it is closed, so that everything is written
+        if self.recorder is not None:  # the recorder is closed, so that all frames are written
             out.print(
                 f"recorded: {self.recorder.episodes} episodes in {self.options.record}, "
                 f"{self.recorder.dropped} frames dropped"
@@ -164,12 +169,12 @@ class RobotRun:
         out.print(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
-            """Return the operator's label of the episode, or else the environment's."""
+            """Return the operator's label of the episode, or else the environment's label."""
             return self.verdict or ("success" if robot.success else "failure")
 
         def check_end() -> bool:
-            """Label the episode so far, print what moves the robot, and return whether the episode
-            has ended.
+            """Update the label of the episode, print the source of motion, and return whether the
+            episode has ended.
             """
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
@@ -178,7 +183,8 @@ class RobotRun:
 
         has_policy = self.options.policy is not None
         options = LoopOptions(
-            guard=None if has_policy else guard,  # a policy's player has it already
+            # The chunk player of a policy already has the control.
+            guard=None if has_policy else guard,
             reset_options={"seed": seed, "env": self.options.env} if has_policy else {},
             viewer=self._viewer,
         )
@@ -214,7 +220,7 @@ class RobotRun:
         return leader
 
     def _press(self, key: str) -> bool:
-        """Handle a key of the terminal; return whether it has a meaning."""
+        """Handle a key of the terminal; return whether the key is known."""
         if key in _LABELS:
             self.verdict = _LABELS[key]
         elif key == "p":
@@ -237,8 +243,8 @@ class RobotRun:
         is_remote = "://" in self.options.policy
         if is_remote and self._settings:
             raise ConfigError(
-                f"--set: expected no settings for {self.options.policy}, a server that has its "
-                f"own, got {sorted(self._settings)}; leave them out"
+                f"--set: expected no settings for {self.options.policy}, a server with its own "
+                f"settings, got {sorted(self._settings)}; leave them out"
             )
         inner: Agent
         if is_remote:
@@ -262,7 +268,7 @@ class RobotRun:
             self._control.resume()
 
     def _print_source_of_motion(self, has_begun: bool) -> None:
-        """Print what moves the robot, or why it is paused, if that has changed."""
+        """Print the source of motion, or the reason of a pause, if it has changed."""
         if self._control is None:
             return
         reason = self._control.reason

@@ -1,4 +1,4 @@
-"""The help of Typer's commands, in the layout of `help_page`."""
+"""The help of Typer's commands in the layout of `help_page`."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def page_of_command(command: Any, path: str) -> HelpPage:
     """Return the help of a command.
 
     Args:
-        command: The command that Typer makes of a function, or a group of commands.
-        path: The command as it is typed, such as "vlagents-ray eval".
+        command: A command that Typer has made from a function, or a group of commands.
+        path: The command as the user types it, such as "vlagents-ray eval".
     """
     panels: dict[str, list[HelpRow]] = {}
     arguments = [param for param in command.params if param.param_type_name == "argument"]
@@ -75,7 +75,7 @@ def _is_argument(param: Any) -> bool:
 
 
 def _argument_term(argument: Any) -> str:
-    """Return an argument as the usage shows it."""
+    """Return the text with which the usage shows an argument."""
     metavar = (argument.metavar or str(argument.name).upper()).strip("[]")
     if argument.nargs == -1 and not metavar.endswith("..."):
         metavar += "..."
@@ -103,7 +103,7 @@ def _metavar(option: Any) -> str:
 
 
 class _WithHelpPage:
-    """The methods of a command or a group with which Typer writes help and errors."""
+    """The methods of a command or a group that Typer calls to write help and errors."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help."""
@@ -116,19 +116,19 @@ class _WithHelpPage:
 
 
 class HelpCommand(_WithHelpPage, TyperCommand):
-    """A command."""
+    """A command whose help is a `HelpPage`."""
 
 
 class HelpGroup(_WithHelpPage, TyperGroup):
-    """A group of commands."""
+    """A group of commands whose help is a `HelpPage`."""
 
 
 def commands_of(command: Any, path: str = "vlagents-ray") -> Iterator[tuple[str, Any]]:
-    """Yield a command and all commands in it, each with the words that are typed.
+    """Yield a command and all its subcommands, each with the words that the user types.
 
     Args:
         command: The command or group.
-        path: The words that are typed for it.
+        path: The words that the user types for it.
     """
     yield path, command
     for name, inner in getattr(command, "commands", {}).items():
@@ -136,7 +136,7 @@ def commands_of(command: Any, path: str = "vlagents-ray") -> Iterator[tuple[str,
 
 
 def use_help_pages(group: typer.Typer) -> None:
-    """Make all commands and groups of Typer in a group show their help as a `HelpPage`."""
+    """Make a Typer group and all commands and groups in it show their help as a `HelpPage`."""
     for command in group.registered_commands:
         if command.cls in (None, TyperCommand):
             command.cls = HelpCommand
