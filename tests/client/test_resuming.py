@@ -274,7 +274,7 @@ def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no
 
     monkeypatch.setattr(InProcess, "call", unknown)
     agent._connection.timeout_s = 30.0
-    with pytest.raises(DeadlineExceeded, match="the next act does"):
+    with pytest.raises(DeadlineExceeded, match="the next call of act resumes it"):
         agent.act(obs(2))
     assert not late
     assert agent.act(obs(3)).info["resumed"]

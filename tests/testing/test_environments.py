@@ -179,7 +179,7 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     ),
     (with_contract(cameras={"front": CameraSpec(8, 8)}), "expected 8x8"),
     (with_contract(cameras={"wrist": CameraSpec()}), "camera 'wrist' is missing"),
-    (with_contract(cameras={}), r"cameras are \['front'\]"),
+    (with_contract(cameras={}), r"expected the cameras of the contract, \[\], got \['front'\]"),
     (with_contract(state={"joints": StateSpec(3)}), r"expected shape \(3,\)"),
     (
         with_contract(gripper=True),

@@ -140,7 +140,7 @@ def _require_resources(plan: ResolvedPlan, deployments: Mapping[str, Deployment]
         raise ConfigError(
             f"worker.gpus: expected at most the {available:g} GPUs of this machine, got "
             f"{needed:g} for a worker; set less (0 renders in software), or give the --address of "
-            f"a "
+            "a "
             "cluster that has them"
         )
     for deployment in deployments.values():
