@@ -329,19 +329,20 @@ class HttpTransport:
 
 
 class _OwnPorts:
-    """Decides which of the replicas' own ports are used.
+    """Decides which of the replicas' own ports the client uses.
 
-    A port that could not be used is avoided for `AVOIDED_S`, and then until a ping is answered
-    there. The ping has its own thread and connection, so that no request waits for it or is lost.
+    The client avoids a port that it could not use for `AVOIDED_S`, and then until the port answers
+    a ping. The ping has its own thread and connection, so that no request waits for it or is lost.
     """
 
     def __init__(self) -> None:
-        # The earliest time of the next ping, time.monotonic(), by port; the key None is for all.
+        # The earliest time of the next ping, time.monotonic(), by port; the key None stands for all
+        # ports.
         self._ping_at: dict[StreamAddress | None, float] = {}
         self._lock = threading.Lock()
 
     def avoid(self, address: StreamAddress) -> None:
-        """Avoid a port that did not execute a request."""
+        """Avoid a port that failed to execute a request."""
         with self._lock:
             self._ping_at[address] = time.monotonic() + AVOIDED_S
 
@@ -351,10 +352,10 @@ class _OwnPorts:
             self._ping_at[None] = time.monotonic() + AVOIDED_S
 
     def may_use(self, address: StreamAddress, is_alive: Callable[[], bool]) -> bool:
-        """Return whether a port may be used. If a ping is due there, begin it.
+        """Return whether a port may be used. If a ping of the port is due, begin the ping.
 
         Args:
-            is_alive: Pings the port; it returns whether there was an answer.
+            is_alive: Pings the port, and returns whether there was an answer.
         """
         with self._lock:
             avoided = [key for key in (None, address) if key in self._ping_at]
@@ -363,7 +364,7 @@ class _OwnPorts:
             if time.monotonic() < max(self._ping_at[key] for key in avoided):
                 return False
             for key in avoided:
-                self._ping_at[key] = float("inf")  # until this ping has ended
+                self._ping_at[key] = float("inf")  # no further ping until this ping has ended
         ping = partial(self._ping, avoided, is_alive)
         threading.Thread(target=ping, name="ping", daemon=True).start()
         return False
