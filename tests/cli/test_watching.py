@@ -32,7 +32,11 @@ FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
 @pytest.mark.parametrize(
     ("policies", "file", "text"),
     [
-        ([FIXED], None, r"expected \{step\} in the checkpoint of one policy, .*, got 0 such policies"),
+        (
+            [FIXED],
+            None,
+            r"expected \{step\} in the checkpoint of one policy, .*, got 0 such policies",
+        ),
         (
             [SWEPT, SWEPT | {"name": "other"}],
             None,
