@@ -27,8 +27,8 @@ from vlagents_ray.settings import wrong_settings
 
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
 _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
-# Settings that a replica does not get, so that it is not restarted when they change. It does not
-# get the dialects of the gateway either.
+# Settings that are not passed to a replica, so that it is not restarted when they change. The
+# dialects of the gateway are not passed either.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
 # Period at which Serve counts the remaining requests of a stopping replica; the default is 2 s.
 _AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}
@@ -70,7 +70,7 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     if args.resources.memory is not None:
         actor_options["memory"] = args.resources.memory
     runtime_env = args.environment.runtime_env()
-    if runtime_env:  # without this setting, Serve applies the application's
+    if runtime_env:  # without it, Serve applies the application's `runtime_env`
         actor_options["runtime_env"] = runtime_env
 
     options: dict[str, Any] = {
@@ -78,13 +78,14 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         # A replica is replaced after three failed checks.
         "health_check_period_s": 1 if args.environment.process == "child" else 5,
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock. Then
-        # only these checks limit the time of a call. Together they take as long as the limit of a
-        # call; Serve's default is 95 s for any policy.
+        # only these checks limit the time of a call. The failed checks take as long together as the
+        # time limit of a call; with Serve's defaults they would take 95 s for every policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
         # A policy that failed to load once will fail again. While other replicas run, Serve retries
         # forever.
         "max_constructor_retry_count": 1,
-        # Settings of the policy that a file has next to `args`; they change without a restart.
+        # Settings of the policy that a deployment file may contain next to `args`; they can change
+        # without a restart.
         "user_config": {},
         "ray_actor_options": actor_options,
         # A WebSocket session counts as one request until it ends, so the limit must allow all
@@ -106,7 +107,8 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         )
 
     replica = serve.ingress()(PolicyReplica)
-    # `metrics_interval_s` is deprecated for a variable that affects a whole cluster.
+    # Serve has deprecated `metrics_interval_s` in favour of an environment variable, which affects
+    # the whole cluster.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         policy = serve.deployment(**options)(replica)
@@ -124,7 +126,7 @@ def _gateway(args: ServerArgs) -> Application:
         "name": GATEWAY,
         "num_replicas": 1,
         "graceful_shutdown_timeout_s": 10,
-        **_AT_ONCE,  # Serve has no requests of its clients, which use its own ports
+        **_AT_ONCE,  # the gateway's clients use its own ports, not Serve's
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {HEAD_NODE: 0.001}},
     }

@@ -1,10 +1,11 @@
-"""How many robots a replica can serve in time: the costs of its batches against what robots need.
+"""The number of robots that a replica can serve in time, from the costs of its batches and the
+needs of the robots.
 
-A robot executes the rows of an action chunk, one a tick, and needs the next chunk before the last
-row was executed. A request waits for the batch that runs when it arrives, and then for its own, so
-that its answer comes after two batches and the transport; the longer this takes, the fewer rows of
-the answer are left to execute. This arithmetic is used by the queue, by the check of a robot's SLO
-at its reset, by autoscaling, and by the plan of a fleet.
+A robot executes one row of an action chunk at each tick, and needs the next chunk before it has
+executed the last row. A request waits for the batch that is running when the request arrives, and
+then for its own batch. Its answer therefore takes the time of two batches and the transport. The
+longer this takes, the fewer rows of the answer are left to execute. The queue, the check of a
+robot's SLO at its reset, autoscaling and the plan of a fleet use this arithmetic.
 """
 
 from __future__ import annotations
@@ -20,31 +21,33 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 
 USABLE = 0.9
-"""The largest load at which robots are in time: requests arrive in bursts, so a replica that is
-needed all the time has a queue without bound. In the simulation of six kinds of robots, all begun
-within 3 s, at least 98.1 % of a minute's ticks were in time at 0.9, and 91.6 % at 1.0
+"""The largest load at which robots are in time. Requests arrive in bursts, so the queue of a
+replica with a load of 1 grows without bound. In the simulation of six kinds of robots that all
+start within 3 s, at least 98.1 % of a minute's ticks were in time at 0.9, and 91.6 % at 1.0
 (`python -m benchmarks.fleet_plans --loads`).
 """
 
-# Share of its longest interval after which a robot replans where the replica can do that: arrivals
-# are not even, and requests are sent at ticks only.
+# Share of its longest interval after which a robot replans if the replica has room for that. The
+# margin is needed because arrivals are uneven, and requests are sent only at ticks.
 _RELAXED = 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class CostCurve:
-    """The duration of a batch over its number of rows: a line, or a table of measured sizes.
+    """The duration of a batch as a function of its number of rows: a line, or a table of measured
+    sizes.
 
     Raises:
-        ConfigError: A duration is not a finite number above 0, or the table is not in the order of
-            its sizes.
+        ConfigError: A duration is not a finite number above 0, or the sizes in the table are not in
+            ascending order.
     """
 
     fixed_s: float = 0.0  # duration of a batch without rows, s
-    row_s: float = 0.0  # further duration of each row, s
+    row_s: float = 0.0  # additional duration of each row, s
     table: tuple[tuple[int, float], ...] = ()
-    """The duration, s, by the number of rows; the line is not used then. Between two sizes the
-    duration is interpolated; past the largest it grows as between the last two.
+    """Pairs of a number of rows and the duration, s. If the table is set, the line is not used.
+    Between two sizes the duration is interpolated; above the largest size it grows as between the
+    last two sizes.
     """
 
     def __post_init__(self) -> None:
@@ -76,14 +79,14 @@ class CostCurve:
 
 @dataclass(frozen=True, slots=True)
 class RobotNeed:
-    """What a robot needs of its policy.
+    """The requirements of a robot for the answers of its policy.
 
     Raises:
         ConfigError: A value is out of range.
     """
 
-    hz: float  # ticks a second
-    rows: int = 1  # rows of an answer that it executes at most
+    hz: float  # ticks per second
+    rows: int = 1  # maximum number of rows of an answer that the robot executes
     age_s: float | None = None  # largest age of an executed action, s; None: any
 
     def __post_init__(self) -> None:
@@ -106,7 +109,7 @@ class RobotNeed:
         """
         left_s = self.longest_s - latency_s
         if self.rows == 1:
-            # Each tick needs an answer of its own, which comes before the next one.
+            # Each tick needs its own answer, which must arrive before the next tick.
             return 1 / self.hz if left_s >= 0 else 0.0
         # More than one request a tick would compute actions that are never executed.
         return max(left_s, 1 / self.hz) if left_s > 0 else 0.0
@@ -115,24 +118,24 @@ class RobotNeed:
     def longest_s(self) -> float:
         """The longest time from the capture of an observation until the next answer, s.
 
-        The oldest action is executed just before the next answer comes. With one action an answer,
-        that is the only one, as old as the answer took.
+        The oldest action is executed just before the next answer arrives. If each answer has one
+        action, that action is as old as its answer took.
         """
         plan_s = self.rows / self.hz
         return plan_s if self.age_s is None else min(plan_s, self.age_s)
 
 
 class ReplicaLoad(NamedTuple):
-    """How much of a replica its robots need."""
+    """The share of a replica that its robots need."""
 
     load: float
-    """Requests a second that the robots need, as a share of those that the replica can answer in
-    time; `inf` if some robot cannot be in time here even alone.
+    """Requests per second that the robots need, as a share of the requests per second that the
+    replica can answer in time; `inf` if a robot could not be in time at this replica even alone.
     """
     batch_size: int  # size of the batches with which the load is least
-    latency_s: float  # from a request to its answer with batches of that size, s
-    # Time between two requests of a robot that can wait so long, with which the replica is used no
-    # more than it can be, s.
+    latency_s: float  # time from a request to its answer with batches of that size, s
+    # Time between two requests of each robot that can wait so long, with which the load of the
+    # replica is at most `USABLE`, s.
     interval_s: float = math.inf
 
     @property
@@ -141,12 +144,12 @@ class ReplicaLoad(NamedTuple):
         return self.load <= USABLE
 
     def replan_s(self, need: RobotNeed) -> float:
-        """Return the time between two requests of a robot with which the replica is used no more
-        than it can be, s; 0 if the robot may ask as often as it wants.
+        """Return the time between two requests of a robot with which the load of the replica is at
+        most `USABLE`, s; 0 if the robot may send requests as often as it needs.
 
-        All robots replan equally often, so that nobody has fresher actions at the cost of another
-        one's, except those that must replan more often to be in time. The nearer the replica is to
-        its limit, the more of its plan every robot executes before.
+        All robots replan equally often, except robots that must replan more often to be in time. No
+        robot thus has fresher actions at the expense of another robot. The nearer the replica is to
+        its limit, the larger is the part of its plan that each robot executes before it replans.
         """
         share = min(1.0, max(_RELAXED, self.load / USABLE))
         return min(self.interval_s, share * need.interval_s(self.latency_s))
@@ -161,15 +164,15 @@ def replica_load(
     max_batch_size: int,
     transport_s: float = 0.0,
 ) -> ReplicaLoad:
-    """Compute the load of a replica, with the size of batches that makes it least.
+    """Compute the load of a replica with the batch size that minimizes the load.
 
-    Small batches answer soon, and large ones answer more requests a second.
+    Small batches answer sooner, and large batches answer more requests per second.
 
     Args:
-        costs: The duration of its batches.
+        costs: The duration of the replica's batches.
         needs: The number of robots with each need.
         max_batch_size: The largest batch of the replica.
-        transport_s: The time that a request and its answer spend on the way, s.
+        transport_s: The time that a request and its answer spend in the transport, s.
     """
     robots = sum(needs.values())
     if not robots:
@@ -180,7 +183,8 @@ def replica_load(
     latencies_s = np.array([answer_s(costs, size, robots) for size in sizes.tolist()]) + transport_s
     needed_hz = _needed_hz(needs, latencies_s)
     too_late = np.flatnonzero(np.isinf(needed_hz))
-    usable_sizes = int(too_late[0]) if len(too_late) else len(sizes)  # larger ones are later still
+    # Larger batches take even longer.
+    usable_sizes = int(too_late[0]) if len(too_late) else len(sizes)
     if not usable_sizes:
         return ReplicaLoad(math.inf, 1, float(latencies_s[0]))
 
@@ -194,11 +198,11 @@ def replica_load(
 
 
 def _needed_hz(needs: Mapping[RobotNeed, int], latencies_s: np.ndarray) -> np.ndarray:
-    """Return the requests a second that robots need at each latency (S,), by
-    `RobotNeed.interval_s`; `inf` where some robot cannot be in time.
+    """Return the requests per second that robots need at each latency (S,), computed as in
+    `RobotNeed.interval_s`; `inf` at latencies with which a robot cannot be in time.
 
-    A replica computes this for up to thousands of robots that differ, and each size of its batches,
-    on the thread of its policy: all at once takes a tenth of the time.
+    A replica computes this on the thread of its policy, for up to thousands of different robots and
+    for each size of its batches. The vectorized computation takes a tenth of the time.
     """
     periods_s = np.array([1 / need.hz for need in needs])
     longest_s = np.array([need.longest_s for need in needs])
@@ -213,12 +217,13 @@ def _needed_hz(needs: Mapping[RobotNeed, int], latencies_s: np.ndarray) -> np.nd
 
 
 def _common_interval_s(longest_s: Sequence[tuple[float, int]], usable_hz: float) -> float:
-    """Return the time between two requests with which robots send `usable_hz` requests a second
-    together, s, if those send them more often whose longest time is shorter.
+    """Return the time between two requests with which all robots together send `usable_hz` requests
+    per second, s. Robots whose longest time is shorter send requests more often.
 
     Args:
-        longest_s: The longest time between two requests, s, with its number of robots.
-        usable_hz: The requests a second; `inf` is returned if the robots need more.
+        longest_s: Pairs of a longest time between two requests, s, and the number of robots with
+            it.
+        usable_hz: The requests per second; the result is `inf` if the robots need more.
     """
     robots = sum(count for _, count in longest_s)
     for interval_s, count in sorted(longest_s):
@@ -231,8 +236,9 @@ def _common_interval_s(longest_s: Sequence[tuple[float, int]], usable_hz: float)
 
 
 def answer_s(costs: CostCurve, size: int, robots: int) -> float:
-    """Return the longest time from the arrival of a request to its answer, s: the batch that runs
-    meanwhile, and its own. A lone robot finds no batch running.
+    """Return the longest time from the arrival of a request to its answer, s: the duration of the
+    batch that is running then, and of the request's own batch. If there is only one robot, no batch
+    is running.
     """
     return costs.cost_s(size) * (1 if robots == 1 else 2)
 

@@ -356,7 +356,10 @@ def test_an_engine_accepts_no_message_that_is_not_charged_to_its_sender(file: Pa
     sender = Sender(engine, "any", caller=caller, has_left=None)
     uncharged, free_of_charge = IncomingMessage("any"), sender.message(free(NoKey.OPEN))
     for message in (uncharged, free_of_charge):
-        with pytest.raises(TypeError, match="expected one that is charged to its sender's key"):
+        with pytest.raises(
+            TypeError,
+            match="expected a message that `Account.charge` has charged to its sender's key",
+        ):
             sender.send(message, Decoded([Request("reset", Obs())], {}), Calls(ignore))
     engine.close()
     with pytest.raises(TypeError, match="identify the client before its first message"):

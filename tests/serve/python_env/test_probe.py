@@ -57,7 +57,7 @@ def test_an_interpreter_that_is_a_link_stays_one(
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
-        ({"process": "child"}, "expected `python` with it, got 'child'"),
+        ({"process": "child"}, "expected `python` to be set as well, got 'child'"),
         ({"process": "thread", "python": "p"}, "'auto', 'replica' or 'child'"),
         ({"pythn": "p"}, "Extra inputs"),
     ],

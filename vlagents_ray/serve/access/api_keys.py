@@ -51,7 +51,7 @@ class NoKey(enum.Enum):
     """The reason why a request needs no API key, used in place of a `Caller`."""
 
     OPEN = "the server has no keys"
-    INSIDE = "it was loaded from the same Ray cluster, or by the replica itself"
+    INSIDE = "the request comes from the same Ray cluster, or from the replica itself"
 
 
 class Keys:
@@ -60,7 +60,7 @@ class Keys:
     If the file is deleted, all keys are rejected. If it cannot be read or parsed, the keys stay
     valid for `_CLOSE_S`, so that an editing mistake or a short failure of a network drive does not
     stop a robot; the log and a metric report it immediately. After that time, all keys are rejected
-    until the file can be read, as some may have been revoked.
+    until the file can be read, since some keys may have been revoked.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Keys:
 
         self._keys: dict[bytes, Key] = {}  # by the SHA-256 of the key
         self._buckets: dict[str, TokenBucket] = {}
-        # Time before which the senders with a key are not read, s.
+        # Time until which no connection of a key is read, s, by the key's name.
         self._unread_until: dict[str, float] = {}
         self._connections: Counter[str] = Counter()  # number of connections, by the key's name
 
@@ -89,7 +89,7 @@ class Keys:
         # Time since which the file is unreadable, s; None if it is readable.
         self._unreadable: float | None = None
         self._reminded = 0.0  # time of the last log line about an unreadable file, s
-        self._hung: threading.Thread | None = None  # a check that has not returned
+        self._hung: threading.Thread | None = None  # thread of a check that has not returned
         self._state: object = self._changed()
         self._load(self._read())
 
@@ -98,7 +98,7 @@ class Keys:
         """Read the keys from a file, which is then checked for changes.
 
         Raises:
-            ConfigError: It is not a key file.
+            ConfigError: The file is not a key file.
         """
         file = Path(path)
         return cls(lambda: read_text(file), lambda: _stamp(file), where=f"keys file {file}")
@@ -128,8 +128,8 @@ class Keys:
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
         keys = self._keys  # another thread may replace the attribute
         key: Key | None = None
-        # The digest is compared with those of all keys, so that the duration reveals nothing about
-        # the keys.
+        # The digest is compared with the digests of all keys, so that the duration reveals nothing
+        # about the keys.
         for known_digest, known_key in keys.items():
             if hmac.compare_digest(known_digest, digest):
                 key = known_key
@@ -225,8 +225,8 @@ class Keys:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed. It runs on a separate thread, as a network drive may
-        block.
+        """Read the file if it has changed. This method runs on a separate thread, since a network
+        drive may block.
         """
         try:
             state = self._changed()
@@ -243,7 +243,9 @@ class Keys:
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Log that the file is unreadable, and reject all keys if it has been so for `_CLOSE_S`."""
+        """Log that the file is unreadable, and reject all keys if it has been unreadable for
+        `_CLOSE_S`.
+        """
         is_first = self._unreadable is None
         if self._unreadable is None:
             self._unreadable = now
@@ -266,7 +268,9 @@ class Keys:
         self._reminded = now
 
     def _load(self, text: str | None) -> None:
-        """Replace the keys with those in the text of a key file, or with none if it is None."""
+        """Replace the keys with the keys in the text of a key file; remove all keys if the text is
+        None.
+        """
         keys = [] if text is None else parse_keys(text, self._where)
         self._keys = {bytes.fromhex(key.sha256): key for key in keys}
 
@@ -520,9 +524,9 @@ class ScopeCheck:
             caller.require(scope)
         elif self.open_to_network:
             raise Forbidden(
-                f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray "
-                f"keys create NAME --scope {scope}` and serve with `--keys`, or serve on loopback "
-                "without `--insecure`"
+                f"{self.subject}: not available on a server with `--insecure`; make a key with "
+                f"`vlagents-ray keys create NAME --scope {scope}` and serve with `--keys`, or "
+                "serve on loopback without `--insecure`"
             )
 
     def may(self, scope: str) -> bool:

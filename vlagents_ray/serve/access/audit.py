@@ -8,7 +8,7 @@ per request.
     key lab: pressed 'pause' for session 'arm-1/7f3a'
 
 A kind of event is logged immediately, and again after `_EVERY_S` at the earliest, with the number
-of omitted events. Only the buttons of the live page are always logged, even on a server without
+of omitted events. Presses of the live page's buttons are always logged, even on a server without
 keys. The log contains names of keys, never keys. Rejections have the level WARNING, all other
 events INFO.
 """
@@ -38,9 +38,9 @@ def write_audit() -> None:
         logger.addHandler(handler)
 
 
-class _StderrHandler(logging.StreamHandler):  # type: ignore[type-arg]  # Python 3.10 has none
-    """Writes each line to the present `sys.stderr`, as a program may replace it and close the old
-    one.
+class _StderrHandler(logging.StreamHandler):  # type: ignore[type-arg]  # not generic in Python 3.10
+    """Writes each line to the current `sys.stderr`, since a program may replace `sys.stderr` and
+    close the old stream.
     """
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -1,18 +1,18 @@
-"""Charges of messages to the keys of their senders. Nothing else takes from the rate of a key.
+"""Charges of messages to the keys of their senders. Nothing else counts towards the rate of a key.
 
-A connection has an `Account`, as has each request over HTTP. A message is charged by
+Each connection and each request over HTTP has an `Account`. A message is charged by
 `Account.charge` when its bytes have arrived, before any of them is parsed. The resulting `Charge`
-goes with the message to the engine, which accepts no message without one, so that an endpoint or a
-dialect has nothing to count::
+accompanies the message to the engine, which accepts no message without a charge. Endpoints and
+dialects therefore count nothing themselves::
 
     account = Account(caller)  # for as long as the connection is open
     charge = account.charge()  # a message has arrived: its first request is charged
     charge.require()  # raises `TooManyRequests`; decoders call it before they parse anything
     charge.cover(3)  # the message has three requests: the second and the third are charged
 
-`cover` takes the number of all requests of the message, and charges those that were not charged
-before. Decoders, dialects and the `Sender` therefore call it independently of each other, and none
-counts a request twice.
+The argument of `cover` is the number of all requests in the message; `cover` charges the requests
+that were not charged before. Decoders, dialects and the `Sender` therefore call it independently of
+each other, and none counts a request twice.
 
 What is charged to the rate of a key:
 
@@ -22,7 +22,7 @@ What is charged to the rate of a key:
 - A reset that the server adds at the beginning of an episode is free.
 - A control frame is free within `CONTROL_FRAMES_PER_S`. Above that rate, the connection costs one
   request, and ends.
-- A WebSocket that ends before its first message, or by a frame that is invalid, costs one request.
+- A WebSocket that ends before its first message, or with an invalid frame, costs one request.
 
 A rejected request costs nothing. A limit per key that concerns messages, requests or control frames
 belongs here, and then applies at every endpoint.
@@ -75,7 +75,7 @@ class Account:
 
         Returns:
             The charge, which raises an error when the message is decoded if the key is over its
-            rate or no longer valid: the endpoint answers it in its own protocol.
+            rate or no longer valid: the endpoint sends this error in its own protocol.
 
         Raises:
             TypeError: The client is not identified yet.
@@ -100,11 +100,12 @@ class Account:
         return Charge(caller, is_robot=key.priority != "simulation")
 
     def charge_control_frame(self) -> None:
-        """Count a control frame, or a small fragment of a message, which costs as much to read.
+        """Count a control frame or a small fragment of a message, either of which takes as long to
+        read as a message.
 
         Raises:
-            MalformedMessage: There are too many, for which a request is charged; the connection has
-                to end.
+            MalformedMessage: There are too many of them. A request is charged, and the connection
+                has to end.
         """
         now = time.monotonic()
         if self._control_frames is None:
@@ -116,8 +117,8 @@ class Account:
             )
 
     def charge_abuse(self) -> None:
-        """Charge a request for a connection that ends by the fault of its client, or without a
-        message.
+        """Charge a request for a connection that ends because of an error of its client, or without
+        a message.
         """
         if isinstance(self.caller, Caller):
             with contextlib.suppress(VLAgentsError):
@@ -129,8 +130,8 @@ class Account:
         return self._refused >= REFUSALS
 
     def throttled_s(self) -> float:
-        """Return for how long the server must not read from the client, s; 0 if the key is within
-        its rate.
+        """Return how long the server must not read from the client, s; 0 if the key is within its
+        rate.
 
         The pause slows down clients of a key whose messages are rejected in any case.
         """
@@ -162,19 +163,19 @@ class Charge:
             is_robot: Whether the key allows requests with the priority of robots.
         """
         self.is_robot = is_robot
-        # The holder of the key that is charged; None if none is.
+        # The holder of the key that is charged; None without a key.
         self.caller = caller if isinstance(caller, Caller) else None
         self._refusal = refusal
         self._charged = 1  # number of requests that the key has been charged for
 
     @property
     def key(self) -> str | None:
-        """Name of the key that is charged; None if none is."""
+        """Name of the key that is charged; None without a key."""
         return None if self.caller is None else self.caller.name
 
     def require(self) -> None:
-        """Raise the reason why the message is rejected, if it is; nothing of it may be parsed
-        then.
+        """Raise an error with the reason if the message is rejected. No part of a rejected message
+        may be parsed.
         """
         if self._refusal is not None:
             raise self._refusal
@@ -186,7 +187,8 @@ class Charge:
             self.caller.require()
 
     def cover(self, requests: int) -> None:
-        """Charge so many requests of the message in all; those charged before are free.
+        """Charge the first `requests` requests of the message, except those that were charged
+        before.
 
         Raises:
             TooManyRequests: The key is over its rate; fewer requests are covered.

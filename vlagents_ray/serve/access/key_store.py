@@ -204,7 +204,7 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
     key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
 
     def add(keys: list[Key]) -> list[Key]:
-        """Return the keys with the new one, which replaces a revoked one of the same name."""
+        """Return the keys and the new key, which replaces a revoked key of the same name."""
         if any(other.name == name and not other.revoked for other in keys):
             raise ConfigError(
                 f"key {name!r} exists already; choose another name, or revoke it first"
@@ -280,9 +280,9 @@ def _copy_owner(descriptor: int, file: Path) -> None:
         os.fchmod(descriptor, old.st_mode & 0o777)
     except OSError as error:
         raise ConfigError(
-            f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one "
-            f"cannot be made ({error.strerror}); nothing was changed: run this as that user, or as "
-            "root"
+            f"keys file {file}: belongs to user {old.st_uid} (group {old.st_gid}), and the new "
+            f"file cannot be given this owner ({error.strerror}); nothing was changed: run this as "
+            "that user, or as root"
         ) from error
 
 

@@ -40,8 +40,8 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
     host = headers.get("host")
     if origin is not None and not _is_page_of(host, origin):
         raise Forbidden(
-            f"origin {origin[:100]!r}: a page of another site reaches no robot, not even with a "
-            "key; let the program behind that page send the request"
+            f"origin {origin[:100]!r}: requests from a page of another site are rejected, even "
+            "with a key; let the program behind that page send the request"
         )
     if host is not None and not _is_name_of_server(host, hosts):
         raise Forbidden(

@@ -65,11 +65,11 @@ class EnvironmentArgs(_DeploymentModel):
     def _one(self) -> EnvironmentArgs:
         if self.python is None and self.process != "auto":
             raise ValueError(
-                f"process: expected `python` with it, got {self.process!r} alone; name an "
-                "interpreter, or leave it out"
+                f"process: expected `python` to be set as well, got {self.process!r} alone; name "
+                "an interpreter, or leave out `process`"
             )
-        # The check also applies to a child process, as Serve shows the deployment, and a child may
-        # become a replica.
+        # The check also applies to a child process, since Serve shows the settings of the
+        # deployment, and the policy may later run in the replica.
         require_no_secrets({"env_vars": self.env_vars})
         return self
 
@@ -205,7 +205,7 @@ class SloArgs(_DeploymentModel):
     share: float = Field(
         default=SHARE,
         le=1,
-        description="Smallest share of its ticks with an action in time.",
+        description="Smallest share of the robot's ticks that have an action in time.",
     )
     rows: int | None = Field(
         default=None,
@@ -220,7 +220,7 @@ class SloArgs(_DeploymentModel):
             try:
                 Slo.from_json(value)
             except ConfigError as error:
-                # The path of the setting, which comes first in the message, ends with `slo`.
+                # pydantic's message begins with the path of the setting, which ends with `slo`.
                 raise ValueError(str(error).removeprefix("slo.").removeprefix("slo: ")) from None
         return value
 
@@ -238,7 +238,7 @@ class StreamArgs(_DeploymentModel):
 
     enabled: bool = Field(
         default=True,
-        description="Whether replicas have a port of their own.",
+        description="Whether each replica has its own port.",
     )
     ports: tuple[Port, Port] | None = Field(
         default=None,
@@ -280,8 +280,8 @@ class LimitArgs(_DeploymentModel):
         default=CallLimits().warm_up_s,
         gt=0,
         le=MOST_S,
-        description="The same for the first two resets, and the first two batches of each of "
-        "`batch.sizes`, which may compile.",
+        description="Time limit of the first two resets, and of the first two batches of each of "
+        "`batch.sizes`, which may compile, in seconds.",
     )
     load_s: float = Field(
         default=CallLimits().load_s,
@@ -299,15 +299,15 @@ class LimitArgs(_DeploymentModel):
         default=DEFAULT_LIMITS.reply_bytes,
         ge=1024,
         le=DEFAULT_LIMITS.body_bytes,  # no client reads a longer reply
-        description="Largest reply: the action and its info, in bytes. A policy that returns more "
-        "has failed (500).",
+        description="Largest reply: the action and its info, in bytes. A larger result of the "
+        "policy is an error (500).",
     )
     decoded_bytes: int = Field(
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
         le=MOST_BYTES,
-        description="Largest decoded size of the images and bytes of one request, each as often "
-        "as it is named.",
+        description="Largest decoded size of the images and bytes of one request, each counted "
+        "as often as the request refers to it.",
     )
     in_flight_bytes: int = Field(
         default=DEFAULT_LIMITS.in_flight_bytes,
@@ -369,7 +369,7 @@ class AccessArgs(_DeploymentModel):
 
     keys_file: str | None = Field(
         default=None,
-        description="Path of the API keys, the same on every node. null: the value of "
+        description="Path of the file of API keys, the same on every node. null: the value of "
         "VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS of the replica.",
     )
     insecure: bool = Field(
@@ -428,14 +428,14 @@ class AutoscalingArgs(_DeploymentModel):
         ge=0,
         le=MOST_WORKERS,
         description="Number of replicas at the start. null: `min_replicas`. `vlagents-ray serve` "
-        "waits until the policy answers, which starts one.",
+        "waits until the policy answers, which starts a replica.",
     )
     target_utilisation: float = Field(
         default=0.7,
         gt=0,
         le=1,
-        description="Share of the time in which a replica's policy may be busy. The rest absorbs "
-        "bursts.",
+        description="Share of the time in which a replica's policy may be busy. The remaining "
+        "time absorbs bursts.",
     )
     target_waiting: float = Field(
         default=1.0,
@@ -454,8 +454,8 @@ class AutoscalingArgs(_DeploymentModel):
         default=0.8,
         gt=0,
         le=1,
-        description="Share of a replica that its robots need to be in time, according to their "
-        "SLOs.",
+        description="Share of a replica that its robots may need to be in time, according to "
+        "their SLOs.",
     )
     look_back_s: float = Field(
         default=15.0,
@@ -468,7 +468,7 @@ class AutoscalingArgs(_DeploymentModel):
         ge=0,
         le=MOST_S,
         description="Time for which more replicas must be needed before they are added, in "
-        "seconds. The need from sessions is obeyed after at most 3 s, the need from "
+        "seconds. Replicas needed for sessions are added after at most 3 s, those needed for "
         "SLOs after at most 1 s.",
     )
     downscale_delay_s: float = Field(
@@ -497,8 +497,8 @@ class AutoscalingArgs(_DeploymentModel):
         }
         # A replica reports at each measurement; Serve's own default is every 10 s.
         report_s = min(2.0, self.look_back_s / 5)
-        # What robots need is known, and reported as it changes. The first measured costs of batches
-        # become better within a second.
+        # The needs of robots are known, and reported as soon as they change. The first measured
+        # costs of batches become more accurate within a second.
         needs_s = min(self.upscale_delay_s, _NEEDS_S)
         # While a session moves, two replicas may count it, until both have reported again.
         all_reported_s = min(self.upscale_delay_s, 1.5 * report_s)

@@ -151,8 +151,8 @@ class DialectArgs(RegisteredArgs):
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
     """Read a mapping.
 
-    The presets are the mappings of known clients. Each dialect defines its own, with the units and
-    orders of its system's examples.
+    The presets are the mappings of known clients. Each dialect defines its own presets, with the
+    units and the order of values in its system's examples.
 
     Args:
         value: A preset's name, or an object. The fields of an object with `preset` override those

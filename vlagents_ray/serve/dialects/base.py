@@ -2,8 +2,9 @@
 
 A dialect is an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and
 anything else on the server's own port, or a `PortDialect` for a protocol that needs its own port.
-CONTRIBUTING.md has the steps to add one; a third-party package has an entry point in the group
-`vlagents_ray.dialects`, or a deployment file names the class, as `my_package:MyDialect`.
+CONTRIBUTING.md lists the steps to add a dialect. A third-party package registers its dialect with
+an entry point in the group `vlagents_ray.dialects`, or a deployment file names the class, as
+`my_package:MyDialect`.
 
 The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a
 list of numbers::
@@ -108,15 +109,15 @@ from vlagents_ray.serve.requests import IncomingMessage
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]
 Check = Callable[[str | None], Identity]
-"""Returns the caller that a client's API key belongs to, or raises `Unauthorized` or
-`Forbidden`; None means no key.
+"""Returns the owner of a client's API key, or raises `Unauthorized` or `Forbidden`. The argument is
+None if the client has sent no key.
 """
 
 logger = logging.getLogger(__name__)
 
 Connect = Callable[[str | None, PriorityName | None], RemoteAgent]
-"""Connects to the application for one client, with its API key and the most urgent class that the
-key allows; None stands for no key, and for any class.
+"""Connects to the application for one client, with its API key (None without a key) and the highest
+priority that the key allows (None for any priority).
 """
 
 # WebSocket close codes
@@ -151,7 +152,7 @@ class GatewayContext:
     check: Check | NoKey  # checks the key of a client; or the reason why none is needed
     admission: Admission = field(default_factory=lambda: Admission(DEFAULT_LIMITS.in_flight_bytes))
     continues_plans: bool = False  # whether a chunk continues the plan that a robot executes
-    longest_prefix: int = 0  # the most rows of that plan with which a chunk begins
+    longest_prefix: int = 0  # maximum number of rows of that plan with which a chunk may begin
 
 
 class Dialect(abc.ABC):
@@ -162,7 +163,7 @@ class Dialect(abc.ABC):
     """
 
     Config: ClassVar[type[DialectConfig]] = DialectConfig
-    clients: ClassVar[str]  # the system whose clients it serves, as named in `/docs`
+    clients: ClassVar[str]  # the system whose clients the dialect serves, as named in `/docs`
     summary: ClassVar[str] = ""  # text of `/docs` about sessions, episodes and errors
     # Modules of optional packages, without which a deployment is rejected.
     requires: ClassVar[Sequence[str]] = ()
@@ -179,8 +180,8 @@ class Dialect(abc.ABC):
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that these clients never send, one sentence each with its
-        remedy.
+        """Return a sentence, which includes the remedy, for each input of the policy that these
+        clients never send.
         """
         mapping = config.keys()
         return [] if mapping is None else mapping.lacks(contract)
@@ -191,8 +192,8 @@ class Dialect(abc.ABC):
         """Return the `paths` or the `address` at which clients connect, for the metadata."""
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
-        """Convert a client's observation, a map, to `Obs`, and return it with the instruction,
-        or None without one.
+        """Convert a client's observation, a map, to `Obs`. Return it and its instruction, which is
+        None if there is none.
         """
         if not isinstance(theirs, dict):
             raise MalformedMessage(f"observation: expected a map, got {type(theirs).__name__}")
@@ -203,7 +204,7 @@ class Dialect(abc.ABC):
         convention.
         """
         if reply.act is None:
-            raise VLAgentsError("act: answered without an action")
+            raise VLAgentsError("act: expected an action in the reply, got none")
         contract = self.context.contract
         return self.mapping.rows(reply.act.action, None if contract is None else contract.action)
 
@@ -211,7 +212,7 @@ class Dialect(abc.ABC):
 class RouteDialect(Dialect):
     """A dialect over HTTP or WebSocket, on the server's own port, in each replica."""
 
-    # "POST /act" or "WS /openpi" -> name of the method that serves the path.
+    # Name of the method that serves each path, such as "POST /act" or "WS /openpi".
     paths: ClassVar[Mapping[str, str]]
     root: ClassVar[str] = ""  # protocol at the server's root, if its clients connect there
     context: ReplicaContext
@@ -242,10 +243,10 @@ class RouteDialect(Dialect):
         return JSONResponse({"status": "ok"})
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
-        """Serve WebSockets at the server's root for all dialects with this protocol there,
-        beginning with this one.
+        """Serve WebSockets at the server's root for all dialects with this protocol there.
+        `sharing` lists them, beginning with this dialect.
         """
-        raise NotImplementedError(f"{self.name} declares a root and does not serve it")
+        raise NotImplementedError(f"{self.name} declares a root but does not serve it")
 
     def sender(self, session_id: str = "") -> Sender:
         """Return the sender of a connection or, given a session's name, of a request."""
@@ -259,14 +260,14 @@ class RouteDialect(Dialect):
         )
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
-        """Return a session of that sender, which begins without a reset by the client; by
-        default its own session.
+        """Return a session of `sender`, for which the client need not send a reset. Without a
+        `name`, it is the sender's own session.
         """
         return ImplicitSession(self.context.engine, sender, self.config.priority, name)
 
     def messages(self, socket: WebSocket) -> ChargedMessages:
-        """Return the messages of an accepted WebSocket, which are charged to the client's key. Each
-        of them needs an `admission` to be decoded.
+        """Return the messages of an accepted WebSocket, which are charged to the client's key.
+        Decoding a message requires its `admission`.
         """
         return ChargedMessages(socket, current_caller())
 
@@ -279,8 +280,8 @@ class RouteDialect(Dialect):
 
         Args:
             socket: The WebSocket.
-            answer: Answers a message, None if it is a text, and returns whether the connection
-                continues.
+            answer: Answers a message, which is None for a text message, and returns whether the
+                connection continues.
         """
         with contextlib.suppress(WebSocketDisconnect):
             async with self.messages(socket) as messages:
@@ -390,7 +391,7 @@ async def decoded(
 ) -> T:
     """Decode a message with `read`, unless it is rejected.
 
-    `data` of None is a WebSocket's text, which is rejected.
+    `data` is None for a text message of a WebSocket, which is rejected.
     """
     admission.begin_message()
     if data is None:
@@ -422,9 +423,7 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
 
 
 async def close_after_error(websocket: WebSocket, error: VLAgentsError) -> None:
-    """Close a WebSocket whose client has been told of an error, after which it must connect
-    again.
-    """
+    """Close a WebSocket after an error was sent to its client, which must then connect again."""
     if isinstance(error, PolicyUnavailable):
         await websocket.close(SERVICE_RESTART, str(error)[:120])
     else:
@@ -489,7 +488,7 @@ class ImplicitSession:
         return reply
 
     async def close(self, charge: Charge) -> None:
-        """End the session, because of the message with that charge."""
+        """End the session for a message of the client; `charge` is the charge of that message."""
         request = self._request("close", None, None, "")
         await self._sender.ask(self._sender.message(charge, "close"), Decoded([request], {}))
 
@@ -502,7 +501,7 @@ class ImplicitSession:
 
 
 class SessionObs(NamedTuple):
-    """An observation of a session, with its instruction, or None without one."""
+    """An observation of a session, and its instruction, which is None if there is none."""
 
     session: ImplicitSession
     obs: Obs
@@ -515,8 +514,8 @@ async def act_together(
     """Return the policy's reply to each observation in a client's message; their acts are queued
     together.
 
-    A session whose episode begins is reset first. One that was removed because it was idle is reset
-    again, which is safe since the observation was not acted on.
+    A session whose episode begins is reset first. A session that was removed because it was idle is
+    reset again. That is safe, since the policy has not received the observation.
 
     Raises:
         TooManyRequests: The client's key is over its rate; nothing was acted on.
@@ -556,8 +555,8 @@ async def act_together(
 
 
 async def _reset(observations: Sequence[SessionObs], charge: Charge, request_id: str) -> None:
-    """Reset the sessions of these observations, whose episodes begin with them; the charge is that
-    of the client's message.
+    """Reset the sessions of these observations, which are the first ones of their episodes.
+    `charge` is the charge of the client's message.
     """
     if not observations:
         return
@@ -588,8 +587,8 @@ async def _ask(
     instructions: Sequence[str | None],
     request_id: str,
 ) -> list[Reply]:
-    """Send a request for each observation, together; of several requests, each has a number at the
-    end of its id.
+    """Send one request for each observation, all together. If there are several requests, each id
+    ends with a number.
     """
     requests = []
     pairs = zip(observations, instructions, strict=True)
@@ -609,15 +608,16 @@ def raise_first(results: Iterable[object]) -> None:
 class HttpDialect(RouteDialect):
     """A dialect of HTTP requests.
 
-    A request without the header `x-session-id` is an episode of one step. With the header it
-    belongs to that session, in which each new instruction begins an episode, as does a request to a
-    path of `end_episode`. Errors have their status and a problem+json document.
+    A request without the header `x-session-id` is an episode of one step. With the header, the
+    request belongs to that session. A new instruction begins a new episode in the session; so does
+    the first observation after a request to a path that `end_episode` serves. The response to an
+    error has the error's status and a problem+json document.
     """
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
-        # Episodes by caller and session id in the engine. A new key with the name of a revoked one
-        # continues the sessions of that name, but not with the revoked key.
+        # Episodes by caller and session id in the engine. A new key with the name of a revoked key
+        # continues the sessions of that name; the caller is then another one.
         self._episodes: dict[tuple[Identity, str], ImplicitEpisode] = {}
 
     async def answer(
@@ -673,7 +673,7 @@ class HttpDialect(RouteDialect):
         Args:
             http: The request.
             read: Decodes the body, within a budget; may run on another thread.
-            act: Returns the body of the answer to what `read` returned.
+            act: Returns the body of the answer, from the result of `read`.
             media_type: The media type of the answer.
         """
         charge = current_charge()
@@ -706,11 +706,12 @@ class HttpDialect(RouteDialect):
         return Response(b"{}", media_type="application/json")
 
     async def client_session(self, sender: Sender, name: str) -> ImplicitSession:
-        """Return the session that a client calls `name`, for its present request; the session's
+        """Return the session that a client calls `name`, for its current request; the session's
         episode exists as long as the session exists in an engine.
 
         Args:
-            sender: The sender of that request, whose connection may be another one than before.
+            sender: The sender of that request, which may use another connection than earlier
+                requests.
             name: The client's name of the session.
         """
         sessions = self.context.engine.sessions

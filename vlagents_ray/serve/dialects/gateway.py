@@ -103,7 +103,7 @@ class Gateway:
 
 @dataclass(frozen=True, slots=True)
 class ServedPolicy:
-    """What the gateway has to know of the policy before it accepts clients."""
+    """The properties of the policy that the gateway needs before it accepts clients."""
 
     contract: Contract | None
     continues_plans: bool
@@ -121,9 +121,9 @@ def _connect(
 ) -> RemoteAgent:
     """Connect to the application for one client.
 
-    The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every
-    transport to a replica contains the key. Shared memory of a replica requires a key, which some
-    clients lack; the handle does not.
+    The gateway itself enforces the permissions of the key, in `GatewaySessions`, since not every
+    transport to a replica transmits the key. Shared memory requires a key, which some clients lack;
+    a Serve handle does not.
     """
     return RemoteAgent(
         f"serve://{app}",

@@ -3,7 +3,7 @@ and the end of connections.
 
 The middleware wraps an ASGI application, so that all of its paths, including the dialects, are
 protected in the same way. Some paths require no key: `/healthz` reports only whether the policy is
-ready, or the step of loading that it has reached, and `public` ones are pages without data. A
+ready, or the step of loading that it has reached, and the `public` paths are pages without data. A
 WebSocket is rejected before it is accepted.
 
 When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels
@@ -63,8 +63,8 @@ logger = logging.getLogger(__name__)
 
 _HEALTH = "/healthz"
 
-# Requests a second to the paths without a key: above it, each is answered as late as a refusal, as
-# it costs as much.
+# Rate of requests to the paths without a key, requests/s. Above it, the answer to each request is
+# delayed like a rejection, since it costs as much.
 _OPEN_PER_S = 20.0
 _TICK_S = 0.5  # period at which the time limit of an upload is checked
 _POLICY_VIOLATION = 1008  # WebSocket close code
@@ -98,9 +98,9 @@ class AccessMiddleware:
                 accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
-            admission: The memory in flight of the replica, which also counts incomplete messages of
+            admission: The in-flight memory of the replica, which also counts incomplete messages of
                 WebSockets.
-            shutdown: The end of the replica; by default it has none.
+            shutdown: The end of the replica; by default, the replica has no end.
             public: The paths of pages without data, which need no key.
         """
         self._app = app
@@ -258,7 +258,7 @@ async def _run_upload(
         waited_s = loop.time() - begun
         if waited_s > slow_s:
             late = MalformedMessage(
-                f"body: not here within {slow_s:g} s; is the connection that slow?"
+                f"body: did not arrive within {slow_s:g} s; is the connection that slow?"
             )
             refusal = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
         elif shutdown.is_due(waited_s):

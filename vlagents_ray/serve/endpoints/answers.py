@@ -24,7 +24,7 @@ def as_frame(message: IncomingMessage) -> bytes:
 
 
 def as_compact(message: IncomingMessage) -> bytes | None:
-    """Encode the replies in compact form; return None if they do not fit into it."""
+    """Encode the replies in compact form; return None if that form cannot represent them."""
     return write_answers(message.replies, arrived=message.arrived)
 
 
@@ -51,7 +51,9 @@ def timed(message: IncomingMessage, encode: Callable[[], T]) -> T:
 
 
 def _complete_timing(message: IncomingMessage, begun: float) -> None:
-    """Add the times of an encoding that `begun` at that time, s, and of the whole message."""
+    """Add the time of the encoding, which began at the time `begun`, s, and the time of the whole
+    message.
+    """
     ended = time.perf_counter()
     for reply in message.replies:
         reply.timing["encode_ms"] = (ended - begun) * 1e3

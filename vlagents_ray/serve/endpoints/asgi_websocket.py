@@ -5,7 +5,7 @@ has the limits, the time-outs and the end of all other WebSockets of the replica
 receives and sends messages as specified by ASGI; or an endpoint that needs no event loop accepts
 the WebSocket with a `MessageHandler` of its own.
 
-The thread is not that of the policy, which answers no ping during a call that is unexpectedly long:
+The policy's thread cannot do this, since it would answer no ping during an unexpectedly long call:
 clients of other systems end a connection after 20 s without an answer.
 """
 
@@ -49,8 +49,8 @@ from vlagents_ray.serve.queue.poller import Poller
 SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
 _WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
-# Maximum number of bytes that a client has not read when the application may send the next message,
-# and period of checking that, s.
+# Number of bytes that a client has not read, above which the application may not send the next
+# message, and the period at which this number is checked, s.
 _UNSENT_BYTES = 2**16
 _UNSENT_S = 0.01
 _NORMAL = 1000  # close code
@@ -187,7 +187,7 @@ class AsgiWebSocket:
             code, reason = INTERNAL_ERROR, "internal error"
             raise
         finally:
-            self._task = None  # the end of the connection must not cancel what runs after this
+            self._task = None  # the end of the connection must not cancel the code after this line
             if self._messages is not None and self._messages.ending is not None:
                 reason, code = self._messages.ending
             if self._connection is not None:
@@ -270,7 +270,7 @@ class _AsgiMessages(MessageHandler):
     def __init__(self, connection: WebSocketConnection, loop: asyncio.AbstractEventLoop) -> None:
         self._connection = connection
         self._loop = loop
-        # Messages, and their sizes.
+        # Pairs of a message and its size.
         self._queue: asyncio.Queue[tuple[Message, int]] = asyncio.Queue()
         self._waiting = _WaitingBytes(connection)
         self._current = -1  # size of the message that the application serves; -1 without one
@@ -297,7 +297,9 @@ class _AsgiMessages(MessageHandler):
         self._put({"type": "websocket.disconnect", "code": code}, 0)
 
     async def next(self) -> Message:
-        """Return the next message, when it is there; the application has served the one before."""
+        """Wait for the next message, and return it. The application has served the message before
+        it.
+        """
         if self._is_over:
             # Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the
             # awaited event, such as the message of a client whose key has just been revoked.
@@ -342,13 +344,13 @@ class _WaitingBytes:
         return True
 
     def remove(self, size: int) -> None:
-        """Count `size` bytes less."""
+        """Count `size` bytes as no longer waiting."""
         with self._lock:
             self._size = max(0, self._size - size)
             self._resize()
 
     def release(self) -> None:
-        """Count no bytes any more."""
+        """Count all bytes as no longer waiting."""
         with self._lock:
             self._size = 0
             self._resize()

@@ -1,5 +1,5 @@
-"""The messages of a WebSocket whose application receives requests: each is charged when it is
-taken.
+"""The messages of a WebSocket whose application receives requests: each message is charged when the
+application receives it.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class ChargedMessage(NamedTuple):
 class ChargedMessages:
     """The messages of one accepted WebSocket, as a context that ends after the last answer.
 
-    `async for` returns one after the other, until the client is gone. Messages stay unread while
-    the key of the client is over its rate. After too many rejected ones in a row, there are no
-    further messages, and the context closes the WebSocket.
+    `async for` returns one message after the other, until the client is gone. Messages stay unread
+    while the key of the client is over its rate. After too many rejected messages in a row, the
+    iteration ends, and the context closes the WebSocket.
     """
 
     def __init__(self, socket: WebSocket, caller: Identity) -> None:

@@ -26,8 +26,8 @@ _current: ContextVar[HasLeft | None] = ContextVar("vlagents_ray_client", default
 
 
 def current_client() -> HasLeft | None:
-    """Return whether the client of the current request or WebSocket has left; None if another
-    process reads the connection.
+    """Return a function that returns whether the client of the current request or WebSocket has
+    left; None if another process reads the connection.
     """
     return _current.get()
 
@@ -51,7 +51,9 @@ class HttpClient:
 
     @classmethod
     def below(cls, receive: Receive) -> HttpClient | None:
-        """Return the client of the request with this `receive`; None if uvicorn is not below."""
+        """Return the client of the request with this `receive`; None if it does not come from
+        uvicorn.
+        """
         transport = getattr(getattr(receive, "__self__", None), "transport", None)
         if transport is None or transport.get_extra_info("socket") is None:
             return None
@@ -90,7 +92,9 @@ class ClientSocket:
 
     @classmethod
     def below(cls, receive: Receive) -> ClientSocket | None:
-        """Return the socket of the WebSocket with this `receive`; None if uvicorn is not below."""
+        """Return the socket of the WebSocket with this `receive`; None if it does not come from
+        uvicorn.
+        """
         protocol: Any = getattr(receive, "__self__", None)
         transport = getattr(protocol, "transport", None)
         if transport is None or transport.is_closing():

@@ -46,7 +46,8 @@ logger = logging.getLogger(__name__)
 BACKLOG = 1024
 # Maximum number of ended connections that are closed at once; each takes about 0.01 ms.
 _ENDED_AT_ONCE = 64
-MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
+# Maximum number of unanswered messages of a client; further messages stay unread.
+MOST_UNANSWERED = 256
 POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the
 # policy's thread.
@@ -132,7 +133,9 @@ class PolledConnection(ABC):
         """
 
     def _continue(self) -> None:
-        """Poll again if no reason against it is left; called on the polling thread."""
+        """Poll the connection again if no reason for a pause is left; called on the
+        polling thread.
+        """
         if not (self._ended or self._polled or self._unpolled_for):
             self._polled = True
             self._poller.watch(self._connection, self.ready)
@@ -179,7 +182,9 @@ class PolledConnection(ABC):
         self._continue()
 
     def _throttle(self) -> bool:
-        """Pause the connection while the client's key is over its rate; return whether it is."""
+        """Pause the connection while the client's key is over its rate; return whether the key is
+        over its rate.
+        """
         if THROTTLED in self._unpolled_for:
             return True
         if self._ended:
@@ -221,7 +226,7 @@ class PolledConnection(ABC):
         """Decode a message with `read`, on another thread if that is slow or the message is
         `long`, and `submit` its requests.
 
-        An error of the other thread is passed to `reject`, one of this thread is raised.
+        An error on the other thread is passed to `reject`; an error on this thread is raised.
         """
         try:
             if long:
@@ -256,7 +261,7 @@ class PolledConnection(ABC):
         stats: MetricsBuffer,
     ) -> None:
         """Encode and send the answers of a message with `send`, and record them, on the thread of
-        the last one.
+        the last answer.
 
         An unexpected error ends this connection, and nothing else.
         """
@@ -414,7 +419,7 @@ class PolledServer(ConnectionOwner[C], ABC):
 
     @abstractmethod
     def _add_client(self, connection: socket.socket) -> None:
-        """Serve a client by `serve`, or close its connection, which is non-blocking."""
+        """Serve a client with `serve`, or close its connection, which is non-blocking."""
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
@@ -448,7 +453,7 @@ class PolledServer(ConnectionOwner[C], ABC):
             return
         except OSError as error:
             self._accepting.give_back()
-            logger.warning("a client was not let in: %s", error)
+            logger.warning("a client was not accepted: %s", error)
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._spare.close()
                 with contextlib.suppress(OSError):
@@ -463,14 +468,16 @@ class PolledServer(ConnectionOwner[C], ABC):
             connection.setblocking(False)
             self._add_client(connection)
         except Exception:
-            logger.exception("a client was not let in")
+            logger.exception("a client was not accepted")
             connection.close()
 
     def _listen_again(self) -> None:
         self.poller.watch(self._listener, self.accept)
 
     def remove(self, client: C) -> None:
-        """Remove a client whose connection is closed, and count it no longer for its key."""
+        """Remove a client whose connection is closed, and no longer count the connection for its
+        key.
+        """
         super().remove(client)
         if isinstance(client.caller, Caller):
             client.caller.hold(-1)
@@ -498,7 +505,8 @@ def time_in_socket_s(control: AncillaryData) -> float:
 
 
 def accept_open(listener: socket.socket) -> socket.socket | None:
-    """Accept the next connection that its client has not ended yet, and close those before it.
+    """Accept the next connection that its client has not ended yet, and close the ended connections
+    before it.
 
     Returns:
         The connection; None if `_ENDED_AT_ONCE` connections had ended.

@@ -1,14 +1,14 @@
-"""Requests of robots over HTTP that pass by Serve's own code.
+"""Requests of robots over HTTP that bypass Serve's own code.
 
-For each request Serve chooses a route, counts, logs, watches the client, and passes each message to
-another thread and back: half of the server's time for a request that the policy answers at once.
-`FrontMiddleware`, which runs before that code in the process of the replica, therefore gives
-`POST /v1/reset`, `/v1/act` and `/v1/close` to the replica's application at once, on the event loop
-of the HTTP server.
+For each request, Serve chooses a route, counts, logs, watches the client, and passes each message
+to another thread and back. This takes half of the server's time for a request that the policy
+answers immediately. `FrontMiddleware`, which runs before that code in the process of the replica,
+therefore passes `POST /v1/reset`, `/v1/act` and `/v1/close` directly to the replica's application,
+on the event loop of the HTTP server.
 
-Nothing of that code is lost. Load and sessions are measured by the engine; when a replica stops,
-Serve's HTTP server waits for these requests as for all others; and the request id and the end of a
-request whose client has left are below.
+Everything that Serve's code provides is kept: the engine measures load and sessions; when a replica
+stops, Serve's HTTP server waits for these requests as for all others; and this module adds the
+request id and ends a request whose client has left.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ _REQUEST_ID = REQUEST_ID_HEADER.encode()
 
 
 class DirectRequests:
-    """The requests to one application that pass by Serve, once Serve has given it a request.
+    """The requests to one application that bypass Serve, once the application has received a
+    request through Serve.
 
     Args:
-        app: The application with its access control. It is called on two event loops: on that of
-            the HTTP server for these requests, and on Serve's for all others.
+        app: The application with its access control. It is called on two event loops: the HTTP
+            server's event loop for these requests, and Serve's event loop for all others.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -39,21 +40,23 @@ class DirectRequests:
         self._prefix: str | None = None  # prefix of the application's paths; None until it is known
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request that Serve passes on, which shows the prefix of the application."""
+        """Serve a request that came through Serve, and read the prefix of the
+        application from it.
+        """
         if scope["type"] == "http":
             self._prefix = scope.get("root_path", "")
         await self._app(scope, receive, send)
 
     def takes(self, scope: Scope) -> bool:
-        """Return whether a request may pass by Serve."""
+        """Return whether a request may bypass Serve."""
         if self._prefix is None or scope["method"] != "POST":
             return False
         path: str = scope["path"]
         return path.startswith(self._prefix) and path[len(self._prefix) :] in _PATHS
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, and cancel it if its client leaves: it is then not acted on, unless a
-        batch has taken it.
+        """Serve a request, and cancel it if its client leaves. The policy then does not receive the
+        request, unless a batch already contains it.
         """
         request_id = dict(scope["headers"]).get(_REQUEST_ID, b"") or uuid.uuid4().hex.encode()
         headers = [pair for pair in scope["headers"] if pair[0] != _REQUEST_ID]
@@ -80,7 +83,9 @@ class DirectRequests:
 
 
 class _Client:
-    """The client of one request; its task is cancelled when it leaves after it has sent all."""
+    """The client of one request. If the client leaves after it has sent the whole request, the
+    request's task is cancelled.
+    """
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive
@@ -115,11 +120,13 @@ _of_this_replica: DirectRequests | None = None
 
 
 def of_this_replica() -> DirectRequests | None:
-    """Return the direct requests of this process; None if it is no replica of this package."""
+    """Return the direct requests of this process; None if the process is not a replica of this
+    package.
+    """
     return _of_this_replica
 
 
 def set_for_this_replica(requests: DirectRequests | None) -> None:
-    """Let requests to the replica of this process pass by Serve."""
+    """Let requests to the replica of this process bypass Serve."""
     global _of_this_replica  # noqa: PLW0603 - Serve creates the middleware, without arguments
     _of_this_replica = requests

@@ -44,45 +44,47 @@ _PATHS = f"""\
 `POST /v1/reset`, `POST /v1/act`
     `multipart/form-data`: a JSON part `obs` (instruction, gripper, state, info; for reset also kwargs, contract) and a
     JPEG or PNG file `cameras.<name>` for each camera; or `application/json` without cameras; or one frame,
-    `{CONTENT_TYPE}`. The answer is JSON, or a frame if `Accept` asks for it. Images are upright RGB. A server cannot
+    `{CONTENT_TYPE}`. The answer is JSON, or a frame if `Accept` requests one. Images are upright RGB. A server cannot
     detect swapped colours: convert OpenCV's BGR with `image[..., ::-1]` before it is sent as an array (`cv2.imencode`
-    takes BGR as it is), and let `vlagents-ray robot check` compare the colours of a card.
+    takes BGR as it is), and let `vlagents-ray robot check` compare the colours of a test card.
 `POST /v1/close`
     Ends the session.
 `WS /v1/stream`
     Binary frames; sessions end with the connection. A message that begins with `VLA?` is a probe.
 `GET /v1/metadata`
-    Policy, checkpoint, contract, protocol version, every way in.
+    Policy, checkpoint, contract, protocol version, and all addresses.
 `GET /healthz`
     200 when the policy can act, 503 until then.
 """
 _HEADERS = f"""\
 `{PRIORITY_HEADER}`
-    `robot` (the default, goes first) or `simulation`.
+    `robot` (the default) or `simulation`. Requests of robots are served first.
 `{DEADLINE_HEADER}`
-    After which an answer is useless (504: with `deadline_exceeded` the request was not acted on and never will be, with
-    `outcome_unknown` the policy was at work on it).
+    Time in milliseconds after which an answer is useless. The request then returns 504. With the code
+    `deadline_exceeded`, the policy has not received the request and never will; with `outcome_unknown`, the policy was
+    processing it.
 `{STEP_HEADER}`
-    Stands in each answer. Sent back with the next request of the session, it keeps that from any other state of it (404
-    `unknown_session`), such as an episode that was left at another replica.
+    Each answer contains this header. If you send its value with the next request of the session, that request is
+    rejected (404 `unknown_session`) unless the session is still in this state. Otherwise, the request could reach an
+    older episode of the session at another replica.
 `{REQUEST_ID_HEADER}`
-    Comes back with the answer and stands in the server's log.
+    Id of a request. The answer and the server's log contain the same id.
 """
 _TIMING = """\
 `decode_ms`
-    The request, whose last byte is here, out of its bytes.
+    Decoding of the request, after its last byte has arrived.
 `queue_ms`
     Waiting for the policy.
 `inference_ms`
-    The batch that it was in, until the device was done.
+    Computation of the batch that contains the request, until the device has finished.
 `encode_ms`
-    The answer into bytes.
+    Encoding of the answer.
 `total_ms`
-    All of that and what lies between, on the server.
+    Total time on the server, including the time between these stages.
 `batch_size`
-    Observations in that batch; no time.
+    Number of observations in that batch (not a time).
 `round_trip_ms`, `wire_ms`
-    Added by our client: the whole, and what of it was not the server's.
+    Added by the client of vlagents_ray: the duration of the whole call, and the part of it outside the server.
 """
 
 
@@ -109,19 +111,19 @@ def docs_page(metadata: dict[str, Any]) -> str:
 <h1>{policy}</h1>
 <p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
 Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:
-<code>reset</code> begins an episode, <code>act</code> gives the next action or chunk of actions.</p>
-<p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
+<code>reset</code> begins an episode, <code>act</code> returns the next action or chunk of actions.</p>
+<p>If the server requires an API key, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
 <h2>With curl</h2><pre>{html.escape(_CURL)}</pre>
 <h2>With Python</h2><pre>{html.escape(_PYTHON)}</pre>
 <h2>Paths</h2>{_entries(_PATHS + parts)}
-<p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
+<p>A replica that stops hands its sessions over to another replica: the next request with the same session id continues the episode.</p>
 <h2>Headers</h2>{_entries(_HEADERS)}
-{"<h2>Clients of other systems, as they are</h2>" + _entries(dialects) if dialects else ""}
-<h2>Timing</h2><p>The answer to <code>act</code> says where the milliseconds went, in <code>timing</code>:</p>
+{"<h2>Unchanged clients of other systems</h2>" + _entries(dialects) if dialects else ""}
+<h2>Timing</h2><p>The answer to <code>act</code> contains these durations in <code>timing</code>:</p>
 {_entries(_TIMING)}
 <h2>Metrics</h2>
-<p>Prometheus reads them at the metrics port of each Ray node, as <code>ray_vlagents_…</code>: requests by op,
-transport, priority and outcome, latency, time by stage, batch sizes, queue depth, sessions by transport, utilisation.</p>
+<p>Prometheus reads the metrics at the metrics port of each Ray node, as <code>ray_vlagents_…</code>: requests by op,
+transport, priority and outcome; latency; time by stage; batch sizes; queue depth; sessions by transport; utilisation.</p>
 <h2>Errors</h2><p><code>application/problem+json</code> with a stable <code>code</code>:</p>
 {_entries(errors)}
 <h2>This policy</h2><pre>{html.escape(json.dumps(metadata, indent=2))}</pre>

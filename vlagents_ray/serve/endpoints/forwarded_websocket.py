@@ -1,8 +1,7 @@
-"""WebSockets whose messages another process passes on, so that there is no socket to take.
-
-That is so behind Serve's own proxy, which a cluster uses without HAProxy. The proxy receives whole
-messages of at most 16 MiB; here a WebSocket ends if its client is silent or reads too slowly, if
-its key becomes invalid, and with its replica.
+"""WebSockets whose messages another process forwards, so that this process has no socket of the
+client. This is the case behind Serve's own proxy, which a cluster uses without HAProxy. The proxy
+receives whole messages of at most 16 MiB; here a WebSocket ends if its client is silent or reads
+too slowly, if its key becomes invalid, and with its replica.
 """
 
 from __future__ import annotations
@@ -49,7 +48,8 @@ class ForwardedWebSocket:
         self._shutdown = shutdown
         self._loop = asyncio.get_running_loop()
 
-        self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()  # read ahead
+        # Messages that the application has not received yet.
+        self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()
         # Start of the wait for the next message, s; None if there is no wait.
         self._silent_since: float | None = None
         # Start of the current sending, s; None if there is none.
@@ -136,7 +136,7 @@ class ForwardedWebSocket:
         self._sending_since = None
 
     def _silent_s(self) -> float:
-        """Return for how long the application has waited for a message, s; 0 while it acts."""
+        """Return how long the application has waited for a message, s; 0 while it acts."""
         return 0.0 if self._silent_since is None else self._loop.time() - self._silent_since
 
     def _close_cause(self) -> tuple[int, str] | None:
@@ -145,7 +145,7 @@ class ForwardedWebSocket:
             self._sending_since is not None
             and self._loop.time() - self._sending_since > self._slow_s
         ):
-            return _POLICY_VIOLATION, "replies are not taken"
+            return _POLICY_VIOLATION, "the client does not read its replies"
         if self._silent_s() > self._idle_s:
             return _GOING_AWAY, "silent for too long"
         refusal = self._caller.refusal() if isinstance(self._caller, Caller) else None

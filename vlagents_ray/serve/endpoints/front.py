@@ -23,9 +23,9 @@ def middlewares() -> list[Middleware]:
 class FrontMiddleware:
     """Rejects headers that are not UTF-8, which Serve decodes.
 
-    Lets requests of robots pass by Serve, see `DirectRequests`, and the application take the socket
-    of a WebSocket, see `ClientSocket`, or ask whether the client of a request has left, see
-    `HttpClient`.
+    Lets requests of robots bypass Serve (see `DirectRequests`). Lets the application take the
+    socket of a WebSocket (see `ClientSocket`), or check whether the client of a request has left
+    (see `HttpClient`).
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -66,8 +66,8 @@ def build_http_app(
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         more: The routes of dialects and of parts, see `vlagents_ray.serve.dialects` and
             `vlagents_ray.serve.replica.part`.
-        direct: The replica's own port, which answers to reset and act name; None if clients of this
-            application may not use it.
+        direct: The replica's own port, whose address is in the answers to reset and act; None if
+            clients of this application may not use it.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata, direct)
 
@@ -99,8 +99,8 @@ class _HttpEndpoint:
     direct: messages.StreamAddress | None
 
     async def health(self, http: HttpRequest) -> Response:
-        """Reply whether the policy is ready, or its step of loading, and nothing else: this path
-        needs no key.
+        """Reply whether the policy is ready, or which step of loading it has reached. This path
+        needs no key, so the reply contains nothing else.
         """
         try:
             ready = await asyncio.wait_for(
@@ -118,7 +118,9 @@ class _HttpEndpoint:
         return http_messages.problem_response(unready, http_messages.request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
-        """Reply with the metadata, or with those for a caller on the machine that it names."""
+        """Reply with the metadata, or with the metadata for a caller on the machine that the
+        request names.
+        """
         machine = http.headers.get(messages.MACHINE_HEADER)
         if machine and self.machine_metadata is not None and self.engine.health.ready:
             return JSONResponse(plain_values(await self.machine_metadata(machine)))
@@ -157,8 +159,8 @@ class _HttpEndpoint:
                     caller=current_caller(),
                     has_left=current_client(),
                     connected=False,
-                    # A document in JSON cannot ask for it. The hash leads its client to a replica
-                    # that joins.
+                    # A JSON document cannot request a reconnection. If a replica joins, HAProxy's
+                    # hash of the session leads such a client to it.
                     can_move=http_messages.accepts_frames(headers),
                 )
                 priority = headers.get(messages.PRIORITY_HEADER, "robot")
@@ -208,7 +210,7 @@ class _HttpEndpoint:
         )
 
     async def _stream_forwarded(self, socket: WebSocket) -> None:
-        """Serve a WebSocket whose messages another process passes on."""
+        """Serve a WebSocket whose messages another process forwards."""
         caller = current_caller()
         sender = Sender(
             self.engine, "websocket", caller=caller, has_left=current_client(), can_move=True

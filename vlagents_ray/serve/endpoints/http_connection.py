@@ -66,7 +66,7 @@ _INLINE_FORM_BYTES = 2**20
 # costs as much as one of a kilobyte.
 _CHUNKED_BYTES = 16 * 1024
 # Maximum number of bytes around the chunks: the heads of chunks, their extensions, and trailers.
-# This is a constant and a part of the size of the body.
+# The maximum is the first number plus this share of the body's size.
 _FRAMING_BYTES, _FRAMING_SHARE = 16 * 1024, 1 / 64
 _MOST_REFUSED_S = 1.0  # maximum time for which the refusal of a first request is delayed
 _REFUSED = "its request is refused"  # a further reason for not polling a connection
@@ -95,7 +95,7 @@ class HttpHead:
     version: str = "1.1"
     is_chunked: bool = False
     fields: list[tuple[bytes, bytes]] = field(default_factory=list)
-    http: HttpRequest = field(init=False)  # the same for the decoders
+    http: HttpRequest = field(init=False)  # the head in the form that the decoders need
 
     @property
     def headers(self) -> dict[str, str]:
@@ -109,7 +109,7 @@ class HttpHead:
 
     @property
     def waits(self) -> bool:
-        """Whether the client sends the body after a "100 Continue" only."""
+        """Whether the client sends the body only after a "100 Continue"."""
         return self.version != "1.0" and self.headers.get("expect", "").lower() == "100-continue"
 
 
@@ -119,7 +119,7 @@ class _Reading:
     def __init__(self) -> None:
         self.head = HttpHead()
         self.body = bytearray()  # received part of a chunked body
-        self.fed = 0  # number of bytes that were received for it
+        self.fed = 0  # number of bytes that the parser of the body has received
         self.has_head = False  # whether the head is complete
         self.is_complete = False
         self.has_next = False  # whether bytes of another request followed
@@ -137,7 +137,7 @@ class _Reading:
         self.has_head = True
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        if not self.has_head:  # neither a trailer nor of the next request
+        if not self.has_head:  # not a trailer or a header of the next request
             self.head.fields.append((name.lower(), value))
 
     def on_body(self, data: bytes) -> None:
@@ -152,7 +152,7 @@ def read_head(data: bytes) -> _Reading:
     """Parse the head of a request.
 
     Raises:
-        MalformedMessage: It is not HTTP, or a header is not UTF-8.
+        MalformedMessage: The bytes are not HTTP, or a header is not UTF-8.
     """
     reading = _Reading()
     parser = httptools.HttpRequestParser(reading)
@@ -184,7 +184,7 @@ def read_head(data: bytes) -> _Reading:
     return reading
 
 
-@lru_cache(maxsize=64)  # a client sends the same few
+@lru_cache(maxsize=64)  # a client sends the same few URLs
 def _path_of(url: str) -> str:
     """Return the path of a request's target, which may be a whole URL, without the query."""
     try:
@@ -220,7 +220,7 @@ class HttpServer(PolledServer[MessageConnection]):
     def identify_request(
         self, headers: Mapping[str, str], known: tuple[Identity, str | None] | None = None
     ) -> tuple[Identity, str | None]:
-        """Return the owner of the key in the headers, and that key.
+        """Return the caller that owns the key in the headers, and the key.
 
         Args:
             known: The result for the connection's last request, to be returned if the key is the
@@ -233,7 +233,8 @@ class HttpServer(PolledServer[MessageConnection]):
 
     @abstractmethod
     def count_connection(self, client: MessageConnection, caller: Identity) -> None:
-        """Count the connection for its caller, and no longer as one whose caller is unknown.
+        """Count the connection for its caller, and no longer as a connection with an unknown
+        caller.
 
         Raises:
             TooManyRequests: The key has as many connections as it may hold sessions, or is over its
@@ -243,15 +244,15 @@ class HttpServer(PolledServer[MessageConnection]):
 
     @abstractmethod
     def op_of(self, path: str) -> Op | None:
-        """Return the operation that a path names, below the unguessable path of this server; None
-        for any other path.
+        """Return the operation of a path below this server's unguessable path; None for any other
+        path.
         """
 
 
 class HttpConnection(MessageConnection):
     """One HTTP connection of the replica's own port.
 
-    It takes the place of the connection that has read its first head.
+    It replaces the `PortConnection` that has read the head of its first request.
     """
 
     late_code = _TIMEOUT
@@ -272,10 +273,10 @@ class HttpConnection(MessageConnection):
         self._key: str | None = None  # key of the caller
 
         self._head = b""  # received part of a head
-        self._reading: _Reading | None = None  # request whose body arrives
-        self._left = 0  # number of bytes of its body that have not arrived; -1: it has chunks
-        self._parts: list[bytes] = []  # received parts of its body
-        self._size = 0  # number of bytes in them
+        self._reading: _Reading | None = None  # request whose body is arriving
+        self._left = 0  # number of missing bytes of that body; -1 if the body has chunks
+        self._parts: list[bytes] = []  # received parts of that body
+        self._size = 0  # number of bytes in these parts
         self._is_dropped = False  # whether the body is discarded, as the request is rejected
         self._answering: HttpHead | None = None  # request whose answer is awaited
         self._request_id = ""  # request id of that request, in the headers of its answer
@@ -303,7 +304,7 @@ class HttpConnection(MessageConnection):
             super()._read()
 
     def _read_early(self) -> None:
-        """Leave bytes that arrive before an answer is sent in the socket, and notice the end of
+        """Leave bytes in the socket that arrive before the answer is sent, and notice the end of
         the connection.
         """
         try:
@@ -349,14 +350,14 @@ class HttpConnection(MessageConnection):
             self.begin(b"" if is_too_long else head)
 
     def take_over(self, head: bytes) -> None:
-        """Serve the first request, whose head another object has read, as `begin` does; an
-        unexpected error ends this connection.
+        """Serve the first request, whose `head` was read before this object existed; see `begin`.
+        An unexpected error ends this connection.
         """
         self._run(partial(self.begin, head))
 
     def begin(self, head: bytes) -> None:
-        """Serve a request whose whole head has arrived; without bytes, reject a head that is too
-        long.
+        """Serve a request whose whole head has arrived; an empty `head` stands for a head that is
+        too long, which is rejected.
         """
         try:
             if not head:
@@ -468,7 +469,7 @@ class HttpConnection(MessageConnection):
             self._complete()
 
     def _receive_body(self, data: bytes | memoryview) -> None:
-        """Process bytes of a body, which are at most its rest unless it is chunked."""
+        """Process bytes of a body. Unless the body is chunked, no byte lies beyond its end."""
         reading = self._reading
         if reading is None:
             return
@@ -501,7 +502,7 @@ class HttpConnection(MessageConnection):
         if self._size > limit:
             self._end_request(MessageTooLarge(f"body: over {limit} bytes, the limit"))
         elif reading.is_complete:
-            # The next request has been read partly; its client sends it again.
+            # A part of the next request has been read; its client must send it again.
             reading.head.is_kept = reading.head.is_kept and not reading.has_next
             self._parts = [bytes(reading.body)]
             self._complete()
@@ -560,7 +561,7 @@ class HttpConnection(MessageConnection):
             caller=caller,
             has_left=self.has_left,
             connected=False,
-            # The end of the connection asks for it, even if the answer is JSON.
+            # The end of the connection requests it, even if the answer is JSON.
             can_move=True,
         )
         priority = head.headers.get(PRIORITY_HEADER, "robot")
@@ -601,13 +602,13 @@ class HttpConnection(MessageConnection):
             self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
-            # For TCP, the kernel records the time of the last segment, which may be the one that
-            # says that the client has left.
+            # For TCP, the kernel records the time of the last segment, which may be the segment
+            # that ends the client's connection.
             may_have_waited=True,
         )
 
     def deliver(self, message: IncomingMessage) -> None:
-        """Send the answer of a request, and read on."""
+        """Send the answer of a request, and continue reading."""
         self.send_answers(message, self._send_answer, self._engine.stats)
         self.remove_unanswered(message.size)
 
@@ -626,7 +627,7 @@ class HttpConnection(MessageConnection):
         except VLAgentsError as error:
             response = http_messages.problem_response(error, self._name)
         self._answering = None
-        # A client that has to move goes back to the server's port.
+        # A client that has to reconnect uses the server's port again.
         is_kept = head.is_kept and not any(reply.draining for reply in message.replies)
         if is_kept:
             self._send_response(response, head)
@@ -654,8 +655,8 @@ class HttpConnection(MessageConnection):
     # The end.
 
     def _end_sessions(self) -> None:
-        """Withdraw the request that no batch has taken, and drop one that is incomplete; sessions
-        of HTTP outlive a connection.
+        """Withdraw a request that no batch contains yet, and drop an incomplete request. Sessions
+        over HTTP outlive a connection.
         """
         self._parts, self._reading = [], None
         self._release_arriving()
@@ -664,7 +665,7 @@ class HttpConnection(MessageConnection):
             sender.release()
 
     def _send_close(self, code: int, reason: str) -> None:
-        """Answer the request that is incomplete or unanswered, and end the connection."""
+        """Answer an incomplete or unanswered request with an error, and end the connection."""
         if self._is_closed_here:
             return
         self._ended_at = time.monotonic()
@@ -686,7 +687,7 @@ class HttpConnection(MessageConnection):
 def _bytes_of(
     response: Response, head: HttpHead | None, request_id: str, *, is_kept: bool
 ) -> bytes:
-    """Return a response as bytes; the request may have had no readable head."""
+    """Return a response as bytes; `head` is None if the request's head was unreadable."""
     reason = http.HTTPStatus(response.status_code).phrase
     lines = [
         f"HTTP/1.1 {response.status_code} {reason}\r\ndate: {_date(int(time.time()))}".encode()

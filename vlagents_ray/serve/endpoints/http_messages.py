@@ -60,9 +60,9 @@ logger = logging.getLogger(__name__)
 # Longer JSON or msgpack is decoded on another thread, to keep the event loop responsive.
 LONG_BYTES = 512 * 1024
 DROPPED_BYTES = 2**20  # a connection is closed after a rejected request with a longer body
-# Time before a caller without a right key is answered, s. Without it, eight connections that send
-# nothing but wrong keys double the time of a robot's act on two cores, and the bodies of their
-# requests take all of the bandwidth; a person with a wrong key does not notice it.
+# Delay of the answer to a caller without a valid key, s. Without this delay, eight connections that
+# send only wrong keys double the time of a robot's act on two cores, and the bodies of their
+# requests take the whole bandwidth. A person with a wrong key does not notice the delay.
 REFUSAL_S = 0.05
 FORM_TYPE = "multipart/form-data"
 _POLICY_VIOLATION = 1008  # WebSocket close code
@@ -115,7 +115,7 @@ def body_of(op: Op, http: HttpRequest, data: bytes, admission: MessageAdmission,
 
     receiving = receive_body(op, HttpRequest(http.scope, receive), admission, name)
     try:
-        # It waits only for bytes, as forms are kept in memory.
+        # The coroutine waits only for bytes, since forms are kept in memory.
         receiving.send(None)
     except StopIteration as ended:
         body: Body = ended.value
@@ -147,7 +147,7 @@ _Decoder: TypeAlias = Callable[[Budget], Request | Decoded]
 
 
 def _decoder(op: Op, content_type: str, data: bytes) -> tuple[_Decoder, bool]:
-    """Return the decoder of a body that is no form, and whether that is long."""
+    """Return the decoder of a body that is not a form, and whether the body is long."""
     if data.startswith(_GZIP):
         raise MalformedMessage("body: expected it uncompressed, got gzip; send it as it is")
     if content_type == CONTENT_TYPE:
@@ -163,11 +163,11 @@ def _decoder(op: Op, content_type: str, data: bytes) -> tuple[_Decoder, bool]:
 def _body(
     op: Op, http: HttpRequest, limits: MessageLimits, name: str, read: _Decoder, is_long: bool
 ) -> Body:
-    """Return a body whose requests also have what the headers say."""
+    """Return a body whose decoded requests also contain the settings in the headers."""
     headers = headers_of(http.scope)
 
     def read_with_headers(budget: Budget) -> Decoded:
-        """Decode the requests, and add to them what the headers say."""
+        """Decode the requests, and add the settings in the headers."""
         content = read(budget)
         decoded = Decoded([content], {}) if isinstance(content, Request) else content
         _read_headers(op, decoded.requests, headers, name, limits)
@@ -227,7 +227,7 @@ def _read_headers(
 
 
 class _FormParser(MultiPartParser):
-    """A parser that keeps all files in memory, which counts as part of the memory in flight."""
+    """A parser that keeps all files in memory; this memory counts as in-flight memory."""
 
     spool_max_size = sys.maxsize
 
@@ -344,8 +344,8 @@ def _require_uncompressed(http: HttpRequest) -> None:
 
 
 def headers_of(scope: Scope) -> dict[str, str]:
-    """Return the headers of a request by lower-case name, decoded once; of equal names the last
-    one counts.
+    """Return the headers of a request by lower-case name, decoded once; if a name occurs more than
+    once, the last value counts.
     """
     headers: dict[str, str] | None = scope.get(_HEADERS)
     if headers is None:
@@ -358,8 +358,8 @@ def headers_of(scope: Scope) -> dict[str, str]:
 
 
 def session_id(http: HttpRequest) -> str:
-    """Return the session id, which every request must have in its header; raise
-    `MalformedMessage` without one.
+    """Return the session id, which every request must have in its header; raise `MalformedMessage`
+    if it is missing.
     """
     name = headers_of(http.scope).get(SESSION_HEADER, "")
     if not name or not is_name(name):
@@ -393,9 +393,7 @@ def _step(text: str) -> int:
 
 
 def request_id(http: HttpRequest) -> str:
-    """Return the request id from the caller or, without one, from Serve, which returns it in a
-    header.
-    """
+    """Return the request id in the header, which Serve adds if the caller has sent none."""
     return valid_request_id(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
 
 

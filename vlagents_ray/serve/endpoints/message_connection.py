@@ -1,9 +1,9 @@
 """A TCP connection whose messages arrive in parts: their limits, and the end of the connection.
 
 WebSockets (`websocket_connection`) and HTTP connections (`http_connection`) differ in how a message
-begins and ends. What they have in common is here: incomplete messages count as part of the memory
-in flight, and have to arrive in time; unanswered ones stop the reading; and a connection that ends
-discards bytes that still arrive, so that its client can read the reason.
+begins and ends. This module contains what they have in common: incomplete messages count as
+in-flight memory, and have to arrive in time; too many unanswered messages stop the reading; and a
+connection that ends discards bytes that still arrive, so that its client can read the reason.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 logger = logging.getLogger(__name__)
 
 READ_BYTES = 1024 * 1024  # maximum size of a read; room for a message with two or three raw images
-# Maximum number of parts that are read from a connection before others have their turn.
+# Maximum number of parts that are read from a connection before other connections are read.
 _PARTS_PER_READ = 16
 _DISCARD_BYTES = 64 * 1024  # maximum size of a read after the end
 # Maximum number of bytes that are discarded after the end, and maximum time, s, in which a client
 # must close its connection.
 _MOST_DISCARDED_BYTES = 8 * STREAM_BYTES
 _CLOSING_S = 5.0
-# Maximum rate of discarding, of all connections together: above it, a client waits. At full speed,
-# 32 connections take a quarter of a core.
+# Maximum rate of discarding, of all connections together: above this rate, a client waits. At full
+# speed, 32 connections take a quarter of a core.
 _DISCARDED_BYTES_PER_S = 64 * 2**20
 _DISCARDING = "too many bytes are discarded"  # a further reason for not polling a connection
-# Close codes of WebSockets, and what they mean for other connections.
+# Close codes of WebSockets, which other connections translate to their own errors.
 GOING_AWAY, TRY_AGAIN_LATER = 1001, 1013
 
 read_buffer = ReadBuffer(READ_BYTES)
@@ -69,11 +69,11 @@ class MessageConnection(PolledConnection):
         idle_s: float,
         answer_bytes: int = STREAM_BYTES,
     ) -> None:
-        """Create a connection that is read once it is `owner.serve`d.
+        """Create a connection, which is read after `owner.serve`.
 
         Args:
-            admission: The memory in flight of the replica, as part of which incomplete messages
-                count; None without a replica.
+            admission: The in-flight memory of the replica, which includes incomplete messages; None
+                without a replica.
             slow_s: Maximum time that a message may take to arrive, s.
             idle_s: Maximum time that the connection may be silent, s.
             answer_bytes: Number of unsent bytes above which a client that reads slowly is cut off.
@@ -99,12 +99,12 @@ class MessageConnection(PolledConnection):
         self._discarded = 0  # number of bytes that were discarded after the end
 
         # Only `overdue` uses these.
-        self._count_before = 0  # number of messages at its last call
+        self._count_before = 0  # number of messages at the last call of `overdue`
         self._quiet_since = time.monotonic()  # time of the last message or answer, s
         self._part_since = float("inf")  # arrival time of the current partial message, s
         self._alive_at = time.monotonic()  # time of the last bytes, s
 
-    # What a protocol defines.
+    # Methods that each protocol defines.
 
     @property
     @abstractmethod
@@ -117,9 +117,9 @@ class MessageConnection(PolledConnection):
 
     @abstractmethod
     def _receive_bytes(self, data: bytes | memoryview) -> bool:
-        """Process received bytes, none of which means that the connection has ended.
+        """Process received bytes; empty `data` means that the connection has ended.
 
-        Return whether more may be read now.
+        Return whether further bytes may be read now.
         """
 
     @property
@@ -137,7 +137,7 @@ class MessageConnection(PolledConnection):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of bytes that the client has not read yet, beyond what the kernel holds."""
+        """Number of unsent bytes, which do not include the bytes in the kernel's buffer."""
         return self._out.unsent_bytes
 
     def add_unanswered(self, size: int) -> None:
@@ -147,8 +147,8 @@ class MessageConnection(PolledConnection):
             self._unanswered_bytes += size
 
     def remove_unanswered(self, size: int) -> None:
-        """Count a message as answered, and read again if only such messages prevented that; may
-        be called on any thread.
+        """Count a message as answered, and read again if only unanswered messages prevented
+        reading; may be called on any thread.
         """
         with self._sending:
             self._unanswered -= 1
@@ -174,7 +174,7 @@ class MessageConnection(PolledConnection):
             parts += 1
 
     def _read_part(self) -> bool:
-        """Read a part of a message; return whether more may be read now."""
+        """Read a part of a message; return whether further bytes may be read now."""
         if self._is_rated and self._throttle():
             return False
 
@@ -213,10 +213,8 @@ class MessageConnection(PolledConnection):
             self._call_later(wait_s, lambda: self._resume(_DISCARDING))
 
     def count_bytes(self) -> ArrivingBytes | None:
-        """Return a count of bytes that wait in this connection, as part of the memory in flight;
-        None without a replica.
-
-        The connection is ended if a complete message needs the memory.
+        """Return a counter of bytes that wait in this connection, as part of the in-flight memory;
+        None without a replica. The connection is ended if a complete message needs the memory.
         """
         if self._admission is None:
             return None
@@ -248,7 +246,7 @@ class MessageConnection(PolledConnection):
         self._call_soon(lambda: self.end(reason, TRY_AGAIN_LATER))
 
     def _release_arriving(self) -> None:
-        """Count no incomplete message any more."""
+        """Stop counting the bytes of an incomplete message."""
         if self._arriving is not None:
             self._arriving.release()
 
@@ -260,7 +258,7 @@ class MessageConnection(PolledConnection):
         """Return a reason and a close code if the connection is too slow or has to end; see
         `PolledConnection`.
 
-        A connection that has been closed, and that its client leaves open, is cut off.
+        A connection that this side has closed is cut off if its client leaves it open.
 
         Time counts against the client only if the server has read all bytes that arrived: a slow
         policy keeps the thread from reading.
@@ -304,8 +302,8 @@ class MessageConnection(PolledConnection):
         return self._ended_at != float("inf")
 
     def silent_s(self, now: float) -> float:
-        """Return for how long the client has sent no message at `now`, s, of `time.monotonic`;
-        0 while messages are unanswered.
+        """Return how long the client has sent no message at `now`, s, of `time.monotonic`; 0 while
+        messages are unanswered.
         """
         return now - self._quiet_since
 

@@ -4,11 +4,11 @@ thread.
 Large messages are not copied, and a client that reads slowly delays no other client.
 
 The metadata contains the port and an unguessable path, so that only clients that may read the
-metadata can use the port; with API keys, a handshake or a request must also contain one. Messages
-of WebSockets are those of `WS /v1/stream` on the server's port, requests of HTTP those of
-`POST /v1/act`; both remain for clients that cannot reach this one. As for local clients, the
-policy thread reads the sockets (see `vlagents_ray.serve.endpoints.connection`) and decodes the
-messages.
+metadata can use the port; on a server with API keys, a handshake or a request must also contain a
+key. The messages of WebSockets are the same as at `WS /v1/stream` on the server's port, and the
+HTTP requests are the same as at `POST /v1/act`. Clients that cannot reach this port use the
+server's port. As for local clients, the policy thread reads the sockets (see
+`vlagents_ray.serve.endpoints.connection`) and decodes the messages.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ logger = logging.getLogger(__name__)
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
-# The head of a WebSocket's handshake; all others are of HTTP requests.
+# The head of a WebSocket's handshake; any other head belongs to an HTTP request.
 _HANDSHAKE = re.compile(rb"\AGET .*\r\nupgrade:[ \t]*websocket\b", re.IGNORECASE | re.DOTALL)
 _REFUSED = "its handshake is refused"  # a further reason for not polling a connection
 
@@ -122,7 +122,7 @@ class OwnPortServer(HttpServer):
         """Return the owner of the handshake's key, and count one more connection for that key.
 
         Raises:
-            UnknownApp: The path is another one.
+            UnknownApp: The path is wrong.
             VLAgentsError: The errors of `identify_request` and `count_connection`.
         """
         if not secrets.compare_digest(request.path.encode(), self.path.encode()):
@@ -164,7 +164,7 @@ class OwnPortServer(HttpServer):
         return next((op for op in messages.OPS if is_known and op == name), None)
 
     def serve_http(self, client: PortConnection, connection: socket.socket, head: bytes) -> None:
-        """Serve a connection whose first head is that of an HTTP request; without bytes, the head
+        """Serve a connection whose first head belongs to an HTTP request; the head is empty if it
         is too long.
         """
         successor = HttpConnection(self, connection)
@@ -206,11 +206,13 @@ class PortConnection(WebSocketConnection):
         self._server = server
         self._head = b""  # received part of the handshake
         self._opened_at = time.monotonic()
-        # Time after which the handshake is no longer over the rate of its key.
+        # Time after which the key of the handshake is no longer over its rate.
         self._refused_for_s = 0.0
 
     def _bytes_to_read(self) -> int:
-        """Return how many bytes to read now: at most the handshake, and then at most one frame."""
+        """Return how many bytes to read now: first at most the handshake, and then at most one
+        frame.
+        """
         if self._handler is not None:
             return super()._bytes_to_read()
 
@@ -316,5 +318,5 @@ def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:
         else:
             return listener
     raise ConfigError(
-        f"stream: cannot listen at {host}, ports {first} to {last} ({refusal}); choose other ones"
+        f"stream: cannot listen at {host}, ports {first} to {last} ({refusal}); choose other ports"
     )

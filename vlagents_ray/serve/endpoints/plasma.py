@@ -1,17 +1,17 @@
 """The endpoint for processes of the Ray cluster on this node: frames in mutable plasma objects.
 
 The replica keeps a pool of observation channels (mutable objects, on which Ray's `Channel` is
-built) and leases them to clients. A client writes its frames into one as raw bytes, so that nothing
-is unpickled and the client may use another version of numpy. The rest is
-`vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a frame, the policy thread
-reads the frame and replies, and the end of the connection, whatever its cause, returns the channel
-to the pool.
+built) and leases them to clients. A client writes its frames into a channel as raw bytes, so that
+nothing is unpickled and the client may use another version of numpy. The module
+`vlagents_ray.serve.endpoints.shm` does the rest: a message on a Unix socket announces a frame, the
+policy thread reads the frame and replies, and the end of the connection, whatever its cause,
+returns the channel to the pool.
 
 A socket accompanies the channel because Ray's readers wait by polling (an idle `Channel.read` takes
 one CPU, with a timeout or without) and do not notice the death of the writer. The channels are
 pooled because Ray frees a channel's memory only when all processes that registered as its readers
-or writers have ended. The socket is in Ray's own folder, beside the object store's, so that it is
-reachable wherever the store is, including other network namespaces.
+or writers have ended. The socket is in Ray's own folder, next to the socket of the object store. It
+is therefore reachable wherever the store is, including other network namespaces.
 """
 
 from __future__ import annotations
@@ -63,10 +63,11 @@ class Channel:
         there is none.
         """
         content = self._take()
-        # Ray's parser below trusts its input, so that a frame of another program is rejected here.
+        # Ray's parser below trusts its input, so a frame of another program is rejected here.
         if content.metadata != PlasmaAddress.TAG:
             raise MalformedMessage(
-                "plasma: what the channel holds is no frame; is this a client of vlagents_ray?"
+                "plasma: expected a frame in the channel, got other data; is this a client of "
+                "vlagents_ray?"
             )
         return np.frombuffer(b"".join(private.channel_pieces(content.data)), np.uint8)
 
@@ -143,7 +144,9 @@ class Pool:
         return key, channel.capacity
 
     def claim(self, key: bytes) -> Channel:
-        """Return the leased channel `key`, which then belongs to the connection that named it."""
+        """Return the leased channel `key`, which then belongs to the connection that has sent the
+        key.
+        """
         with self._lock:
             channel = self._leased.pop(key, None)
         if channel is None:
@@ -177,9 +180,10 @@ class Pool:
             if self._bytes + capacity > _SHARE * store_bytes:
                 raise MessageTooLarge(
                     f"plasma: no room for a channel of {capacity} bytes: this node's object store "
-                    f"has {store_bytes:.0f}, a replica's channels may take {_SHARE:.0%} of it and "
-                    f"take {self._bytes}; start Ray with a larger object_store_memory (`ray start "
-                    "--object-store-memory BYTES`), or use transport 'shm'"
+                    f"has {store_bytes:.0f} bytes, of which a replica's channels may take "
+                    f"{_SHARE:.0%}, and they already take {self._bytes} bytes; start Ray with a "
+                    "larger object_store_memory (`ray start --object-store-memory BYTES`), or use "
+                    "transport 'shm'"
                 )
             self._bytes += capacity
 
@@ -210,7 +214,7 @@ class PlasmaServer(UnixServer):
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
     def open(self) -> None:
-        """Listen, then give the socket its name; remove the sockets of killed replicas."""
+        """Listen, and then give the socket its file name. Remove the sockets of killed replicas."""
         for other in self._path.parent.glob("vla????????"):
             _remove_if_dead(other)
         hidden = self._path.with_name(f".{self._path.name}")
@@ -270,5 +274,5 @@ def _remove_if_dead(path: Path) -> None:
             probe.connect(str(path))
         except ConnectionRefusedError:
             path.unlink(missing_ok=True)
-        except OSError:  # the socket is busy or another user's, so its replica runs
+        except OSError:  # the socket is busy or belongs to another user, so its replica is running
             return

@@ -94,14 +94,17 @@ class RequestStream(MessageHandler):
             self,
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
-            # For TCP, the kernel records the time of the last segment, which may be the one that
-            # says that the client has left.
+            # For TCP, the kernel records the time of the last segment, which may be the segment
+            # that ends the client's connection.
             may_have_waited=True,
         )
 
     def deliver(self, message: IncomingMessage) -> None:
-        """Send the answers of a message, and read on if the client had too many unanswered."""
-        if message.size:  # a message that was rejected before its requests were sent has none
+        """Send the answers of a message, and read again if the client had too many unanswered
+        messages.
+        """
+        # A message that was rejected before its requests were sent has no admission.
+        if message.size:
             self._connection.remove_unanswered(message.size)
         self._connection.send_answers(message, self._send, self._engine.stats)
 

@@ -32,21 +32,22 @@ class SendBuffer:
         """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it
         reads none for 10 s.
 
-        `lost` is called, with the lock held, if the client has ended the connection: requests of
-        it that are still unread must do nothing more.
+        `lost` is called, with the lock held, if the client has ended the connection: its unread
+        requests must then have no effect.
         """
         self._connection = connection
         self._lock = lock
         self._limit = limit
         self._lost = lost
         self._unsent = bytearray()
-        self._thread: threading.Thread | None = None  # sends the rest to a slow client
-        self._slow = False  # whether the thread is sending the rest
+        self._thread: threading.Thread | None = None  # sends unsent bytes to a slow client
+        self._slow = False  # whether the thread is sending unsent bytes
         self._last = False  # whether no bytes may follow the unsent ones
         self._closed = False
 
     def send(self, data: bytes, *, last: bool = False) -> None:
-        """Send as many bytes as the connection accepts now; a thread sends the rest later.
+        """Send as many bytes as the connection accepts now; a thread sends the remaining bytes
+        later.
 
         After the `last` bytes the client reads the end of the connection, which stays open for
         reading.
@@ -113,7 +114,7 @@ class SendBuffer:
                     return
 
     def _disconnect(self) -> None:
-        logger.warning("client: takes no replies; cut off")
+        logger.warning("client: does not read its replies; cut off")
         self._unsent.clear()
-        with contextlib.suppress(OSError):  # the client closed it already
+        with contextlib.suppress(OSError):  # the client has already closed the connection
             self._connection.shutdown(socket.SHUT_RDWR)

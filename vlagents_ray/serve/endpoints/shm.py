@@ -3,9 +3,9 @@ observations in shared memory.
 
 A `Payload` reads that memory: the client's memory files, or channels in the node's object store
 (`vlagents_ray.serve.endpoints.plasma`). For memory files, a client connects to an abstract socket
-whose unguessable name is in the metadata, and passes files that it writes its frames into. Neither
-side creates a file name, so that memory and socket are freed when their processes end for any
-reason. Only processes of the same user may connect.
+whose unguessable name is in the metadata, and passes descriptors of the files that contain its
+frames. Neither side creates a file name, so the memory and the socket are freed when their
+processes end for any reason. Only processes of the same user may connect.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ class UnixConnection(PolledConnection):
             sender = self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))
             if sender is None:
                 with self._sending:
-                    self._unanswered -= 1  # a valid key is not answered
+                    self._unanswered -= 1  # the server does not answer a valid key
             else:
                 self._receive(sender, message, waited_s, data, descriptors)
         except VLAgentsError as error:
@@ -225,14 +225,14 @@ class UnixConnection(PolledConnection):
             self._pause(BACKLOGGED)
 
     def _end_if_refused_too_often(self) -> None:
-        """End the connection of a client whose key, or whose messages, are rejected again and
-        again; called after each refusal.
+        """End the connection of a client after too many rejections of its key or its messages;
+        called after each rejection.
         """
         if self._sender is None:
             self._refused_keys += 1
             if self._refused_keys >= REFUSALS:
                 self.end(f"its key was rejected {REFUSALS} times; connect with another one")
-                self.disconnect()  # its further messages are not read
+                self.disconnect()  # the client's further messages are not read
         elif self.account.refused_too_often:
             self.end(REFUSED)
 
@@ -321,8 +321,8 @@ class UnixConnection(PolledConnection):
     def overdue(
         self, now: float, refusal: Callable[[Caller], str | None]
     ) -> tuple[str, int] | None:
-        """Return a reason to end the connection, as in `PolledConnection`; a client must send
-        its key within 5 s.
+        """Return a reason to end the connection, as in `PolledConnection`; a client that has not
+        sent its key after 5 s is overdue.
         """
         if self._sender is not None:
             return super().overdue(now, refusal)
@@ -338,8 +338,8 @@ class UnixConnection(PolledConnection):
 
     def _discard(self) -> None:
         self._payload.free()
-        # With messages unread, the kernel would report a reset to the client before the answers
-        # that it has not read.
+        # If there are unread messages, the kernel would report a reset to the client before the
+        # client reads its last answers.
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RD)
             while self._connection.recv(1):
@@ -497,8 +497,8 @@ def counted_array(admission: Admission, size: int, read: Callable[[], np.ndarray
     """Return the array of `size` bytes that `read` creates, counted as in flight for as long as
     anything views it.
 
-    Raises the errors of `Admission.hold`, before the array is created; the share of robots is not
-    used.
+    Raises the errors of `Admission.hold`, before the array is created. The bytes reserved for
+    robots are not used.
     """
     admission.hold(size, False, 0)
     try:

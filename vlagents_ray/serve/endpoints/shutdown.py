@@ -12,7 +12,7 @@ class Shutdown:
     """The end of a replica, before which its WebSockets and incomplete uploads end; its methods are
     thread-safe.
 
-    A WebSocket is a request for Serve, which ends a replica after its last request, and kills it
+    Serve counts a WebSocket as a request. It ends a replica after its last request, and kills it
     after a time limit.
     """
 
@@ -26,6 +26,6 @@ class Shutdown:
         self._begun = time.monotonic()
 
     def is_due(self, silent_s: float) -> bool:
-        """Return whether a connection has to end whose client has been silent for `silent_s`."""
+        """Return whether a connection has to end if its client has been silent for `silent_s`."""
         stopping_s = time.monotonic() - self._begun
         return stopping_s >= self._patience_s or (stopping_s >= 0 and silent_s >= _QUIET_S)

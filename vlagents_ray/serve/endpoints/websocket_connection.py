@@ -48,8 +48,8 @@ logger = logging.getLogger(__name__)
 _FINISHING = "it ends after its answers"  # a further reason for not polling a connection
 _FINISHING_S = 0.01  # period at which it is checked whether all messages are answered
 _FRAGMENT_BYTES = 16 * 1024  # size below which a fragment of a message counts like a control frame
-# A client behind a proxy that has disappeared is found out by pings: the kernel's own probes reach
-# the proxy only.
+# Only pings detect that a client behind a proxy has disappeared, since the kernel's own probes
+# reach only the proxy.
 _PING_S = 20.0
 _INVALID_DATA, _ABNORMAL = 1007, 1006  # close codes
 
@@ -57,20 +57,21 @@ _INVALID_DATA, _ABNORMAL = 1007, 1006  # close codes
 class MessageHandler(ABC):
     """Serves the messages of one WebSocket; the polling thread calls its methods."""
 
-    most_unanswered: int  # number of unanswered messages above which no more are read
-    most_unanswered_bytes: int  # the same of their bytes
+    most_unanswered: int  # number of unanswered messages at which reading stops
+    most_unanswered_bytes: int  # size of the unanswered messages above which reading stops, bytes
 
     @abstractmethod
     def begin(self) -> Charge | None:
         """Charge a message of which a part has arrived, before the rest is read.
 
         Returns:
-            The charge for `receive`; None if the message is charged when the application takes it.
+            The charge for `receive`; None if the message is charged when the application receives
+            it.
         """
 
     @abstractmethod
     def receive(self, message: bytes | str, arrived: float, charge: Charge | None) -> None:
-        """Serve a complete message; a text is a `str`.
+        """Serve a complete message; a text message is a `str`.
 
         Args:
             arrived: Time at which its last byte arrived, s, of `time.perf_counter`.
@@ -83,7 +84,7 @@ class MessageHandler(ABC):
 
     @abstractmethod
     def finish(self, reason: str, code: int) -> None:
-        """End the connection once all messages that have arrived are answered; no further ones
+        """End the connection once all messages that have arrived are answered; no further messages
         will be received.
         """
 
@@ -101,11 +102,11 @@ class WebSocketConnection(MessageConnection):
         idle_s: float,
         pings: bool = False,
     ) -> None:
-        """Create a connection that is read once it is `owner.serve`d.
+        """Create a connection, which is read after `owner.serve`.
 
         Args:
-            admission: The memory in flight of the replica, as part of which incomplete messages
-                count; None without a replica.
+            admission: The in-flight memory of the replica, which includes incomplete messages; None
+                without a replica.
             slow_s: Maximum time that a message may take to arrive, s.
             idle_s: Maximum time that the connection may be silent, s.
             pings: Whether the client has to answer pings.
@@ -118,22 +119,22 @@ class WebSocketConnection(MessageConnection):
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
         self._received = ReceiveBuffer(STREAM_BYTES)
-        self._fragments: list[bytes] = []  # frames of a message whose last one has not arrived
+        self._fragments: list[bytes] = []  # frames of a message whose last frame has not arrived
         self._fragments_bytes = 0
-        self._is_text = False  # whether those are of a text
-        # Received but unprocessed messages, their arrival times, s, and the charges of those
-        # received in parts.
+        self._is_text = False  # whether these frames belong to a text message
+        # Received but unprocessed messages, their arrival times, s, and the charges of messages
+        # that arrived in parts.
         self._messages: deque[tuple[bytes | str, float, Charge | None]] = deque()
         self._partial: Charge | None = None  # charge of a partly received message
         self._is_partial = False  # whether a part of a message has been counted
 
         self._has_ended_sessions = False
-        self._is_finishing = False  # whether it ends once all messages are answered
+        self._is_finishing = False  # whether the connection ends once all messages are answered
         # Time of the last ping since the last bytes, s; 0 without one. Only `overdue` uses it.
         self._pinged_at = 0.0
 
     def accepted(self, handler: MessageHandler) -> None:
-        """Serve messages by `handler`, since the handshake is accepted."""
+        """Serve messages with `handler`, now that the handshake is accepted."""
         self._received.attach(self._protocol)
         self._is_rated = isinstance(self.caller, Caller)
         self._handler = handler
@@ -152,7 +153,7 @@ class WebSocketConnection(MessageConnection):
                 self._out.send(frame_head(len(message)) + message)
 
     def finish(self, reason: str, code: int) -> None:
-        """Read no further messages, and end the connection once those that have arrived are
+        """Read no further messages, and end the connection once the messages that have arrived are
         answered; may be called on any thread.
         """
         if not self._is_finishing:
@@ -196,9 +197,9 @@ class WebSocketConnection(MessageConnection):
     def _bytes_to_read(self) -> int:
         """Return how many bytes to read now: at most one frame.
 
-        The bytes after it stay in the socket until it is known whether the client may send more.
-        If the connection has ended, the number is 1, which reads its end. Raises `BlockingIOError`
-        if the socket is empty.
+        The bytes after the frame stay in the socket until it is known whether the client may send
+        more. If the connection has ended, the number is 1, which reads its end. Raises
+        `BlockingIOError` if the socket is empty.
         """
         if not self._frame_left:
             peeked = self._connection.recv(HEAD_BYTES - len(self._frame_head), socket.MSG_PEEK)
@@ -295,7 +296,7 @@ class WebSocketConnection(MessageConnection):
                     charge.require()
                 self._partial = charge
                 self._is_partial = True
-        except TooManyRequests:  # the rest stays unread until the key is under its rate
+        except TooManyRequests:  # the remaining bytes stay unread until the key is within its rate
             self._throttle()
             if self.account.refused_too_often:
                 self.end(REFUSED)
@@ -318,7 +319,7 @@ class WebSocketConnection(MessageConnection):
         ):
             message, arrived, charge = self._messages.popleft()
             if self._handler is None:  # no frame is read before the handshake is accepted
-                raise VLAgentsError("stream: a message before the handshake was accepted")
+                raise VLAgentsError("stream: a message arrived before the handshake was accepted")
             self._handler.receive(message, arrived, charge)
             if self.account.refused_too_often:
                 self.end(REFUSED)
@@ -346,7 +347,8 @@ class WebSocketConnection(MessageConnection):
         self._handler.ended(_ABNORMAL if close is None else int(close.code))
 
     def _discard(self) -> None:
-        # A connection without a message costs as much as one; so does a message that is not paid.
+        # A connection without a message is charged as one request; so is a partial message that was
+        # not charged.
         if not self._message_count or (self._is_partial and self._partial is None):
             self.account.charge_abuse()
         self._partial = None

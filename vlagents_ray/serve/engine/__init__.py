@@ -18,11 +18,11 @@ PendingRequest.begun
 
 PendingRequest.reserved, .sought
     writers: the thread that reserves for the request
-    protection: a request reserves, is searched for or queued, one at a time
+    protection: only one thread at a time reserves for, searches for or queues a request
 
 PendingRequest.loaded
     writers: checkpoints, before it queues the reset again
-    protection: lock of the queue, which passes the request on
+    protection: lock of the queue, through which the policy gets the request
 
 Origin.sessions: episodes
     writers: each thread that reserves or undoes a reset, policy at a close
@@ -38,7 +38,7 @@ Session.agent, .prepares, .steps, .instruction, .resetting, .announced
 
 Session.plan
     writers: policy, at resets and answers; .is_admitted also each reader of the load
-    protection: single assignments; a reader takes the newest or the last value
+    protection: single assignments; a reader gets the old or the new value
 
 Session.first, .expected, .began, .last_reset, .moves, .over
     writers: each thread that reserves, runs or undoes a reset
@@ -50,7 +50,7 @@ LoadedModel.deferred
 
 Session.origin, .used, .moved_in
     writers: each thread that reserves for a request of the session
-    protection: the last one counts: requests of two threads have no order
+    protection: the last value counts: requests of two threads have no order
 
 Session.model, LoadedModel.sessions
     writers: policy, checkpoints, each thread that ends a session
@@ -62,14 +62,14 @@ Session.weights, .follows
 
 ModelWeights: versions
     writers: pushes, policy
-    protection: its lock; the version in the agent: policy, with busy
+    protection: its lock; only the policy changes the version in the agent, with `busy`
 
 Health: reasons
     writers: policy, event loop, the thread that starts or stops the engine
     protection: its lock; requests read one reference
 
 PolicyCalls.under_way
-    writers: each thread that calls the policy, its own calls
+    writers: each thread that calls the policy, for its own calls
     protection: single operations of a set; overdue copies it
 
 PolicyCalls.failed_batches
@@ -86,7 +86,7 @@ DrainList: connections
 
 Runner: unsent answers
     writers: policy
-    protection: one writer, which passes them on to policy-answers
+    protection: one writer, which passes the answers to policy-answers
 
 Poller: lent to policy-reader
     writers: policy; periodic, while a batch runs
@@ -105,8 +105,8 @@ PolledConnection: unsent bytes, unanswered messages, end
     protection: its lock
 
 Account, Charge
-    writers: the thread or the event loop that reads the connection; while a message is decoded
-        elsewhere, that thread
+    writers: the thread or the event loop that reads the connection; while another thread decodes
+        a message, that thread
     protection: the connection reads no further message meanwhile
 
 Sender: whether its client was requested to reconnect

@@ -1,4 +1,6 @@
-"""The use of an agent's ability by another process: its replica, if the agent runs in a child."""
+"""The use of an agent's ability from another process: the replica uses an agent that runs in its
+child process.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ class AbilityCall:
     """A call of one method of an ability, or the request for one of its values."""
 
     protocol: str  # "module:Class"
-    member: str = ""  # a method or an attribute; empty to ask only for the ability itself
-    # The arguments by the names in the protocol, without the observation.
+    member: str = ""  # a method or an attribute; empty to check only for the ability
+    # The arguments by their names in the protocol, without the observation.
     arguments: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -37,8 +39,8 @@ class AbilityCall:
         return cls(name_of(protocol), member, arguments), obs
 
     def is_available(self, agent: Agent) -> bool:
-        """Return whether the agent has the ability. A protocol whose module is not installed here
-        is none of its abilities.
+        """Return whether the agent has the ability. If the module of the protocol is not installed
+        here, the agent does not have the ability.
         """
         try:
             protocol: type = named_class(self.protocol)
@@ -55,14 +57,14 @@ class AbilityCall:
 
         Raises:
             PolicyFailed: The agent has no such ability.
-            Exception: Any error of the method.
+            Exception: The method has raised it.
         """
         protocol: type = named_class(self.protocol)
         able: Any = ability(agent, protocol)
         if able is None or self.member not in members(protocol):
             raise PolicyFailed(
                 f"{type(agent).__name__}: expected the ability {self.protocol}, with "
-                f"{self.member!r}, got an agent without it; ask for it with `ability` first"
+                f"{self.member!r}, got an agent without it; check for it with `ability` first"
             )
         value = getattr(able, self.member)
         if not is_method(protocol, self.member):

@@ -5,17 +5,18 @@ A message has a `MessageAdmission` from its arrival until it is answered. Decode
 `Budget`, so that these limits apply before anything is decoded:
 
 - The message was charged to the caller's key when it arrived (`vlagents_ray.serve.access.charges`),
-  or it is rejected; each further request in it is charged when its header is parsed (429).
+  or it is rejected. Each further request in the message is charged when the request's header is
+  parsed (429).
 - Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a
   key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved
   for robots (503).
 - Images of more than a megapixel or 8 ms and headers of more than 64 KiB are decoded on separate
-  threads, those of simulations on half of the cores, so that neither the policy's thread nor an
-  event loop waits for them.
-- While batches are slow and several sessions act, images of robots are decoded there from 0.4 ms
-  on, if there are four cores: the messages of robots that are answered together arrive together,
-  and one thread would decode them one after another.
+  threads, so that neither the policy's thread nor an event loop waits for them. Messages of
+  simulations are decoded on half of the cores.
+- While batches are slow and several sessions act, images of robots that take more than 0.4 ms are
+  also decoded on these threads, if there are four cores. Robots that are answered together send
+  their next messages together, and one thread would decode these one after another.
 """
 
 from __future__ import annotations
@@ -36,20 +37,21 @@ from vlagents_ray.serve.access.charges import Charge
 
 T = TypeVar("T")
 
-# Above these another thread decodes: a megapixel of decoded bytes, and the time in which one core
-# decodes such a JPEG.
+# Limits above which another thread decodes: the decoded bytes of a megapixel, and the time in which
+# one core decodes such a JPEG.
 INLINE_BYTES = 3 * 2**20
 INLINE_S = 8e-3
-# The same time while the messages of several sessions are decoded side by side. Decoding less takes
-# about as long as the change of threads.
+# Time limit while the messages of several sessions are decoded in parallel, s. A shorter decoding
+# takes about as long as the thread switch.
 SIDE_BY_SIDE_S = 0.4e-3
-# Number of cores from which on messages are decoded side by side. On two cores, both decode the
-# images of one message already, and more threads only delayed the policy's and the clients'.
+# Minimum number of cores with which messages are decoded in parallel. On two cores, both already
+# decode the images of one message, and more threads only delay the threads of the policy and the
+# clients.
 SIDE_BY_SIDE_CORES = 4
 # Memory of a request from its arrival until its answer, without images and arrays.
 REQUEST_BYTES = 2048
 _ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
-_KEYS_SHARE = 0.5  # share of the bytes that the other keys leave free, which one key may take
+_KEYS_SHARE = 0.5  # share of the bytes left free by other keys that one key may take
 
 
 class NeedsDecodingThread(Exception):
@@ -69,16 +71,17 @@ class Admission:
     """
 
     def __init__(self, in_flight_bytes: int, window: OverlapsBatches | None = None) -> None:
-        """Hold no bytes yet.
+        """Create the admission of a replica, without bytes in flight.
 
         Args:
             in_flight_bytes: Largest number of bytes in flight of all messages together.
-            window: The window of the replica's batches, by which messages of several sessions are
-                decoded side by side; None to decode small messages on the threads that read them.
+            window: The window of the replica's batches, which determines when messages of several
+                sessions are decoded in parallel; None to decode small messages on the threads that
+                read them.
         """
         self._window = window
         has_cores = window is not None and thread_map.allowed() >= SIDE_BY_SIDE_CORES
-        # The smallest result of `inline_s`, s: most messages take less.
+        # The smallest possible result of `inline_s`, s. Decoding most messages takes less.
         self.least_inline_s = SIDE_BY_SIDE_S if has_cores else INLINE_S
         # Maximum number of bytes in flight of all messages together, by whether the message that
         # needs more is a robot's.
@@ -86,14 +89,15 @@ class Admission:
         self.held = 0  # number of bytes in flight
         # Bytes to release with each message that has no admission.
         self.messages: dict[weakref.ref[Any], int] = {}
-        # Number of bytes in flight by the name of their key.
+        # Number of bytes in flight by the name of the sender's key.
         self._held_by: Counter[str] = Counter()
         # Number of bytes of incomplete messages, the oldest first.
         self._arriving: dict[ArrivingBytes, int] = {}
-        self._arriving_by: Counter[str | None] = Counter()  # the same by the name of their key
-        # Reentrant: the garbage collector may release a message within the sections that it guards.
+        # Number of these bytes by the name of the sender's key.
+        self._arriving_by: Counter[str | None] = Counter()
+        # Reentrant: the garbage collector may release a message in a section that holds this lock.
         self._lock = threading.RLock()
-        # The thread pools for robots and (False) for others.
+        # The thread pool for robots (True), and the thread pool for all others (False).
         self._threads: dict[bool, ThreadPoolExecutor] = {}
         # Number of robots' messages that the threads decode, or that wait for a thread.
         self._decoding_robots = 0
@@ -103,12 +107,12 @@ class Admission:
         """Count `size` more bytes as in flight for a message that already holds `message_bytes`
         bytes.
 
-        If there is no room, incomplete messages are given up first.
+        If there is no room, incomplete messages are given up before an error is raised.
 
         Args:
             robot: Whether the message may use the bytes reserved for robots.
             key: The name of the sender's key, which may take a share of what other keys leave free;
-                None without one.
+                None without a key.
 
         Raises:
             Overloaded: The bytes in flight leave no room at the moment.
@@ -118,13 +122,15 @@ class Admission:
         message_limit = limit if key is None else int(limit * _KEYS_SHARE)
         if message_bytes + size > message_limit:
             raise MessageTooLarge(
-                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take "
-                f"{message_limit}; send fewer requests at once, or raise `limits.in_flight_bytes`"
+                f"message: takes {message_bytes + size} bytes when decoded, but all messages in "
+                f"flight may take only {message_limit}; send fewer requests at once, or raise "
+                "`limits.in_flight_bytes`"
             )
 
         given_up: list[ArrivingBytes] = []
         with self._lock:
-            # As `_room` does, with one call less for each act of a robot without a key.
+            # This computes the result of `_room` without its call, which saves time for each act of
+            # a robot without a key.
             room = limit - self.held if key is None else self._room(limit, key)
             while size > room:
                 arriving = self._largest_arriving(size, limit, robot, key)
@@ -142,9 +148,10 @@ class Admission:
             arriving.give_up()
         if not has_room:
             raise Overloaded(
-                f"the messages in flight here take {held_bytes} bytes, and may take {limit}, of "
-                "which one key may take half of what other keys leave free; send the request "
-                f"again after {Overloaded.retry_after_s:g} s, or raise `limits.in_flight_bytes`"
+                f"the messages in flight at this replica take {held_bytes} of at most {limit} "
+                "bytes, and one key may take half of the bytes that other keys leave free; send "
+                f"the request again after {Overloaded.retry_after_s:g} s, or raise "
+                "`limits.in_flight_bytes`"
             )
 
     def release(self, size: int, key: str | None = None) -> None:
@@ -153,8 +160,8 @@ class Admission:
             self._count(-size, key)
 
     def resize(self, arriving: ArrivingBytes, size: int) -> None:
-        """Count `size` bytes of incomplete messages in place of those counted before; raise
-        `Overloaded`.
+        """Set the number of bytes of incomplete messages to `size`; raise `Overloaded` if there is
+        no room for more.
         """
         limit = self._limits[arriving.robot]
         with self._lock:
@@ -174,7 +181,9 @@ class Admission:
         return room if key is None else min(room, self._room_of_key(limit, key))
 
     def _room_of_key(self, limit: int, key: str) -> int:
-        """Return how many bytes a key may take, if the incomplete messages of others give way."""
+        """Return how many bytes a key may take if the incomplete messages of other keys are given
+        up.
+        """
         arriving_of_others = sum(self._arriving_by.values()) - self._arriving_by[key]
         by_others = self.held - self._held_by[key] - arriving_of_others
         return int(_KEYS_SHARE * (limit - by_others)) - self._held_by[key]
@@ -182,11 +191,9 @@ class Admission:
     def _largest_arriving(
         self, size: int, limit: int, robot: bool, key: str | None
     ) -> ArrivingBytes | None:
-        """Return incomplete messages to give up: those of the key with the most bytes, or of a key
-        over its share.
-
-        None if there are none, or only those of robots and the bytes are for a simulation. The
-        caller holds the lock.
+        """Return incomplete messages to give up: those of the key with the most bytes, or those of
+        `key` if it is over its share. Incomplete messages of robots are not given up for a
+        simulation. The result is None if there is nothing to give up. The caller holds the lock.
         """
         candidates = [arriving for arriving in self._arriving if robot or not arriving.robot]
         if key is not None and size > self._room_of_key(limit, key):
@@ -212,8 +219,8 @@ class Admission:
                 del self._held_by[key]
 
     def release_with(self, message: weakref.ref[Any]) -> None:
-        """Release the bytes of a message that is answered or dropped: the callback of the weak
-        references to it.
+        """Release the bytes of a message that is answered or dropped: this is the callback of the
+        weak references to messages.
         """
         size = self.messages.pop(message, 0)
         with self._lock:
@@ -229,7 +236,8 @@ class Admission:
                 cores = thread_map.allowed()
                 number = max(1, cores // 2)
                 if robot:
-                    # The policy's thread mostly waits for a GPU while messages are decoded so.
+                    # The policy's thread mostly waits for a GPU while messages are decoded in
+                    # parallel.
                     number = cores if cores >= SIDE_BY_SIDE_CORES else max(1, cores - 1)
                 name = f"decode-{'robots' if robot else 'others'}"
                 threads = self._threads[robot] = ThreadPoolExecutor(number, name)
@@ -254,8 +262,9 @@ class Admission:
         return self.least_inline_s if is_side_by_side else INLINE_S
 
     def fills_cores(self) -> bool:
-        """Return whether so many messages of robots are decoded that the cores are in use if one
-        thread decodes all images of a message: most robots have two or three cameras.
+        """Return whether the messages of robots that are being decoded keep all cores busy with one
+        thread for each message. If not, the two or three images of a message are decoded on several
+        threads.
         """
         return 2 * self._decoding_robots > thread_map.allowed()
 
@@ -269,17 +278,17 @@ class Admission:
 
 
 class ArrivingBytes:
-    """The bytes of a connection's messages that are incomplete, or not read by the application.
-    Thread-safe.
+    """The bytes of a connection's messages that are incomplete, or that the application has not
+    read. Thread-safe.
     """
 
     def __init__(
         self, admission: Admission, key: str | None, robot: bool, give_up: Callable[[], None]
     ) -> None:
-        """Hold no bytes yet.
+        """Create a count of 0 bytes.
 
         Args:
-            key: The name of the connection's key; None without one.
+            key: The name of the connection's key; None without a key.
             robot: Whether the bytes reserved for robots may be used.
             give_up: Ends the connection, as a complete message needs the memory; called on any
                 thread.
@@ -288,13 +297,11 @@ class ArrivingBytes:
         self._admission = admission
 
     def resize(self, size: int) -> None:
-        """Count `size` bytes in place of those counted before; raise `Overloaded` if there is no
-        room for more.
-        """
+        """Set the number of bytes to `size`; raise `Overloaded` if there is no room for more."""
         self._admission.resize(self, size)
 
     def release(self) -> None:
-        """Count no bytes any more."""
+        """Set the number of bytes to 0."""
         self._admission.resize(self, 0)
 
 
@@ -337,7 +344,7 @@ class MessageAdmission(Budget):
                 are decoded elsewhere.
             keep_files: Whether `files` keeps the files of the message's images.
             share: The name under which a sender without a key has a share of the bytes in flight;
-                None for no limit of its own.
+                None for no separate limit.
         """
         super().__init__(limits)
 
@@ -368,8 +375,8 @@ class MessageAdmission(Budget):
         super().parse(size)
 
     def begin(self, op: object, priority: object = "robot") -> None:
-        """Begin the next request, as in `Budget`, and charge it; the first one was charged with its
-        message.
+        """Begin the next request, as in `Budget`, and charge it; the first request was charged with
+        its message.
         """
         self._refill()
         if priority == "simulation":
@@ -390,8 +397,8 @@ class MessageAdmission(Budget):
         self._held += size
 
     def grow(self, size: int) -> None:
-        """Count the message as in flight with `size` bytes, including those counted before;
-        raise as `receive`.
+        """Set the number of bytes in flight of the message itself to `size`; raise the errors of
+        `receive`.
         """
         if size > self._held:
             self.receive(size - self._held)
@@ -432,7 +439,7 @@ class MessageAdmission(Budget):
         self._decoded = 0
         self._decoding_s = 0.0
         self._refill()
-        self._requests = 0  # they are read again, and each is charged once
+        self._requests = 0  # the requests are read again, and each request is charged only once
         self._inline = False
         return self._admission.submit(lambda: read(self), self._robot)
 

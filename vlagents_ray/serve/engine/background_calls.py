@@ -1,4 +1,4 @@
-"""Calls for the loaded policy and its weights that run while the policy acts.
+"""Calls for the loaded policy and its weights that run while the policy computes actions.
 
 The replica of a child process sends them to the engine in the child
 (`vlagents_ray.serve.python_env.child_connection`), as requests with the operations
@@ -85,9 +85,9 @@ class BackgroundCalls:
         """Make a version of the weights.
 
         Args:
-            name: Its name, by which later calls refer to it.
+            name: Name of the version, with which later calls refer to it.
             base: The name of the version with the values that were not pushed.
-            number: Its number.
+            number: Number of the version.
             file: The file in memory with the pushed values, as safetensors.
             options: The fields of `PushOptions`.
             shared: `SharedValues.to_json` of the pushed values that are not in the file, if any.

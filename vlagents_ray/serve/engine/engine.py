@@ -65,7 +65,7 @@ class Engine:
             agent: The agent, or the checkpoints that sessions can choose from.
             settings: The settings.
             finder: Fetches sessions from other replicas.
-            on_step: Called with each step of a long load, on the loading thread.
+            on_step: Called with each step of a long load, on the thread that loads.
             clock: Clock, s; a simulated engine has simulated clocks.
             wall_clock: Wall clock, ns.
             poller: Poller of the queue; that of a simulated engine does not block.
@@ -145,21 +145,23 @@ class Engine:
         self.health.finish_loading()
 
     def collect_stats(self) -> Collected:
-        """Return the metrics recorded since the last call, also in the processes of policies that
-        run in another Python.
+        """Return the metrics recorded since the last call, including the processes of policies that
+        run in another Python environment.
         """
         for work in self.models.gpu_work_elsewhere():
             self.stats.add_gpu_work(work)
         return self.stats.collect()
 
     def _quiet_s(self) -> float:
-        """Return the time since a model last acted, s; 0 while one acts, or the policy sleeps."""
+        """Return the time since a model last computed actions, s; 0 while a model computes, or
+        while the policy sleeps.
+        """
         return 0.0 if self.weights.acting_lock.locked() else self.queue.quiet_s()
 
     @property
     def contract(self) -> Contract | None:
-        """Contract of the deployment's own checkpoint; None until that is loaded, or if it has
-        no contract.
+        """Contract of the deployment's own checkpoint; None if the checkpoint is not loaded yet or
+        has no contract.
         """
         return self.models.contract
 
@@ -178,9 +180,9 @@ class Engine:
         if hanging is None:
             return
 
-        # The policy may still act on the running batch, so its requests must not be sent again;
-        # waiting requests may be. This is repeated at each call, since a request that was checked
-        # before may be queued later.
+        # The policy may still process the running batch, so its requests must not be sent again,
+        # unlike waiting requests. This is repeated at each call, since a request may be queued
+        # after this call although it was checked before.
         running, waiting = self.queue.clear()
         for pending in running:
             pending.fail(OutcomeUnknown(hanging.description))
@@ -201,7 +203,8 @@ class Engine:
         """Reject all requests except those of the running batch, and wait at most `timeout_s`
         for its end.
         """
-        # This fails if the policy is loading, or if its GPU has too little memory for it to wake.
+        # This fails if the policy is loading, or if the GPU has too little memory to wake the
+        # policy.
         with suppress(Exception):
             self.weights.rest(Rest("wake"))
 

@@ -25,8 +25,8 @@ class HangingCall(NamedTuple):
 class Health:
     """Whether the policy can act. Thread-safe.
 
-    There may be several reasons at once why it cannot act. Clients get the first one of: it failed
-    to load, the replica stops, a call hangs, it loads, its thread has ended.
+    Several reasons why it cannot act may exist at once. Clients get the first of these: the policy
+    failed to load, the replica stops, a call hangs, the policy is loading, its thread has ended.
     """
 
     def __init__(self, models: ModelManager, calls: PolicyCalls, stats: MetricsBuffer) -> None:
@@ -44,7 +44,7 @@ class Health:
         self._hung: PolicyCall | None = None  # overdue call that `find_hanging_call` found
         self._hanging: PolicyUnavailable | None = None
         self.alive = False  # whether a thread takes batches from the queue
-        # The first reason, which is set after each change; a request reads nothing else.
+        # The first reason, which is updated after each change. Requests read only this field.
         self._unready: VLAgentsError | None = self._loading_error
 
     def begin_thread(self) -> None:
@@ -82,8 +82,8 @@ class Health:
             return self._stopping
 
     def find_hanging_call(self) -> HangingCall | None:
-        """Return the call of the policy that exceeds its time limit, from whose discovery to its
-        return no request is accepted.
+        """Return the call of the policy that exceeds its time limit. From then on, no request is
+        accepted until the call returns.
         """
         call = self._calls.overdue()
         if call is None:
@@ -100,7 +100,7 @@ class Health:
                 self._update()
         if is_new:
             logger.error(
-                "%s. This replica is not healthy until it does. Its thread:\n%s",
+                "%s. This replica is unhealthy until the call returns. Thread of the call:\n%s",
                 description,
                 call.stack(),
             )
@@ -138,7 +138,7 @@ class Health:
         """
         unready = self._unready
         if unready is self._loading_error:
-            raise self._models.loading()  # with the present step of loading
+            raise self._models.loading()  # with the current step of loading
         if unready is not None:
             raise unready
         if self._calls.broken is not None:

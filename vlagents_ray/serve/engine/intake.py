@@ -1,8 +1,9 @@
-"""The way of requests into the queue: each is checked, and gets what it reserves.
+"""The path of requests into the queue: each request is checked, and makes its reservations.
 
-A reset reserves an episode of its session, and an act its session and the episode that it belongs
-to. A reservation is a value in its request, so that it can be undone if the policy never receives
-the request. An act whose session is not here reserves again after a search at other replicas.
+A reset reserves an episode of its session. An act reserves its session and the episode to which it
+belongs. A reservation is a value in its request, so that it can be undone if the policy never
+receives the request. If the session of an act is not at this replica, the act reserves again after
+a search at other replicas.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from vlagents_ray.serve.sessions import Session, SessionState
 from vlagents_ray.serve.weights import follows
 from vlagents_ray.slo import Slo
 
-# Operations after which their connection has no further session.
+# Operations after which a connection does not have the request's session.
 _USE_NO_SESSION = ("close", *BACKGROUND_OPS)
 
 
@@ -65,8 +66,8 @@ class Intake:
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
         """Check requests, and queue them together; those that cannot be queued are finished with
-        their errors. Calls that run while the policy acts are begun at once, and some are executed
-        at once.
+        their errors. The operations in `BACKGROUND_OPS` are started immediately, and those in
+        `IMMEDIATE_OPS` are executed immediately.
         """
         ready: list[PendingRequest] = []
         for pending in requests:
@@ -103,12 +104,13 @@ class Intake:
         return {}
 
     def _store(self, session_id: str, request: Request) -> None:
-        """Store an observation until an act names it, and begin to prepare it; drop one that no
-        act will name.
+        """Store an observation until an act refers to it, and begin to prepare it. Without an
+        observation, drop the stored observation, which no act will use.
         """
         number = request.kwargs["number"]
         if request.obs is None:
-            with contextlib.suppress(UnknownSession):  # its observations have ended with it
+            # The observations were dropped with the session.
+            with contextlib.suppress(UnknownSession):
                 _, preparation = self._sessions.get(session_id).stored.pop(number, (None, None))
                 if preparation is not None:
                     preparation.future.cancel()
@@ -116,22 +118,20 @@ class Intake:
 
         self._health.require_ready()
         session = self._sessions.get(session_id)
-        obs = copy.deepcopy(request.obs)  # it may be in the sender's memory
+        obs = copy.deepcopy(request.obs)  # the original may be in the sender's memory
         session.stored[number] = (obs, self._prepare(session, obs))
 
     def _prepare(self, session: Session[LoadedModel], obs: Obs | None) -> Preparation | None:
         """Begin to prepare an observation of a session; return None if there is nothing to do."""
         if self._preparations is None:
             return None
-        model = session.model  # another thread may set it to None
+        model = session.model  # another thread may set the attribute to None
         acts = None if model is None else model.acts
         return self._preparations.begin(session.prepares, obs, acts)
 
     def reserve(self, pending: PendingRequest) -> ReservedAct | Opening | None:
-        """Check a request before it is queued, and return what it reserves; raise if it is
-        rejected.
-
-        The session of a request becomes one of its connection's.
+        """Check a request before it is queued, and return its reservation; raise an error if it is
+        rejected. The session of the request becomes a session of its connection.
         """
         request, origin, session_id = pending.request, pending.origin, pending.session_id
         is_act = request.op == "act"
@@ -145,7 +145,7 @@ class Intake:
                 raise NotReset(
                     f"session {session_id!r}: act before a successful reset; reset first"
                 )
-            # Only acts of a policy in another Python name a stored observation.
+            # Only acts for a policy in a child process refer to a stored observation.
             is_stored = bool(request.prepared)
             preparation = _take_stored(session, pending) if is_stored else None
             request = pending.request
@@ -165,7 +165,7 @@ class Intake:
                 # An act of an older episode, which will be rejected, does not use the session.
                 session.origin = origin
 
-            model = session.model  # another thread may set it to None
+            model = session.model  # another thread may set the attribute to None
             if model is not None:
                 model.check(request)
             if request.obs is not None and request.obs.info:
@@ -187,8 +187,8 @@ class Intake:
     def _record_report(
         self, session: Session[LoadedModel], pending: PendingRequest, info: Mapping[str, Any]
     ) -> None:
-        """Read the slack of an act's robot, and add what the robot reports to its session and to
-        the metrics.
+        """Read the slack of an act's robot, and record the robot's report in its session and in the
+        metrics.
         """
         slack_s = stated_slack_s(info)
         if slack_s is not None:
@@ -212,7 +212,7 @@ class Intake:
         if slo is None and pending.priority is Priority.ROBOT:
             slo = self._default_slo
         follows_newest = follows(kwargs, by_default=pending.priority is not Priority.ROBOT)
-        # If the checkpoint is not loaded, the request is checked after loading.
+        # If the checkpoint is not loaded yet, the request is checked after loading.
         model = self._models.loaded(choice)
         if model is not None:
             model.check(request)
@@ -220,7 +220,7 @@ class Intake:
         is_new = session_id not in self._sessions
         session = self._sessions.open(session_id, origin)
         if is_new and request.step is not None:
-            # Its client has had an episode elsewhere: it resumes a session that was lost.
+            # The client has had an episode at another replica, so it resumes a lost session.
             session.moved_in = self._clock()
         first, previous = self._sessions.begin(session, request.step, pending.arrived, origin)
         return Opening(choice, kwargs, follows_newest, first, previous, slo)
@@ -251,7 +251,7 @@ class Intake:
         """Search for an act's session at other replicas, and queue the act again; return False if
         there is no search.
 
-        If its session is not found, the act fails with the `error`.
+        If the search does not find the session, the act fails with `error`.
         """
         if (
             self._finder is None
@@ -278,8 +278,8 @@ class Intake:
         return False
 
     def retry(self, pending: PendingRequest) -> None:
-        """Queue an act again after a search of its session; raise if it is rejected."""
-        # The session stays elsewhere if its key has no room for it here.
+        """Queue an act again after a search for its session; raise an error if it is rejected."""
+        # The session stays at the other replica if its key may hold no further session here.
         if pending.session_id not in self._sessions:
             self._sessions.require_allowed(pending.origin)
         pending.reserved = self.reserve(pending)
@@ -312,11 +312,9 @@ class SessionSearch:
             pending.fail(self._error if is_same else public_error(error, pending))
 
     def origin_for(self, state: SessionState, began: float) -> Origin | None:
-        """Return the origin of the act if it can be executed on a session in that state, at another
-        replica, else None.
-
-        If it cannot be, the session stays where it is. The session's episode `began` at that time,
-        s.
+        """Return the origin of the act if the act can be executed on a session in the given state
+        at another replica. If not, return None, and the session stays there. `began` is the time at
+        which the session's episode began, s.
         """
         pending = self._pending
         if pending.is_abandoned:
@@ -335,8 +333,8 @@ class SessionSearch:
 
 
 def _take_stored(session: Session[LoadedModel], pending: PendingRequest) -> Preparation | None:
-    """Give an act the stored observation that it names, and return the preparation of that; raise
-    `InvalidInput` if there is no such observation.
+    """Add the stored observation to the act that refers to it, and return the observation's
+    preparation; raise `InvalidInput` if there is no such observation.
     """
     number = pending.request.prepared
     stored = session.stored.pop(number, None)
@@ -350,7 +348,7 @@ def _take_stored(session: Session[LoadedModel], pending: PendingRequest) -> Prep
 
 
 def _stated_slo(option: object) -> Slo | None:
-    """Return the SLO that a reset states, if it does; raise `InvalidInput` if that is wrong."""
+    """Return the SLO in a reset, or None; raise `InvalidInput` if the SLO is invalid."""
     if option is None:
         return None
     try:
@@ -360,11 +358,10 @@ def _stated_slo(option: object) -> Slo | None:
 
 
 def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:
-    """Return the step at which the episode began that an act belongs to whose connection has none.
-
-    That is the session's latest one; but an act without a step does not belong to an episode that
-    has begun since the connection was opened, or over HTTP, since the act arrived, while it waited
-    for a search of its session.
+    """Return the step at which the episode of an act began, if the act's connection has no episode.
+    The act then belongs to the latest episode of the session. An act without a step is rejected if
+    this episode has begun too late: after the connection was opened or, over HTTP, after the act
+    arrived, while the act waited for a search for its session.
     """
     if pending.request.step is None and session.last_reset > pending.latest_begin:
         raise session.wrong_episode()

@@ -1,8 +1,8 @@
 """Timings of requests and batches: reported in each reply, and buffered for the metrics exporter.
 
 Per request this costs two readings of the clock and one addition to a sample. The exporter thread
-(`vlagents_ray.serve.replica.metrics`) has little work left: requests may wait while it holds the
-interpreter lock.
+(`vlagents_ray.serve.replica.metrics`) has little work left, since requests may wait while it holds
+the interpreter lock.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Collected:
     replays: int = 0  # replays of CUDA graphs
     # Calls of the policy that exceeded their limit, by op.
     hung: Counter[str] = field(default_factory=Counter)
-    # What robots reported, by priority: ticks, starved ticks, and ages of executed actions, ms.
+    # Reports of robots, by priority: ticks, starved ticks, and ages of executed actions, ms.
     ticks: Counter[str] = field(default_factory=Counter)
     starved: Counter[str] = field(default_factory=Counter)
     ages_ms: dict[str, Sample[float]] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class MetricsBuffer:
         self._collected = Collected()
 
     def enable(self) -> None:
-        """Start recording requests and batches, since an exporter will collect them."""
+        """Start recording requests and batches, which an exporter then collects."""
         self._enabled = True
 
     def record(self, message: IncomingMessage) -> None:
@@ -102,7 +102,7 @@ class MetricsBuffer:
             kinds = kinds[:1]
         for (op, priority), reply in zip(kinds, message.replies, strict=True):
             if reply.error is None:
-                # Replies too large together are sent as errors, without times.
+                # Replies that are too large together are sent as errors, without times.
                 times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
                 self.handled((op, message.transport, priority, "ok"), times)
             else:
@@ -129,7 +129,7 @@ class MetricsBuffer:
             sample.add(times)
 
     def report(self, priority: str, report: RobotReport) -> None:
-        """Record what a robot reported with a request of that priority."""
+        """Record the report of a robot in a request of that priority."""
         if not self._enabled:
             return
         with self._lock:
@@ -169,7 +169,7 @@ class MetricsBuffer:
         return CudaGraph.replays + self._replayed_elsewhere
 
     def add_gpu_work(self, work: GpuWork) -> None:
-        """Record what another process of the replica has done on its GPU."""
+        """Record the GPU work of another process of the replica."""
         if work.last_ms is not None:
             self.gpu_ms = work.last_ms
         with self._lock:
@@ -189,8 +189,8 @@ class MetricsBuffer:
         return collected
 
     def collect_gpu_work(self) -> GpuWork:
-        """Return what this process has done on its GPU since the last call, in place of `collect`,
-        for the replica whose policy it runs.
+        """Return the GPU work of this process since the last call. A child process uses this in
+        place of `collect`, for the replica whose policy it runs.
         """
         collected = self.collect()
         return GpuWork(

@@ -15,7 +15,7 @@ from vlagents_ray.serve.sessions import Session, SessionState
 
 
 class SessionMoves:
-    """Exports the sessions of an engine, and continues those of other replicas. Thread-safe."""
+    """Exports the sessions of an engine, and continues sessions of other replicas. Thread-safe."""
 
     def __init__(self, parts: EngineParts) -> None:
         self._sessions = parts.sessions
@@ -27,7 +27,7 @@ class SessionMoves:
         """Return the state that another replica needs to continue the session after its release
         here; called on the policy's thread.
 
-        The state was `asked` for at that time, s, of the engine's clock.
+        `asked` is the time at which the state was requested, s, of the engine's clock.
         """
         session = self._sessions.get(session_id)
         model, weights = session.model, session.weights
@@ -55,7 +55,7 @@ class SessionMoves:
 
         Args:
             session_id: Id of the session.
-            state: Its state there.
+            state: Its state at the other replica.
             timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded
                 already.
 
@@ -77,9 +77,9 @@ class SessionMoves:
         """Create a copy of the session that cannot act before `enter`; if it is not needed, call
         `abandon`.
 
-        Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts
-        for the key of the `origin`. `weights` are the values of its version of the weights, if that
-        is not held here.
+        `began` is the earliest time at which its episode may have begun, s, of this engine's clock.
+        From now on, the session counts for the key of `origin`. `weights` are the values of its
+        version of the weights, if this replica does not hold that version.
         """
         self._health.require_ready()
         self._sessions.require_room(session_id)
@@ -109,7 +109,7 @@ class SessionMoves:
                 )
 
             number, fingerprint = state.weights
-            # The session holds the version until `find` returns it, or a newer one.
+            # The session holds the version until `find` returns that version or a newer one.
             if weights is not None:
                 arriving.weights = model.parameters.restore(number, fingerprint, weights)
             arriving.weights = model.parameters.find(number, fingerprint, follows=state.follows)

@@ -1,9 +1,9 @@
 """The interface of observers, the only access to the requests and the answers of an engine.
 
 An observer is called on the threads that process requests and answers: it copies data or keeps
-references, and leaves the rest to its own thread. Its memory is bounded: beyond a limit in bytes or
-entries it drops data. Requests that could not be decoded reach no observer. Parts of a replica add
-observers.
+references, and does all other work on its own thread. Its memory is bounded: beyond a limit in
+bytes or entries it drops data. Requests that could not be decoded reach no observer. Parts of a
+replica add observers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Observer:
         """
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add to the info of an answer before it is sent; the live page sends commands to a
+        """Add entries to the info of an answer before it is sent; the live page sends commands to a
         robot this way.
         """
 
@@ -44,7 +44,7 @@ class Observers(Observer):
     """The observers of an engine, called as one observer. Thread-safe."""
 
     def __init__(self) -> None:
-        # Whether there are observers: without any, each request costs only this check.
+        # Whether there are observers. Without observers, each request costs only this check.
         self.any = False
         self._all: tuple[Observer, ...] = ()
         self._lock = threading.Lock()
@@ -80,4 +80,6 @@ class Observers(Observer):
             try:
                 call(observer)
             except Exception:
-                logger.exception("%s: a request is left out", type(observer).__name__)
+                logger.exception(
+                    "%s: the observer has failed and left out a request", type(observer).__name__
+                )

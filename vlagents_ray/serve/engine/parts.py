@@ -1,4 +1,4 @@
-"""The objects that intake, runner and moves of one engine share."""
+"""The objects that the intake, the runner and the moves of one engine share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vlagents_ray.serve.weights import WeightUpdates
 
 @dataclass(frozen=True, slots=True)
 class EngineParts:
-    """The objects that intake, runner and moves of one engine share."""
+    """The objects that the intake, the runner and the moves of one engine share."""
 
     settings: EngineSettings
     clock: Callable[[], float]  # s

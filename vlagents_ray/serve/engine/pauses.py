@@ -2,7 +2,7 @@
 
 Deadlines begin when a message arrives, and the kernel records that time for each message (see
 `vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not expose
-the record. After a pause of the whole process, the time is therefore looked up for HTTP requests;
+that time. After a pause of the whole process, the time is therefore looked up for HTTP requests;
 messages of the server's WebSockets and Ray's calls are assumed to have waited since the pause
 began.
 """
@@ -22,7 +22,8 @@ from vlagents_ray.serve.periodic import Periodic
 _LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data were last received, ms
 _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
-# Minimum and maximum time to read the backlog of a pause; it is half as long as the pause.
+# Minimum and maximum time to read the backlog of a pause, s. Between these limits, it is half as
+# long as the pause.
 _BACKLOG_S = (0.5, 5.0)
 
 # Ports of both ends of the current HTTP request's TCP connection, the server's first.
@@ -54,7 +55,7 @@ def _since_last_data_s() -> float | None:
                 connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
                 try:
                     names = connection.getsockname(), connection.getpeername()
-                    # The address of a Unix socket is no tuple.
+                    # The address of a Unix socket is not a tuple.
                     connected = tuple(name[1] for name in names if isinstance(name, tuple))
                     if connected == ports:
                         info = connection.getsockopt(
@@ -76,7 +77,8 @@ class PauseDetector:
         self._clock = clock
         self._checks = Periodic(_CHECK_S)
         self._checked: float | None = None  # time of the last check
-        # Start of the first pause whose messages are still read, and the end of that backlog.
+        # Start of the first pause whose messages are still being read, and the end of the time for
+        # that backlog.
         self._pause_began, self._backlog_until = 0.0, float("-inf")
         self._latest_began = 0.0  # start of the latest pause
 
@@ -97,7 +99,7 @@ class PauseDetector:
         now = self._clock()
         if self._checked is not None and now - self._checked > _PAUSE_S:
             self._record_pause(self._checked, now)
-        # This comes last: until then `waited_s` regards the pause as not recorded yet.
+        # This assignment comes last, since `waited_s` regards the pause as unrecorded until then.
         self._checked = now
 
     def _record_pause(self, began: float, ended: float) -> None:
@@ -112,8 +114,8 @@ class PauseDetector:
         self._backlog_until = ended + max(shortest_s, min(longest_s, lasted_s / 2))
 
     def latest(self) -> float:
-        """Return the start of the latest pause, s, of the clock, which identifies it; 0.0 if no
-        message can have waited in one.
+        """Return the start of the latest pause, s, of the clock, which identifies the pause; 0.0 if
+        no message can have waited in a pause.
         """
         checked, now = self._checked, self._clock()
         if checked is None:
@@ -123,8 +125,8 @@ class PauseDetector:
         return self._latest_began if now < self._backlog_until else 0.0
 
     def waited_s(self) -> float:
-        """Return how long a request that was just read may have waited, s: 0 unless there was a
-        pause.
+        """Return how long a request that was just read may have waited, s; 0 if there
+        was no pause.
         """
         if self._checked is None:
             return 0.0

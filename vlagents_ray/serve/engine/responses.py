@@ -43,8 +43,8 @@ def build_reply(
         result: The policy's result, or the error that it raised.
         contract: The policy's contract, if it has one; the action is checked against it.
         limit: Maximum size of action and info together, bytes.
-        policy: Version of the weights that acted, for the info, unless the policy itself names one
-            (as a proxy does).
+        policy: Version of the weights that computed the action, which is added to the info unless
+            the policy itself returns a version (as a proxy does).
 
     Returns:
         The reply; it has an error if the policy raised one, or if its result is invalid or too
@@ -104,8 +104,8 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
 
 
 def raised_at(error: Exception) -> str:
-    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if
-    there is none.
+    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if no
+    such line is known.
     """
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
@@ -145,8 +145,8 @@ class _BoundedWriter(ValueWriter):
         self._bytes = self._values = self._depth = 0
 
     def value(self, value: Any) -> Any:
-        """Encode a value as `ValueWriter` does; raise `MessageTooLarge` before copying one over
-        the limits.
+        """Encode a value as `ValueWriter` does; raise `MessageTooLarge` before a value over the
+        limits is copied.
         """
         self._values += 1
         if self._values > DEFAULT_LIMITS.items:

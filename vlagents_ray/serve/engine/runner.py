@@ -48,8 +48,8 @@ logger = logging.getLogger(__name__)
 
 Acting = tuple[PendingRequest, Session[LoadedModel]]
 
-# Share of a batch's time that the policy's thread computes, over which it is busy rather than
-# waits.
+# Share of a batch's time in which the policy's thread computes, above which the thread counts as
+# busy rather than waiting.
 _WORKING = 0.5
 
 
@@ -64,16 +64,18 @@ class WaitingReset:
         self._session = session
 
     def end(self, error: VLAgentsError | None) -> None:
-        """Queue the reset again, since its session holds the model, or answer it with the error."""
+        """Queue the reset again, now that its session holds the model, or answer it
+        with the error.
+        """
         self._runner.requeue(self._pending, error)
 
     def is_abandoned(self) -> bool:
-        """Return whether the reset need not wait any more."""
+        """Return whether the reset no longer needs to wait."""
         return self._runner.is_abandoned(self._pending, self._session)
 
 
 class Runner:
-    """Loads the policy, and runs its batches, on one thread: the policy's.
+    """Loads the policy, and runs its batches, on one thread: the policy's thread.
 
     Only `start` and `join` may be called on another thread.
     """
@@ -94,7 +96,8 @@ class Runner:
         self._reply_bytes = parts.settings.reply_bytes
         self._load_s = parts.settings.limits.load_s
 
-        # Whether the policy's thread is the engine's own, and not the one that calls `start`.
+        # Whether the engine has a separate thread for the policy. If not, the thread that calls
+        # `start` is the policy's thread.
         self.threaded = parts.settings.threaded
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         # Done when loading the policy has succeeded or failed.
@@ -149,7 +152,7 @@ class Runner:
                     del unsent  # their sessions may end before the next answers are deferred
 
                 if not acting.acquire(blocking=False):
-                    # The policy sleeps. Clients' pings are answered meanwhile.
+                    # The policy sleeps; clients' pings are still answered.
                     self._queue.poller.hand_to_reader()
                     acting.acquire()
                     self._queue.poller.reclaim()
@@ -158,7 +161,7 @@ class Runner:
                     self.run(taken)
                 finally:
                     acting.release()
-                del taken  # their observations may be in the sender's memory
+                del taken  # the observations may be in the sender's memory
 
             deliver(self._unsent)
             self._answers.shutdown()
@@ -187,8 +190,8 @@ class Runner:
         try:
             self._run(taken.batch)
         except BaseException as error:
-            # A policy that calls sys.exit() must not end the replica's only thread. Where the
-            # caller's thread runs the policy, Ctrl-C ends it.
+            # A policy that calls sys.exit() must not end the replica's only thread. If the caller's
+            # thread runs the policy, Ctrl-C ends that thread.
             if not self.threaded and not isinstance(error, SystemExit):
                 raise
             logger.exception("the batch failed")
@@ -219,7 +222,7 @@ class Runner:
         for (model, weights), group in acting.items():
             prepared_s = 0.0
             if self._queue.window.slow:
-                group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
+                group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - only the prepared ones
             if group:
                 deliver(self._act(model, weights, group, prepared_s))
 
@@ -241,14 +244,14 @@ class Runner:
             self._sessions.end_episode(session, pending, opening.first)
             model = session.model
             if model is None:
-                session.weights = None  # no commit of a model changes it
+                session.weights = None  # no commit of a model may change it
             else:
                 model.parameters.end(session)
 
             waiting = WaitingReset(self, pending, session)
             held = self._models.hold(session, opening.choice, waiting.end, waiting.is_abandoned)
             if held is None:
-                # The policy does no work on it while its checkpoint is loaded.
+                # The policy does not work on the reset while its checkpoint is being loaded.
                 self._queue.give_back([pending])
                 return ()  # `requeue` queues it again
         else:
@@ -296,7 +299,8 @@ class Runner:
                 for obs in request.history:
                     observes.observe(obs)
 
-        info = {**model.identity, **info}  # a session with an adapter returns both by itself
+        # The info of a session with an adapter already contains the identity.
+        info = {**model.identity, **info}
         key = pending.origin.prefix
         plan = RobotPlan()
         if opening.slo is not None:
@@ -317,11 +321,11 @@ class Runner:
         if session.announced or self._finder is None:
             return [(pending, reply)]
         session.announced = True
-        # The session's acts come over the same connection, to this replica.
+        # The session's acts arrive over the same connection, at this replica.
         if pending.origin.owner:
             self._finder.announce(session.id, session.steps)
             return [(pending, reply)]
-        # The next act may come to a replica that still has an older episode.
+        # The next act may arrive at a replica that still has an older episode.
         self._finder.announce(session.id, session.steps, (pending, reply))
         return ()
 
@@ -339,8 +343,8 @@ class Runner:
             pending.fail(reason)
 
     def is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
-        """Return whether the caller of that reset no longer waits, or the session was reset
-        again; called on any thread.
+        """Return whether the caller of a reset no longer waits, or the session was reset again;
+        called on any thread.
         """
         return (
             pending.is_abandoned
@@ -358,10 +362,11 @@ class Runner:
         elif request.op == "release":
             info = {"released": self._sessions.release(session_id, request.kwargs["version"])}
         elif request.op == "adopt":
-            # The replica of this process reuses names, for sessions that it compares.
+            # The replica of this process uses the same session id again for sessions that it
+            # compares.
             self._sessions.free(session_id)
-            # That replica decides which version of the weights acts: the session's may be older, or
-            # not held here.
+            # That replica decides which version of the weights is used: the session's own version
+            # may be older, or may not exist in this process.
             state = SessionState.from_info(request.kwargs)
             state = replace(state, weights=self._weights.acting())
             self._moves.adopt(session_id, state)
@@ -378,10 +383,10 @@ class Runner:
         self, pending: PendingRequest
     ) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         """Return the session of an act or an observation, with its model and its version of the
-        weights; raise if it is not the one that the request was sent for.
+        weights; raise an error if it is not the session for which the request was sent.
         """
         reserved = pending.reserved if isinstance(pending.reserved, ReservedAct) else None
-        # Since the lookup the session has ended, or arrived here from another replica.
+        # The session has ended since it was looked up, or has arrived here from another replica.
         if reserved is None or reserved.session.over:
             session = self._sessions.get(pending.session_id)
         else:
@@ -398,15 +403,16 @@ class Runner:
             raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
-        # A reset before it in the queue chose another model, or the session has arrived since.
+        # A reset that was queued before this request chose another model, or the session has
+        # arrived since.
         if reserved is None or model is not reserved.model:
             model.check(pending.request)
         return session, model, weights
 
     def _call(self, pending: PendingRequest) -> Any:
-        """Use an ability of a session's agent, for the process in whose place it acts."""
+        """Use an ability of a session's agent, for the replica of this child process."""
         session, model, weights = self._ready(pending)
-        if session.agent is None:  # `_ready` ensures that there is one
+        if session.agent is None:  # `_ready` ensures that there is an agent
             raise NotReset(f"session {pending.session_id!r}: has no agent; reset it")
         call = AbilityCall(**pending.request.kwargs)
         with model.busy, model.uncaptured, model.call(call.member):
@@ -461,7 +467,8 @@ class Runner:
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         slow = self._queue.window.slow
-        # The time is not measured for fast acts: two calls take a fiftieth of the fastest ones.
+        # The time is not measured for fast acts: its two calls take a fiftieth of the time of the
+        # fastest act.
         worked_s = time.thread_time() if slow else 0.0
         try:
             with model.busy, model.uncaptured, call:
@@ -477,12 +484,12 @@ class Runner:
             results = [error] * rows
 
         worked_s = time.thread_time() - worked_s if slow else 0.0
-        # This is skipped for a lone act that succeeded like the one before: it would take a
-        # hundredth of the act's time.
+        # This is skipped for a single act that succeeded like the act before it: the call would
+        # take a hundredth of the act's time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
 
-        del observations  # they may be in the sender's memory
+        del observations  # the observations may be in the sender's memory
         for pending, _ in acting:
             pending.request.drop_observations()
         if padding:
@@ -518,8 +525,8 @@ class Runner:
     def _set_pace(
         self, pending: PendingRequest, session: Session[LoadedModel], reply: Reply
     ) -> None:
-        """Learn from an act what its robot needs, and tell a robot that states its slack when to
-        replan.
+        """Update the needs of an act's robot. If the robot has sent its slack, add the time after
+        which it should replan to the answer.
         """
         act, plan = reply.act, session.plan
         if act is None:
@@ -537,7 +544,7 @@ def _not_taken(pending: PendingRequest, now: float) -> VLAgentsError:
     will.
     """
     if pending.origin.ended or not pending.expired(now):
-        return ConnectionLost("its connection has ended: not acted on, and never will be")
+        return ConnectionLost("the request's connection has ended: not acted on, and never will be")
     return DeadlineExceeded(
         f"no action within {pending.request.deadline_ms:g} ms: dropped before inference"
     )

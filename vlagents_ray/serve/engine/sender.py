@@ -29,21 +29,21 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Wait of a message in a pause of the process, s, in which a client may have left that cannot be
-# asked, and the time in which the event loop notices that, s.
+# Wait of a message in a pause of the process, s, above which the client may have left unnoticed,
+# and the time in which the event loop then notices that, s.
 _LONG_WAIT_S, _NOTICE_S = 0.25, 0.1
 
 
 class Sender:
-    """Submits the requests of a connection, whose end also ends its sessions, or of a caller
-    without a connection.
+    """Submits the requests of one sender: a connection, whose end also ends its sessions, or a
+    caller without a connection.
 
-    A request names its session; if it does not, it is for `session_id`, the sender's own session.
-    If the server has API keys, a caller cannot reach sessions of other keys: the key's name is part
-    of the session ids in the engine.
+    A request without a session id belongs to `session_id`, the sender's own session. If the server
+    has API keys, a caller cannot reach sessions of other keys: the key's name is part of the
+    session ids in the engine.
 
-    Each message has the `Charge` that was made when it arrived, which the sender completes: it
-    charges the requests that were not charged while they were decoded.
+    Each message has the `Charge` that was made when it arrived. The sender completes this charge:
+    it charges the requests that were not charged while they were decoded.
     """
 
     def __init__(
@@ -61,12 +61,13 @@ class Sender:
 
         Args:
             session_id: Name of the sender's own session; a random one by default.
-            caller: The authenticated caller, or the reason why none is needed. It has no default,
+            caller: The authenticated caller, or the reason why no key is needed. It has no default,
                 so that an endpoint without authentication fails.
-            has_left: Whether the client has left, so that no request of it is executed any more;
-                None if this process cannot know. It has no default, so that no endpoint omits it.
+            has_left: Returns whether the client has left, after which none of its requests is
+                executed; None if this process cannot know. It has no default, so that no endpoint
+                omits it.
             connected: Whether the sender has a connection, whose end also ends its sessions.
-            can_move: Whether the client connects to another replica if a reply asks for it.
+            can_move: Whether the client connects to another replica if a reply requests it.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
@@ -85,8 +86,8 @@ class Sender:
 
         # Prefix of the sender's session ids.
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""
-        # Id of the sender's own session in the engine, as of `id_of`: HTTP makes a sender for each
-        # request.
+        # Id of the sender's own session in the engine. It is stored, since HTTP creates a sender
+        # for each request.
         self.session_id = self._prefix + self._session_id
         owner = uuid.uuid4().hex if connected else ""
         self._origin = Origin(
@@ -122,20 +123,20 @@ class Sender:
         """Submit the requests of a message.
 
         Args:
-            receiver: Takes the message with all its replies, on the thread of the last one.
+            receiver: Receives the message with all its replies, on the thread of the last reply.
             admission: Admission of the message, if it was decoded with one.
             waited_s: Time that the message waited before it was read, s, which counts towards the
                 deadlines.
-            may_have_waited: Whether it may have waited for longer than is known.
+            may_have_waited: Whether the message may have waited longer than `waited_s`.
 
         Raises:
-            TypeError: The message has no charge, or another key is charged for it.
+            TypeError: The message has no charge, or its charge is for another key.
         """
         charge = message.charge
         if charge is None or not (charge.caller is self._caller or charge.caller == self._caller):
             raise TypeError(
-                "message: expected one that is charged to its sender's key, by Account.charge, got "
-                f"one charged to {None if charge is None else charge.key!r}"
+                "message: expected a message that `Account.charge` has charged to its sender's "
+                f"key, got one charged to {None if charge is None else charge.key!r}"
             )
         engine, (requests, refused) = self._engine, decoded
         now = engine.clock()
@@ -151,7 +152,7 @@ class Sender:
                 is_robot = requests[0].priority == "robot" and charge.is_robot
                 engine.admission.hold(size, is_robot, 0)
                 # The bytes are also released if the requests are dropped without an answer, as
-                # those of an ended connection.
+                # after the end of a connection.
                 reference = weakref.ref(message, engine.admission.release_with)
                 engine.admission.messages[reference] = size
         except VLAgentsError as error:
@@ -226,8 +227,7 @@ class Sender:
         return allowed
 
     def deliver(self, message: IncomingMessage) -> None:
-        """Pass a message with all its replies on to its receiver, between the calls of the
-        observers.
+        """Pass a message with all its replies to its receiver, between the calls of the observers.
 
         The memory of the message is released, and its client is requested to reconnect if the
         replica drains.
@@ -257,13 +257,14 @@ class Sender:
 
         If a pause of the process delayed a request, the delay counts towards its deadline. A busy
         event loop may have delayed it as well. When the caller stops waiting (deadline,
-        disconnect), its requests that no batch has taken are withdrawn.
+        disconnect), its requests that are not in a batch yet are withdrawn.
         """
         loop = asyncio.get_running_loop()
         waiting = WaitingTask()
         waited_s = self._engine.pauses.waited_s()
         if self._has_left is None and waited_s > _LONG_WAIT_S:
-            # The caller may have left during the pause; this lets the loop read that, and cancel.
+            # The caller may have left during the pause; the sleep lets the event loop notice that,
+            # and cancel this task.
             await asyncio.sleep(_NOTICE_S)
         sent = self.send(
             message,
@@ -307,11 +308,10 @@ class Sender:
     def release(self, *, for_good: bool = False) -> None:
         """End the sessions of a closed connection, unless its client has to reconnect elsewhere.
 
-        Its requests that no batch has taken are answered with an error, and are never executed or
-        searched for.
-
-        The sessions of such a client are kept, for another replica to fetch. `for_good` ends them
-        in any case, for protocols without a request to reconnect.
+        Its requests that are not in a batch yet are answered with an error. They are never
+        executed, and their sessions are not searched for. The sessions of a client that has to
+        reconnect are kept, so that another replica can fetch them. `for_good` ends them in any
+        case, for protocols that cannot request a reconnection.
         """
         self._origin.ended = True
         owner = self._origin.owner

@@ -17,16 +17,16 @@ def accept_any(_: Contract | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class EngineSettings:
-    """The settings of an engine, with those of a deployment that concern it."""
+    """The settings of an engine, including the settings of a deployment that concern it."""
 
     max_batch_size: int = 16  # maximum number of observations in a batch
     patience: float = 0.0  # see `BatchQueue`
-    # Sizes to which batches are padded; the largest one is `max_batch_size`. Without them, a
-    # compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
+    # Sizes to which batches are padded; the largest one is `max_batch_size`. If there are none, a
+    # compiled policy that specifies no sizes is compiled for 1, 2, 4, … `max_batch_size`.
     batch_sizes: Sequence[int] = ()
     session_limit: int = 1000  # maximum number of sessions
     session_idle_s: float = 600.0  # time without a request after which a session may be dropped, s
-    slo: Slo | None = None  # what a robot needs whose reset states no SLO
+    slo: Slo | None = None  # need of a robot whose reset contains no SLO
     # Version of the policy; sessions only move between replicas of equal version and settings.
     version: str = ""
     # Raises an error if a policy with that contract cannot be served.
@@ -36,6 +36,6 @@ class EngineSettings:
     reply_bytes: int = DEFAULT_LIMITS.reply_bytes  # maximum size of a reply
     # Maximum size of all messages in flight together, bytes.
     in_flight_bytes: int = DEFAULT_LIMITS.in_flight_bytes
-    # Whether a thread of the engine runs the policy. Otherwise the thread that calls `start` does,
-    # and then calls `queue.take` and `runner.run` in turns.
+    # Whether a thread of the engine runs the policy. Otherwise the thread that calls `start` runs
+    # the policy, and then calls `queue.take` and `runner.run` alternately.
     threaded: bool = True
