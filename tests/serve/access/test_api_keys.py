@@ -358,7 +358,7 @@ def test_an_engine_accepts_no_message_that_is_not_charged_to_its_sender(file: Pa
     for message in (uncharged, free_of_charge):
         with pytest.raises(
             TypeError,
-            match="expected a message that `Account.charge` has charged to its sender's key",
+            match="has charged to its sender's key",
         ):
             sender.send(message, Decoded([Request("reset", Obs())], {}), Calls(ignore))
     engine.close()
