@@ -1,9 +1,10 @@
-"""Whether robots had their actions in time, as they report it with their requests.
+"""Whether robots had their actions in time, according to the reports in their requests.
 
-A chunk player on a robot adds to each request the number of ticks at which the policy was to act
-since the last one, those of them without a row of an answer (*starved ticks*), and the age of the
-action that it executed last. The entries of the requests' info are untrusted: `RobotReport.of`
-checks them, and a session keeps a fixed number of values however often its robot reports.
+A chunk player on a robot adds three values to each request: the number of ticks since the last
+request at which the policy had to act, the number of these ticks without a row of an answer
+(*starved ticks*), and the age of the last executed action. The entries in the requests' info are
+untrusted. `RobotReport.of` checks them, and a session keeps a fixed number of values regardless of
+how often its robot reports.
 """
 
 from __future__ import annotations
@@ -22,24 +23,24 @@ from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.slo import SHARE
 
 WINDOW_S = 10  # time over which shares, ages and the goodput are computed, s
-# The largest number of ticks and age of one report. A robot that was offline for weeks stays below
-# them, as it would be rejected for ever otherwise.
+# Maximum number of ticks, and maximum age, in one report. The report of a robot that was offline
+# for weeks stays below these limits, since the robot would otherwise be rejected forever.
 _MOST_TICKS = 2**31
 _MOST_AGE_MS = 2.0**31
-_AGES = 128  # number of the last ages that a session keeps
+_AGES = 128  # maximum number of ages that a session keeps
 
 
 class RobotReport(NamedTuple):
-    """What a robot reports with one request."""
+    """The report of a robot in one request."""
 
-    ticks: int  # ticks at which the policy was to act since the last request
-    starved: int  # those of them without a row of an answer
+    ticks: int  # ticks since the last request at which the policy had to act
+    starved: int  # number of these ticks without a row of an answer
     age_ms: float | None  # age of the action that was executed last; None if there was none
-    is_of_further_model: bool = False  # whether another model's session counts the robot
+    is_of_further_model: bool = False  # whether the session of another model counts the robot
 
     @classmethod
     def of(cls, info: Mapping[str, Any]) -> RobotReport | None:
-        """Return the report in the info of an observation; None without one.
+        """Return the report in the info of an observation; None if there is none.
 
         Raises:
             InvalidInput: An entry has another type than a chunk player sends, or is out of range.
@@ -81,14 +82,14 @@ class RobotTimes:
     """The ticks and the ages that the robot of one session reports. Thread-safe."""
 
     def __init__(self, priority: Priority = Priority.ROBOT) -> None:
-        """Start without reports, for a session of that priority."""
+        """Create the record of a session, without reports."""
         self.priority = priority
         self.target_share = SHARE  # share of the ticks in time that the robot needs
-        self.is_of_further_model = False  # whether another model's session counts the robot
+        self.is_of_further_model = False  # whether the session of another model counts the robot
         self.ticks = 0  # in total
         self.starved = 0  # in total
         self._lock = threading.Lock()
-        # By second, oldest first: its number, ticks and starved ticks.
+        # Number, ticks and starved ticks of each second, oldest first.
         self._seconds: deque[tuple[int, int, int]] = deque(maxlen=WINDOW_S + 1)
         self._ages: deque[tuple[float, float]] = deque(maxlen=_AGES)  # time, s, and age, ms
 
@@ -109,7 +110,9 @@ class RobotTimes:
                 self._ages.append((now, report.age_ms))
 
     def lately(self, now: float) -> TimeShare:
-        """Return how well the robot was served in the last `WINDOW_S` seconds before `now`, s."""
+        """Return statistics about the service to the robot in the last `WINDOW_S` seconds before
+        `now`, s.
+        """
         with self._lock:
             ages_ms = [age_ms for when, age_ms in self._ages if when > now - WINDOW_S]
         return TimeShare.from_ages(*self._ticks_lately(now), ages_ms)
@@ -129,19 +132,20 @@ class RobotTimes:
         """Return whether the robot's share was at least its target in the last `WINDOW_S` seconds
         before `now`, s; None if it reported no ticks.
         """
-        share = TimeShare(*self._ticks_lately(now)).share  # the ages take ten times as long
+        # Computing the ages would take ten times as long.
+        share = TimeShare(*self._ticks_lately(now)).share
         return None if share is None else share >= self.target_share
 
 
 class Goodput(NamedTuple):
     """The robots that report their ticks."""
 
-    robots: int  # those that reported ticks in the last `WINDOW_S` seconds
-    in_time: int  # those of them with a share of at least their target
+    robots: int  # number of robots that reported ticks in the last `WINDOW_S` seconds
+    in_time: int  # number of these robots with a share of at least their target
 
     @property
     def late(self) -> int:
-        """The robots with a share below their target."""
+        """Number of robots with a share below their target."""
         return self.robots - self.in_time
 
 
@@ -158,13 +162,14 @@ def goodput(times: Iterable[RobotTimes], now: float) -> dict[Priority, Goodput]:
 
 
 def describe(times: Iterable[RobotTimes], now: float) -> dict[str, Any]:
-    """Return how the robots of a replica were served in the last `WINDOW_S` seconds before `now`,
-    s, for its metadata.
+    """Return statistics about the service to a replica's robots in the last `WINDOW_S` seconds
+    before `now`, s, for the metadata.
 
     Returns:
-        `robots`, the number of those that report their ticks; `in_time`, the number of those whose
-        share was at least their target; `share`, that of the ticks of all of them, None without
-        ticks; and `age_p95_ms`, the largest 95th percentile of the ages of one robot's actions.
+        `robots`, the number of robots that report their ticks; `in_time`, the number of robots
+        whose share was at least their target; `share`, the share of all robots' ticks that were in
+        time, None without ticks; and `age_p95_ms`, the largest 95th percentile of the ages of one
+        robot's actions.
     """
     robots = [robot for robot in times if robot.priority is Priority.ROBOT]
     lately = [robot.lately(now) for robot in robots]

@@ -37,8 +37,8 @@ def build_engine(
 
     Args:
         args: The settings, with `environment.process` decided.
-        config: The settings of the policy, with those of the deployment's `user_config`.
-        finder: Fetches sessions from other replicas; None if there are none.
+        config: The settings of the policy, including the deployment's `user_config`.
+        finder: Fetches sessions from other replicas; None if there are no other replicas.
         threaded: Whether a thread of the engine runs the policy.
     """
     settings = EngineSettings(
@@ -83,7 +83,7 @@ def policy_metadata(
         "contract": None if contract is None else contract.to_json(),
         "continues_plans": models.continues_plans,
         "longest_prefix": models.longest_prefix,
-        "reads_slo": True,  # at a reset
+        "reads_slo": True,  # selected at a reset
         "slo": None if args.slo is None else args.slo.objective().to_json(),
         "version": importlib.metadata.version("vlagents-ray"),
         "code": None if code is None else code.to_json(),
@@ -113,8 +113,8 @@ class LocalAgent(Agent):
         contract: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Begin an episode. If there is a `contract`, the policy's contract is first compared with
-        it, as a server does.
+        """Begin an episode. If `contract` is set, it is first compared with the policy's contract,
+        as a server does.
         """
         [reply] = self._replies(
             [self], [Request("reset", obs, instruction, kwargs, contract, priority="simulation")]
@@ -133,7 +133,7 @@ class LocalAgent(Agent):
             results.append(
                 reply.error
                 or reply.act
-                or PolicyFailed("act: the policy answered without an action")
+                or PolicyFailed("act: expected an action from the policy, got none")
             )
         return results
 
@@ -163,7 +163,7 @@ class LocalAgent(Agent):
 
 
 class LocalPolicy(LocalAgent):
-    """A deployment's policy as an agent. `sessions` opens more sessions of it."""
+    """A deployment's policy as an agent. `sessions` opens more sessions of the policy."""
 
     def __init__(
         self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False
@@ -172,10 +172,10 @@ class LocalPolicy(LocalAgent):
 
         Args:
             args: The settings. A policy with its own Python environment runs in a child process.
-            config: The settings of the policy, with those of the deployment's `user_config`.
+            config: The settings of the policy, including the deployment's `user_config`.
             threaded: Whether a separate thread runs the policy, in batches of sessions that act at
-                the same time. By default, the caller's thread runs it, so that a debugger can stop
-                in it.
+                the same time. By default, the caller's thread runs the policy, so that a debugger
+                can stop in it.
         """
         environment = args.environment.model_copy(update={"process": "child"})
         local_args = args.model_copy(update={"environment": environment})

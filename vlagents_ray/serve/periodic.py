@@ -33,10 +33,10 @@ class Periodic:
                 self._thread.start()
 
     def remove(self, call: Callable[[], None]) -> None:
-        """Stop calling `call`. This does nothing if it was not added.
+        """Stop calling `call`. This does nothing if `call` was not added.
 
-        If it was the last function, this waits for a running call, unless it is called by the
-        periodic thread itself.
+        If `call` was the last function, this method waits for a running call, unless the periodic
+        thread itself calls `remove`.
         """
         with self._lock:
             self._calls = [added for added in self._calls if added != call]

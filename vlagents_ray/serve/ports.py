@@ -1,4 +1,4 @@
-"""TCP ports: finding free ones, and reserving one for a server that starts later."""
+"""TCP ports: finds free ports, and reserves a port for a server that starts later."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import peer_uid
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
-# Environment variable of a replica: the address of its server, if it is not Serve's.
+# Environment variable of a replica: the address at which its server listens, if it differs from
+# Serve's address.
 HOST = "VLAGENTS_RAY_HOST"
 _BLOCKS = (20_000, 24_000)  # range of the ports for replicas
-# Range of the ports for HAProxy and others, below the system's ephemeral ports.
+# Range of the ports for HAProxy and other servers, below the system's ephemeral ports.
 _PORTS = (24_000, 32_700)
-_CLAIMS = 256  # maximum number of ports that this process claims at once, the latest ones
+_CLAIMS = 256  # maximum number of claims of this process; older claims are released
 _RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
 _PROBES = 64  # maximum number of processes that read the owner of a claim at the same time
 _LISTEN_S = 0.002  # time within which a process listens at a claim that it has just bound
-_claims: deque[int] = deque()  # descriptors of the claims; the kernel closes them with the process
+# Descriptors of the claims; the kernel closes them when the process ends.
+_claims: deque[int] = deque()
 _excluded: set[int] = set()  # ports that `free_port` never returns
 _random = random.SystemRandom()
 
@@ -44,7 +46,8 @@ def free_port(host: str = LOOPBACK) -> int:
 
 
 def _claim(port: int) -> bool:
-    """Claim a port for this process; False if another process of this user has claimed it.
+    """Claim a port for this process; return False if another process of this user has claimed the
+    port.
 
     The claim is an abstract Unix socket named after the port, which the kernel lets only one
     process bind, and closes when that process ends. Any account of the machine can bind such names,
@@ -58,7 +61,7 @@ def _claim(port: int) -> bool:
     except OSError:
         claim.close()
         return not _is_claim_of_this_user(name)
-    claim.listen(_PROBES)  # so that other processes can read its owner
+    claim.listen(_PROBES)  # so that other processes can read the claim's owner
     _claims.append(claim.detach())
     if len(_claims) > _CLAIMS:
         os.close(_claims.popleft())
@@ -84,11 +87,10 @@ def keep(*ports: int) -> None:
 
 
 def free_block(size: int) -> int:
-    """Return the first of `size` consecutive ports for the replicas. The first port is free, and
-    Ray skips others that are in use.
-
-    The block is claimed, as by `free_port`, since servers that start at the same time would
-    otherwise choose the same one. If all free blocks are claimed, a block is shared.
+    """Return the first of `size` consecutive ports for the replicas. The first port is free; Ray
+    skips other ports of the block that are in use. The block is claimed as in `free_port`, since
+    servers that start at the same time would otherwise choose the same block. If all free blocks
+    are claimed, a block is shared.
     """
     bases = list(range(*_BLOCKS, size))
     _random.shuffle(bases)
@@ -104,7 +106,7 @@ def free_block(size: int) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Return whether this process can listen on that port."""
+    """Return whether this process can listen on a port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -118,14 +120,15 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
     """Return a socket that is bound to the port for the dialect `name`, and does not listen yet.
 
     Raises:
-        ConfigError: Another process still uses the port after `timeout_s`, or this machine has no
-            such address.
+        ConfigError: Another process still uses the port after `timeout_s`, or the address does not
+            belong to this machine.
     """
     try:
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except OSError as error:
         raise ConfigError(
-            f"{name}: {host!r} is no address of this machine ({error}); change dialects.{name}.host"
+            f"{name}: {host!r} is not an address of this machine ({error}); change "
+            f"dialects.{name}.host"
         ) from error
     family, _, _, _, address = addresses[0]
 

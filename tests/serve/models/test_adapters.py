@@ -147,7 +147,7 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
         ({"checkpoint": "fold"}, r"expected one of \['late', 'pour', 'stack'\].*, got 'fold'"),
         (
             {"checkpoint": "stack", "checkpoint_step": 3},
-            "expected none with the adapter 'stack', which has no steps, got 3",
+            "expected none with the adapter 'stack', since an adapter has no steps, got 3",
         ),
         (
             {"checkpoint": "stack", "adapter": "pour"},

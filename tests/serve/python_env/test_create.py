@@ -109,7 +109,10 @@ def test_a_light_one_and_one_of_another_python_are_without_ray(
     said: list[str] = []
     make_environment(requirements, tmp_path / "env", progress=said.append)
     assert "ray==" not in asked[-1]
-    assert "Python 3.12 is not this one's 3.11: without Ray, for a child process" in said
+    assert (
+        "Python 3.12 differs from this environment's 3.11: installing without Ray, for a child process"
+        in said
+    )
 
 
 OWN = "{}.{}".format(*sys.version_info[:2])
@@ -234,7 +237,7 @@ def test_torch_is_for_cuda_12_where_the_driver_is_too_old_for_13(
     make_environment(requirements, tmp_path / "env", progress=said.append)
     assert asked[-1].endswith("torch<2.11\n")
     assert (
-        "the driver, 570.124.06, is older than 580, the first for CUDA 13: taking torch<2.11"
+        "the driver, 570.124.06, is older than 580, the first driver for CUDA 13: using torch<2.11"
         in said
     )
     monkeypatch.setenv("UV_TORCH_BACKEND", "cu126")

@@ -88,7 +88,7 @@ def test_the_same_python_and_ray_host_the_replica() -> None:
 def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) -> None:
     found = probe(sys.executable)
     for name, version, said in (
-        ("python", "3.10.1", "it is Python 3.10.1, the cluster's is 3."),
+        ("python", "3.10.1", "it has Python 3.10.1, the cluster has Python 3."),
         ("ray", "2.40.0", "it has Ray 2.40.0, the cluster has"),
         ("ray", None, "it has no Ray, the cluster has"),
     ):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
-# The keys of an application that Serve does not have to apply.
+# The keys of an application that Serve need not apply.
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 
@@ -44,7 +44,7 @@ class HttpSettings(BaseModel, extra="allow"):
 
 
 class Application(BaseModel, extra="allow"):
-    """An application of this package or of another one."""
+    """An application of this or another package."""
 
     name: str = "default"
     route_prefix: Annotated[str, Field(pattern="^/")] | None = "/"
@@ -65,7 +65,9 @@ class Deployment(BaseModel, extra="allow"):
 
     @property
     def plain(self) -> bool:
-        """Whether all applications are of this package, without settings that Serve must apply."""
+        """Whether all applications belong to this package and have no settings that Serve must
+        apply.
+        """
         if self.model_extra or self.http_options.model_extra:
             return False
         if our_apps(self) != self.applications:
@@ -107,14 +109,14 @@ def read_deployment(
     app: str | None = None,
     step_follows: bool = False,
 ) -> Deployment:
-    """Read a deployment and check it.
+    """Read and check a deployment.
 
     Args:
         source: A YAML file, or the name of a policy.
         args: The args of a policy that is given by its name.
         overrides: Changes of the args of the only policy of the deployment, such as
             `batch.max_size=8` or `config.gain=0.3`.
-        app: The application of a file that `overrides` change, if it has several.
+        app: The application that `overrides` change, if the file has several applications.
         step_follows: Whether `with_settings` sets `checkpoint_step` later, so that a checkpoint
             with `{step}` may lack it.
 
@@ -151,7 +153,7 @@ def _deployment_of_file(
 
     application = _application_to_change(config, str(file), overrides[0], app)
     if any(override.path[0] == "config" for override in overrides):
-        # Otherwise `user_config` would take priority over a changed setting.
+        # Otherwise a value in `user_config` would take priority over the changed setting.
         application.args["config"] = own_settings(application)
         for settings_of_serve in application.deployments:
             if settings_of_serve.get("name") == POLICY:
@@ -177,7 +179,7 @@ def _application_to_change(
     """Return the application whose args are changed.
 
     Raises:
-        ConfigError: The file has several applications, or none of this name.
+        ConfigError: The file has several applications, or no application with this name.
     """
     applications = {application.name: application for application in our_apps(config)}
     if app is None and len(applications) == 1:
@@ -225,8 +227,8 @@ def _settings_of_checkout(policy: str) -> dict[str, Any]:
 def policy_application(
     source: str, app: str | None = None, overrides: Sequence[Override] = ()
 ) -> Application:
-    """Return the application with the name `app` of a deployment, or its only application, with its
-    args changed by `overrides`.
+    """Return the application `app` of a deployment, or its only application, with `overrides`
+    applied to its args.
     """
     config = read_deployment(source, overrides=overrides, app=app)
     applications = {application.name: application for application in our_apps(config)}
@@ -251,8 +253,8 @@ def with_gateways_at(config: Deployment, host: str) -> Deployment:
 
 
 def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> Deployment:
-    """Return the deployment of one application with these settings of a dialect, which replace
-    those of the file.
+    """Return the deployment of one application with these settings of a dialect, which replace the
+    dialect's settings in the file.
     """
     changed = config.model_copy(deep=True)
     apps = our_apps(changed)
@@ -284,8 +286,8 @@ def only_application(name: str, config: Deployment) -> Application:
 
 
 def together(policies: Mapping[str, Deployment]) -> Deployment:
-    """Join several policies into one deployment, each as an application under its name, without
-    dialects.
+    """Join several policies into one deployment without dialects, in which each policy is an
+    application under its name.
 
     Raises:
         ConfigError: One of the deployments contains more than one application.
@@ -305,7 +307,8 @@ def with_settings(
     steps: bool = False,
     step_follows: bool = False,
 ) -> Deployment:
-    """Return the deployment with these settings of its policies, which replace those of the file.
+    """Return the deployment with these settings of its policies, which replace the settings in the
+    file.
 
     With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
     """
@@ -421,10 +424,8 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
 def _require_policy(
     args: ServerArgs, config: dict[str, Any], *, installed: bool, step_follows: bool
 ) -> None:
-    """Build the policy in its environment with the settings of each choice, and check that the
-    dialects fit its contract.
-
-    A replica repeats the check.
+    """For each choice of a checkpoint, build the policy in its environment, and check that the
+    dialects fit the policy's contract. A replica repeats the check.
 
     Args:
         args: The settings of the server.

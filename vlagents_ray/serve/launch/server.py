@@ -43,17 +43,19 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_f
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
-# Time for Serve's proxies to listen; on a busy node, several are replaced before one does.
+# Time within which Serve's proxies must listen, s. On a busy node, Serve replaces several proxies
+# before one of them listens.
 _PROXIES_S = 180.0
 _HAPROXY_S = 0.5  # time in which HAProxy is updated after the end of an application, s
-_LOOK_S = 0.2  # interval of the checks of Serve's proxies and of its end, s
+# Interval of the checks whether Serve's proxies listen, and whether Serve has ended, s.
+_LOOK_S = 0.2
 _START_S = 600.0  # time for a policy to become ready on this machine
 _GROW_S = 3600.0  # time for a policy to become ready on a cluster that may add a machine first
 _REMIND_S = 30.0
 
 
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
-    """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
+    """Wait until all proxies listen; raise the error of a proxy that cannot listen.
 
     Serve kills a proxy that does not start within some seconds, for example on a busy node, and
     starts another one.
@@ -80,9 +82,9 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
 def end_applications(client: Any, names: Sequence[str]) -> None:
     """End these applications, and wait until their replicas have ended.
 
-    When Serve shuts down, it stops HAProxy at once, and with it the connections of the clients,
-    before the replicas have answered them and closed their WebSockets. Without its applications,
-    HAProxy keeps these connections; see also `haproxy.close_port`.
+    When Serve shuts down, it stops HAProxy immediately. This would end the connections of the
+    clients before the replicas have sent their answers and closed the WebSockets. If only the
+    applications are removed, HAProxy keeps these connections; see also `haproxy.close_port`.
     """
     private.begin_to_end(client, names)
     deadline = time.monotonic() + _SHUTDOWN_S
@@ -103,13 +105,13 @@ def end_applications(client: Any, names: Sequence[str]) -> None:
 
 def shut_down(client: Any) -> None:
     """Shut Serve down as `serve.shutdown` does, so that replicas drain and HAProxy stops, but
-    without its error message.
+    without an error message of Ray.
 
     The controller ends itself during this call, which Ray would report as a failed task that will
     be retried. A signal to the whole process group or service, such as systemd's SIGTERM, also ends
     Ray's head. Serve can then neither answer nor continue, and the reaper ends its processes.
     """
-    # Ray would report a call in progress at the end as a failed task.
+    # Ray would report a call that is in progress at the end as a failed task.
     for poll in private.long_polls(client):
         poll.stop()
     client.shutdown_cached_handles()
@@ -152,7 +154,7 @@ def running_server(
 
     Args:
         config: The deployment.
-        host: The address to listen on, IPv4. Other than loopback addresses require `keys_file`,
+        host: The address to listen on, IPv4. Addresses other than loopback require `keys_file`,
             keys in the deployment, or `insecure`.
         port: The port; 0 selects a free one.
         address: A running Ray cluster, or "auto"; by default this process's cluster, or a new local
@@ -163,7 +165,7 @@ def running_server(
         insecure: Whether other machines may connect without keys; replaces `access.insecure`.
         plain_http: Replaces `access.plain_http`.
         tls: The server's certificate and key.
-        ingress: Whether to serve HTTP. Without it, a new local cluster serves only its own
+        ingress: Whether to serve HTTP. Without HTTP, a new local cluster serves only its own
             processes, at `serve://APP`, and starts and ends faster.
 
     Raises:
@@ -178,7 +180,7 @@ def running_server(
     private.check_ray()
     config = with_gateways_at(config, host)
     config = _with_access(config, keys_file, insecure, plain_http)
-    if address is None:  # otherwise each replica checks and warns on its own machine
+    if address is None:  # otherwise each replica checks the access, and warns, on its own machine
         _check_access(config, host, insecure, tls)
     if tls is not None:
         tls.check()
@@ -202,8 +204,8 @@ def running_server(
         if running:
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL "
-                f"(serve://{running[0]} inside the cluster), or `serve deploy` one file with "
-                "those and yours"
+                f"(serve://{running[0]} inside the cluster), or `serve deploy` one file with these "
+                "applications and yours"
             )
         stack.push(session.unless_lost(lambda: shut_down(client)))
 
@@ -258,7 +260,7 @@ def _with_access(
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         access = dict(app.args.get("access") or {})
-        if keys_file is not None or insecure:  # either option replaces both settings of the file
+        if keys_file is not None or insecure:  # either option replaces both settings in the file
             access |= {
                 "insecure": insecure,
                 "keys_file": None if keys_file is None else str(keys_file.absolute()),
@@ -311,12 +313,12 @@ def _require_gpus(config: Deployment, local_gpus: float | None = None) -> None:
         return
     missing = _missing_gpus(config, local_gpus)
     if missing is not None:
-        raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
+        raise ConfigError(f"{missing}; if the machine has more GPUs, run `vlagents-ray doctor`")
 
 
 def _missing_gpus(config: Deployment, local_gpus: float | None = None) -> str | None:
-    """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if
-    it has enough.
+    """Return a sentence about the missing GPUs of this machine or the running cluster; None if
+    there are enough.
     """
     needed = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     total = sum(needed.values())
@@ -327,14 +329,14 @@ def _missing_gpus(config: Deployment, local_gpus: float | None = None) -> str | 
     where = "this machine" if is_local else "this cluster"
     return (
         f"resources.num_gpus: expected at most {available:g} GPUs, which {where} has, got "
-        f"{total:g} for the replicas of {needed}; set less (0 runs on the CPU), or add a machine "
-        "that has them"
+        f"{total:g} for the replicas of {needed}; reduce the setting (0 runs on the CPU), or add a "
+        "machine with GPUs"
     )
 
 
 def _begins_with_replicas(app: Application) -> bool:
-    """Return whether an application gets a replica before its first request; False if it is of
-    another package and might not.
+    """Return whether an application gets a replica before its first request; False for an
+    application of another package that may start without one.
     """
     return app.import_path == IMPORT_PATH and ServerArgs(**app.args).initial_replicas > 0
 
@@ -397,9 +399,9 @@ def _ray(
 
     if tls is not None:
         raise ConfigError(
-            "TLS on a cluster that runs already: end it before Serve, in the cluster's load "
-            "balancer, or name ssl_certfile and ssl_keyfile under http_options in the deployment "
-            "file"
+            "TLS on a running cluster: expected no TLS options, got some; terminate TLS in front "
+            "of Serve, in the cluster's load balancer, or set ssl_certfile and ssl_keyfile under "
+            "http_options in the deployment file"
         )
     has_haproxy = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
     if has_haproxy and address is None and host not in (LOOPBACK, "localhost", EVERYWHERE):
@@ -436,14 +438,14 @@ def own_ray(
     can reach.
 
     The arguments are described at `running_server`. The server will listen at `host` and `port` as
-    soon as it has a replica. If an application `begins_empty`, it listens immediately, as the first
-    request then starts the replica.
+    soon as it has a replica. If an application `begins_empty`, the server listens immediately,
+    since the first request then starts the replica.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
 
     Raises:
-        ConfigError: The port is in use, certificates of clients need HAProxy, which is not
+        ConfigError: The port is in use, HAProxy, which certificates of clients require, is not
             installed, or the environment excludes Ray's token or HAProxy's settings.
     """
     if os.environ.get(session.MODE, "token").lower() != "token":
@@ -453,17 +455,17 @@ def own_ray(
         )
     if not is_free(host, port):
         raise ConfigError(
-            f"cannot listen on {host}:{port}: it is taken; choose another --port or --host"
+            f"cannot listen on {host}:{port}: the port is in use; choose another --port or --host"
         )
     keep(port)
 
     with session.ray_folder() as folder, contextlib.ExitStack() as stack:
         # By default Ray starts workers with a low priority, so that a policy would wait for all
-        # other processes. Proxies start while policies load: on a slow machine Serve would replace
-        # them after three times its 5 s.
+        # other processes. Proxies start while policies load. On a slow machine, Serve would replace
+        # the proxies after three times its default of 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
-        # These variables replace the user's. At `HOST` the replicas listen for WebSockets: on
-        # loopback if only TLS may cross the network.
+        # These variables replace the user's values. Replicas listen for WebSockets at the address
+        # `HOST`, which is loopback if only TLS may cross the network.
         fixed = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
 
         listener = None
@@ -487,9 +489,9 @@ def own_ray(
                     fixed[name] = value
             environment |= settings
 
-        # If another server's process started this one, it has inherited that server's files and
-        # ports, which are replaced. Otherwise the user's values are kept, unless they are in
-        # `fixed`.
+        # If another server's process started this one, this process has inherited the files and
+        # ports of that server, which are replaced. Otherwise the user's values are kept, unless
+        # they are in `fixed`.
         is_inherited = MARK in os.environ
         unset = {
             name: value
@@ -498,7 +500,8 @@ def own_ray(
         }
         stack.enter_context(session.variables(unset | fixed | session.token_variables(folder)))
 
-        # Ray has read the variable `ALONE` when it was imported, so its setting is also changed.
+        # Ray has read the variable `ALONE` when Ray was imported, so Ray's copy of the setting is
+        # also changed.
         stack.callback(private.use_loopback, private.use_loopback(True))
         if listener is not None:
             listener.require()
@@ -529,7 +532,8 @@ def wait_until_ready(
 
     Args:
         serve: The module `ray.serve`.
-        apps: The URL of each application; one without a URL is called through a Serve handle.
+        apps: The URL of each application; an application without a URL is called through a Serve
+            handle.
         ours: The applications of this package, which report why their policy is not ready yet.
         deadline: End of the waiting, s, of `time.monotonic()`.
         missing: Describes the resources that the cluster lacks, which is logged immediately, and
@@ -581,7 +585,7 @@ def _deploy_failure(app: Any) -> str:
 def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:
     """Return the reason why the application is not ready; None if it is ready.
 
-    A replica reports the reason, since over HTTP only clients with a key get it.
+    The reason is requested from a replica, since over HTTP only clients with a key can read it.
     """
     refusal = None if url is None else _http_reason(url)
     if app not in ours or (url is not None and refusal is None):

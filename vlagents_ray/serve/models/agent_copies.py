@@ -70,7 +70,7 @@ class _Shared:
         self._parameter: type | None = torch.nn.Parameter if torch is not None else None
 
     def add(self, obj: Any) -> int:
-        """Add an object to the shared ones, and return its index."""
+        """Add an object to the shared objects, and return its index."""
         number = self.numbers.get(id(obj))
         if number is None:
             number = self.numbers[id(obj)] = len(self.objects)
@@ -118,7 +118,7 @@ class _Shared:
 
 class _Pickler(pickle.Pickler):
     """Pickles an agent in memory without its shared objects. With `find`, objects that must be
-    shared are added to them.
+    shared are added to the shared objects.
     """
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
@@ -174,7 +174,7 @@ class AgentCopies:
 
         Args:
             agent: The copy.
-            find: Whether to add objects that copies must share to the shared ones.
+            find: Whether to add the objects that copies must share to the shared objects.
 
         Raises:
             Exception: Any error of pickling.
@@ -184,7 +184,7 @@ class AgentCopies:
         return file.getvalue()
 
     def load(self, data: bytes) -> Agent:
-        """Return the copy that `dump` wrote, in this replica or in another one with the same
+        """Return the copy that `dump` wrote, in this replica or in another replica with the same
         fingerprint.
         """
         agent: Agent = _Unpickler(data, self._shared).load()

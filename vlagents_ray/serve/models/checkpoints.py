@@ -22,7 +22,7 @@ from vlagents_ray.policies.base.checkpoint import at_step
 from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
-_ADAPTERS = "adapters"  # setting of a policy: its adapters by name
+_ADAPTERS = "adapters"  # setting of a policy: the adapters by name
 
 
 class Checkpoints:
@@ -43,7 +43,8 @@ class Checkpoints:
 
         Args:
             make: Creates an agent from settings, without loading anything.
-            choices: See `CheckpointArgs`, as for the other arguments.
+            choices: The choices by name. `CheckpointArgs` describes this and the following
+                arguments.
             steps: Whether sessions may choose a step.
             loaded: Maximum number of loaded checkpoints.
         """
@@ -97,8 +98,8 @@ class Checkpoints:
         if isinstance(choice, str) and choice in self._adapters:
             if step is not None:
                 raise UnknownCheckpoint(
-                    f"{STEP}: expected none with the adapter {choice!r}, which has no steps, got "
-                    f"{step!r}; leave it out"
+                    f"{STEP}: expected none with the adapter {choice!r}, since an adapter has no "
+                    f"steps, got {step!r}; leave it out"
                 )
             adapter = rest.get(ADAPTER)
             if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
@@ -133,8 +134,8 @@ class Checkpoints:
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
     def examples(self) -> list[CheckpointChoice]:
-        """Return an example of each choice: the deployment's own checkpoint, every named one, and a
-        step if sessions may choose steps.
+        """Return an example of each choice: the deployment's own checkpoint, every named
+        checkpoint, and a step if sessions may choose steps.
         """
         return [
             DEFAULT,
@@ -152,7 +153,9 @@ class Checkpoints:
     def offers(
         self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]
     ) -> bool:
-        """Return whether the deployment offers that choice, and the choice has these settings."""
+        """Return whether the deployment offers the choice, and whether `settings` are the settings
+        of that choice.
+        """
         known = choice.name is None or choice.name in self._choices
         return (
             known

@@ -37,7 +37,8 @@ from vlagents_ray.validation import check_observation
 
 logger = logging.getLogger(__name__)
 
-# Acts after which a padding session is replaced, since its agent may store every observation.
+# Number of acts after which a dummy session is replaced, since its agent may store every
+# observation.
 _LIFE = 1000
 
 
@@ -79,11 +80,12 @@ class Padding:
             self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
 
     def sessions(self, rows: int) -> list[Agent]:
-        """Return the dummy sessions that pad a batch of `rows` to the next size; none if it exceeds
-        the largest size.
+        """Return the dummy sessions that pad a batch of `rows` to the next size; none if `rows`
+        exceeds the largest size.
         """
         missing = next((size for size in self._sizes if size >= rows), rows) - rows
-        if self._first is None:  # all sessions so far were moved here from other replicas
+        # All sessions so far were moved here from other replicas, without a reset.
+        if self._first is None:
             return []
         try:
             while len(self._rows) < missing:
@@ -92,15 +94,15 @@ class Padding:
                 agent.reset(obs, instruction, **kwargs)
                 self._rows.append(_DummySession(agent))
         except Exception:
-            logger.exception("no padding for the batches: its session could not be reset")
+            logger.exception("batches are not padded, since the dummy session could not be reset")
             self._sizes.clear()
             self._rows.clear()
             return []
         return [row.agent for row in self._rows[:missing]]
 
     def check_results(self, results: Sequence[Act | Exception]) -> None:
-        """Check the results of the dummy sessions, and discard those that failed or have made
-        `_LIFE` acts.
+        """Check the results of the dummy sessions, and discard the sessions that failed or have
+        made `_LIFE` acts.
         """
         used = self._rows[: len(results)]
         for row in used:
@@ -117,30 +119,31 @@ class Padding:
 class LoadedModel:
     """A loaded agent, and the data that its sessions share."""
 
-    choice: CheckpointChoice  # the choice that it was loaded for
+    choice: CheckpointChoice  # the choice for which the model was loaded
     settings: dict[str, Any]
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    # Digest and revision, see `HasWeightsId`, and those of `HasStatistics`.
+    # Digest and revision of the weights (see `HasWeightsId`), and statistics (see `HasStatistics`).
     weights: dict[str, Any] | None
-    files: Program  # digests of the files named in its settings
+    files: Program  # digests of the files named in the settings
     # Equal in replicas that can take over each other's sessions of this model.
     version: tuple[str, str]
-    calls: PolicyCalls  # running calls of the replica, including those of this agent
+    calls: PolicyCalls  # running calls of the replica, including the calls of this agent
     parameters: ModelWeights  # versions of the weights
-    busy: threading.Lock  # lock held while its agent runs, or is being closed
-    report: LoadingReport  # devices and other facts that it reported while loading
-    since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
-    sessions: int = 0  # number of sessions that use it
+    busy: threading.Lock  # lock that is held while the agent runs, or is being closed
+    report: LoadingReport  # devices and other facts that the model reported while loading
+    since: float = field(default_factory=time.monotonic)  # time at which the model was loaded, s
+    sessions: int = 0  # number of sessions that use the model
     closed: bool = False
-    deferred: DefersLoading | None = None  # None if all of it is loaded
+    # The rest of the load; None if the model is loaded completely.
+    deferred: DefersLoading | None = None
     key: str = field(init=False)  # `key_of(settings)`
     # The stream of the agent's calls, on any thread; None without a GPU of torch.
     acts: ActStream | None = field(init=False)
     # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA
-    # graph. Without an accelerator it is an unshared lock, which costs less.
+    # graph. Without an accelerator, each model has a separate lock, which costs less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
 
@@ -157,7 +160,7 @@ class LoadedModel:
 
     @property
     def checkpoint(self) -> str | None:
-        """The checkpoint's name, for its sessions."""
+        """Name of the checkpoint, for the sessions."""
         return resolved(self.settings) or self.choice.name
 
     @property
@@ -196,7 +199,7 @@ class LoadedModel:
         """
         if self.closed:
             raise UnknownSession(
-                f"{self.choice} has just been unloaded for another; reset the session"
+                f"{self.choice} has just been unloaded for another checkpoint; reset the session"
             )
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
@@ -210,8 +213,8 @@ class LoadedModel:
         return len(padding)
 
     def close(self, wait_s: float = -1.0) -> None:
-        """Close the agent after the running batch. Its memory is freed when no reference to it
-        remains.
+        """Close the agent after the running batch. The agent's memory is freed when no reference to
+        the agent remains.
 
         If the batch is still running after `wait_s` (-1: no limit), the agent stays open until this
         process ends.
@@ -229,16 +232,16 @@ class LoadedModel:
 
 @dataclass(slots=True)
 class GpuWork:
-    """What a process has done on its GPUs since it last reported that, for the metrics."""
+    """The work of a process on its GPUs since its last report, for the metrics."""
 
     passes_ms: list[float] = field(default_factory=list)  # a sample of the times of forward passes
-    last_ms: float | None = None  # the time of the last one
+    last_ms: float | None = None  # time of the last forward pass
     out_of_memory: int = 0  # forward passes that did not fit into memory
     replays: int = 0  # replays of CUDA graphs
 
 
 class ComputesElsewhere(ABC):
-    """An agent that computes in another process, which also has the memory."""
+    """An agent that computes in another process, which also allocates the memory."""
 
     @abstractmethod
     def gpu_memory(self) -> dict[str, int]:
@@ -246,11 +249,11 @@ class ComputesElsewhere(ABC):
 
     @abstractmethod
     def gpu_work(self) -> GpuWork:
-        """Return what that process has done on its GPUs since the last call."""
+        """Return the work of that process on its GPUs since the last call."""
 
 
 class ModelStats(Protocol):
-    """Records what models report while they act: the `MetricsBuffer` of an engine."""
+    """Records the reports of models while they compute: the `MetricsBuffer` of an engine."""
 
     def out_of_memory(self) -> None:
         """Record a forward pass that did not fit into the accelerator's memory."""
@@ -272,8 +275,8 @@ class Loader:
         calls: PolicyCalls,
         stats: ModelStats,
     ) -> None:
-        """Create the loader; `stats` records what the models report, and the other arguments are
-        described at `EngineSettings`.
+        """Create the loader; `stats` records the reports of the models. `EngineSettings` describes
+        the other arguments.
         """
         self._source, self._version, self._batch_sizes = source, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
@@ -292,12 +295,12 @@ class Loader:
         served.
 
         Args:
-            choice: The choice to load it for.
+            choice: The choice for which the model is loaded.
             settings: The settings of the agent.
             on_progress: Called with each step of a long load.
             agent: An agent created from the `settings`, but not initialized yet.
-            beside_acts: Whether other models act meanwhile. The agent may then defer a part of its
-                loading to calls of `load_deferred`.
+            beside_acts: Whether other models compute actions meanwhile. The agent may then defer a
+                part of its loading to calls of `load_deferred`.
 
         Raises:
             BaseException: Any error of the agent's initialization, or of the deployment's check of
@@ -309,7 +312,7 @@ class Loader:
         return model
 
     def load_deferred(self, model: LoadedModel) -> None:
-        """Load a part of what a model has deferred, between two of its calls.
+        """Continue the deferred loading of a model, between two of its calls.
 
         The lock of pushes, which a capture needs, comes first: a push also holds it when it waits
         for the model.
@@ -321,7 +324,9 @@ class Loader:
                 try:
                     is_complete = not model.deferred.load_deferred()
                 except Exception:
-                    logger.exception("%s: acts on without what was deferred", model.choice)
+                    logger.exception(
+                        "%s: the deferred loading failed; the model runs without it", model.choice
+                    )
                     is_complete = True
             if is_complete:
                 model.deferred = None
@@ -401,7 +406,7 @@ class Loader:
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:
-        """Return the version of the policy with these settings."""
+        """Return the version of the policy that has these settings."""
         return f"{self._version} {key_of(settings)}"
 
 

@@ -1,13 +1,13 @@
 """Manages the checkpoints in the memory of a replica. They are loaded on demand, and evicted when
 another checkpoint needs the memory.
 
-The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the
-others, one at a time, while sessions of loaded checkpoints act. `ModelCache` decides which one is
-next.
+The first checkpoint is loaded on the policy's thread. The thread `checkpoints` then loads and
+evicts all other checkpoints, one at a time, while sessions of loaded checkpoints act. `ModelCache`
+decides which checkpoint is next.
 
-Ray's `serve.multiplexed` only counts models. At its limit it unloads the least recently requested
-one, even while sessions act with it, and never waits for them. Therefore this cache exists, which
-tracks the sessions.
+Ray's `serve.multiplexed` only counts models. At its limit, it unloads the least recently requested
+model, even while sessions use that model, and never waits for the sessions. This cache tracks the
+sessions instead.
 
 A deployment's own settings can change (`ModelManager.configure`). The new checkpoint is then loaded
 next to the old one. New episodes use the new checkpoint, and the old one is evicted when its last
@@ -58,12 +58,13 @@ OnLoaded = Callable[[VLAgentsError | None], None]
 DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]
 logger = logging.getLogger(__name__)
 
-# Time without an act after which a model that was loaded beside acts is loaded completely, s. An
-# act that comes meanwhile waits for up to a second.
+# Time without an act after which the deferred loading of a model continues, s. An act that arrives
+# meanwhile waits for up to a second.
 QUIET_S = 5.0
-# Interval of the checks whether waiting callers are still there, and whether models act, s.
+# Interval of the checks whether callers are still waiting, and whether models compute, s.
 _CHECK_S = 1.0
-_CLOSE_S = 10.0  # longest wait for the loading thread, and for the running batch of each model
+# Longest wait for the thread `checkpoints`, and for the running batch of each model, s.
+_CLOSE_S = 10.0
 
 
 @dataclass(slots=True, eq=False)
@@ -95,28 +96,27 @@ class EvictTask:
 
 @dataclass(frozen=True, slots=True)
 class DeferredTask:
-    """The task to load a part of what a model has deferred."""
+    """The task to continue the deferred loading of a model."""
 
     key: str  # key of the model
 
 
 class ModelCache:
-    """The eviction policy: the loaded models, the sessions that wait for others, and the next task.
-
-    It uses no threads; its lock `changed` guards all calls. If all slots are in use:
+    """The eviction policy: the loaded models, the sessions that wait for other models, and the next
+    task. It uses no threads; its lock `changed` guards all calls. If all slots are in use:
 
     - The least recently used checkpoint without a session is evicted.
     - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the
       checkpoint that was loaded first accepts no more episodes, until its sessions have ended and
-      it is evicted. So ten checkpoints can take turns in two slots, each for long enough to be
-      worth loading.
+      it is evicted. Ten checkpoints can therefore share two slots, and each of them stays loaded
+      for long enough to be worth loading.
     """
 
     def __init__(self, source: Checkpoints) -> None:
         # Held during all calls, and notified after changes.
         self.changed = threading.Condition()
         self.config = source.config  # the deployment's own settings in effect
-        self.next: dict[str, Any] | None = None  # settings to swap to
+        self.next: dict[str, Any] | None = None  # settings of a swap that has not finished
         self.failure: str | None = None  # error of the last swap
         # Models by the keys of their settings, the least recently used first.
         self.loaded: dict[str, LoadedModel] = {}
@@ -143,20 +143,22 @@ class ModelCache:
         }
 
     def find(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice would use now; None if it is not
-        loaded.
+        """Return the model that an episode of the choice would use now; None if that model is
+        not loaded.
         """
         return self.loaded.get(key_of(self._settings(choice)))
 
     def free(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice may use now; None if the episode must
-        wait for it.
+        """Return the model that an episode of the choice may use now; None if the episode must wait
+        for the model.
         """
         model = self.find(choice)
         return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
-        """Assign the model to the session, which may have had another one, and return the model."""
+        """Assign the model to the session, which may have had another model, and return
+        the model.
+        """
         self._take_model(session)
         # The most recently used model is the last one.
         self.loaded[model.key] = self.loaded.pop(model.key)
@@ -165,8 +167,8 @@ class ModelCache:
         return model
 
     def release_model(self, session: Session[LoadedModel]) -> bool:
-        """Release the model that the session holds, and return whether it held one; may be called
-        without the lock.
+        """Release the model that the session holds, and return whether the session held a model;
+        may be called without the lock.
         """
         with self.changed:
             held = self._take_model(session)
@@ -190,8 +192,8 @@ class ModelCache:
         return model
 
     def pop_due(self) -> DueCallbacks:
-        """Remove the sessions whose wait has ended. Return their callbacks, with an error if there
-        was one.
+        """Remove the sessions whose wait has ended. Return their callbacks, each with its error or
+        None.
         """
         due: DueCallbacks = []
         for waiter in list(self.waiting):
@@ -213,7 +215,7 @@ class ModelCache:
     def plan(self, fits: Callable[[int], bool]) -> LoadTask | EvictTask | None:
         """Return the next task, or None. This also decides which model is `draining`.
 
-        `fits` returns whether one more model fits into memory next to the given number.
+        `fits` returns whether one more model fits into memory next to the given number of models.
         """
         self.draining = ""
         idle = [model for model in self.loaded.values() if not model.sessions]
@@ -232,7 +234,8 @@ class ModelCache:
                 return task
             limit = len(self.loaded)
 
-        # During a swap episodes still begin with the old settings, so their model is evicted last.
+        # During a swap, episodes still begin with the old settings, so the model of these settings
+        # is evicted last.
         old = None if self.next is None else self.config
         if idle:
             self.draining = min(idle, key=lambda model: model.settings == old).key
@@ -306,7 +309,8 @@ class ModelManager:
         """
         # Whether chunks of the deployment's own model continue the executed plan.
         self.continues_plans = False
-        # The most rows of that plan with which they begin exactly; 0: none.
+        # Maximum number of rows of the executed plan that a chunk repeats exactly at its beginning;
+        # 0 for none.
         self.longest_prefix = 0
         # Contract of the deployment's own model that was loaded last.
         self.contract: Contract | None = None
@@ -412,8 +416,8 @@ class ModelManager:
         return uncompiled
 
     def gpu_memory(self) -> dict[str, int]:
-        """Return the memory of the GPUs of the loaded models, see `accelerator.gpu_memory`; of
-        what several processes can allocate there, the least is "free".
+        """Return the memory of the GPUs of the loaded models, see `accelerator.gpu_memory`; "free"
+        is the least of the amounts that the processes can allocate there.
         """
         by_process = [gpu_memory(self.devices)]
         for agent in self._agents_elsewhere():
@@ -426,7 +430,7 @@ class ModelManager:
         return {**total, "free": min(free)} if free else {}
 
     def gpu_work_elsewhere(self) -> list[GpuWork]:
-        """Return what each other process of the replica has done on its GPU since the last call."""
+        """Return the GPU work of each other process of the replica since the last call."""
         return [agent.gpu_work() for agent in self._agents_elsewhere()]
 
     def _agents_elsewhere(self) -> list[ComputesElsewhere]:
@@ -437,7 +441,7 @@ class ModelManager:
 
     def _fits(self, loaded: int) -> bool:
         """Return whether the GPU has enough memory for one more checkpoint, assuming that it takes
-        as much as each of the loaded ones.
+        as much memory as each loaded checkpoint.
         """
         memory, full = self.gpu_memory() if loaded else {}, self._full
         self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
@@ -452,8 +456,8 @@ class ModelManager:
         return not self._full
 
     def loading(self) -> PolicyUnavailable:
-        """Return the error for clients while the first checkpoint is loaded. It names the present
-        step of loading.
+        """Return the error for clients while the first checkpoint is loaded. The error contains the
+        current step of loading.
         """
         return PolicyUnavailable(
             f"the policy is loading{self.step and f' ({self.step})'}; try again"
@@ -467,7 +471,7 @@ class ModelManager:
             return self._cache.describe()
 
     def loaded(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model that an episode of that choice would use now; None if it is not
+        """Return the model that an episode of the choice would use now; None if that model is not
         loaded.
         """
         with self._changed:
@@ -480,17 +484,17 @@ class ModelManager:
         on_loaded: OnLoaded,
         is_abandoned: Callable[[], bool] = lambda: False,
     ) -> LoadedModel | None:
-        """Return the model for a session's next episode. The session keeps it until the next call
-        for this session, or its end.
+        """Return the model for a session's next episode. The session keeps the model until the next
+        call for this session, or until the session ends.
 
         Args:
             session: The session; it releases the model that it held before.
             on_loaded: Called only if the session has to wait for the model: with None once the
-                session has it, or with the error.
+                session has the model, or with the error.
             is_abandoned: Returns whether the caller no longer waits.
 
         Returns:
-            The model, or None if it has to be loaded or waited for.
+            The model; None if the session has to wait for the model.
         """
         with self._changed:
             self._require_open()
@@ -512,7 +516,7 @@ class ModelManager:
     ) -> LoadedModel:
         """Return the model for a session from another replica.
 
-        If the deployment offers that model, it is loaded, unless that takes longer than
+        If the deployment offers that model, the model is loaded, unless loading takes longer than
         `timeout_s`.
 
         Raises:
@@ -554,8 +558,8 @@ class ModelManager:
             raise _stopping()
 
     def _wake(self) -> None:
-        """Wake up the loading thread, which then checks for work. The first call after `start`
-        starts the thread.
+        """Wake up the thread `checkpoints`, which then checks for work. The first call after
+        `start` starts the thread.
         """
         if self._thread.ident is None and self._loaded and not self._closed:
             self._thread.start()
@@ -600,7 +604,7 @@ class ModelManager:
                     self._set_own_model(model)
                     logger.info("new episodes begin with %s", model.checkpoint)
 
-                # This precedes `plan`, which might evict a model that was just loaded.
+                # This comes before `plan`, which might evict a model that was just loaded.
                 due = self._cache.pop_due()
                 if due:
                     return due
@@ -656,13 +660,17 @@ class ModelManager:
         with self._changed:
             model = self._cache.loaded[task.key]
         if task.at_once:
-            logger.info("there is room for one checkpoint: its sessions end, for the next")
+            logger.info(
+                "there is room for only one checkpoint: the sessions of the old checkpoint end, "
+                "so that the next one can be loaded"
+            )
             self._sessions.close_those_of(model)
         with self._changed:
-            # A session from another replica holds it, but is not in a table yet.
+            # A session that moves here from another replica may hold the model, and not be in a
+            # table yet.
             if task.at_once and model.sessions:
                 self._changed.wait(_CHECK_S)
-            if model.sessions:  # a session still holds it, or has taken it
+            if model.sessions:  # a session still holds the model, or has been assigned it meanwhile
                 return
             del self._cache.loaded[task.key]
         logger.info("%s: unloading %s", model.choice, model.checkpoint)

@@ -1,4 +1,6 @@
-"""The agent of a replica: the policy itself, or a proxy for one that runs in a child process."""
+"""The agent of a replica: the policy itself, or a proxy for a policy that runs in a
+child process.
+"""
 
 from __future__ import annotations
 
@@ -48,8 +50,8 @@ def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
 def version_of(args: ServerArgs) -> str:
     """Return a text that is equal in replicas between which sessions can move.
 
-    It covers the policy, wrappers and environment, since pickles of one environment are valid in no
-    other.
+    The text covers the policy, its wrappers and its environment, since a pickle is valid only in
+    the environment that created it.
     """
     return json.dumps([args.policy, args.wrappers, args.environment.model_dump()], sort_keys=True)
 
@@ -107,8 +109,8 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
                 continue
             request = Request("act", session_obs, session=session._session or "")
             stored = session_obs.prepared
-            # A row that pads the batch has the observation of another session, and the caller may
-            # act on an observation again.
+            # A stored observation cannot be used for a row that pads the batch, which has the
+            # observation of another session, or if the caller uses the observation in a second act.
             if isinstance(stored, StoredObservation) and stored.waits_for(
                 self.child, request.session
             ):
@@ -116,15 +118,14 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
                 stored.is_named = True
             requests.append(request)
 
-        missing = PolicyFailed("act: the policy's process answered without an action")
+        missing = PolicyFailed("act: expected an action from the policy's process, got none")
         return [reply.error or reply.act or missing for reply in self.child.call(requests)]
 
     def forwarded(self, protocol: type[T]) -> T | None:
         """Return an ability of the policy in the child, whose arguments and results are sent.
 
-        An ability whose values cannot be sent (`InProcess`) is used by the child itself: it
-        prepares the observations that this process sends it ahead, replaces weights and checks its
-        health.
+        The child itself uses an ability whose values cannot be sent (`InProcess`): it prepares the
+        observations that this process sends in advance, replaces weights, and checks its health.
         """
         if protocol is Prepares and self._connection is not None and self.child.has(Prepares):
             return cast(T, _SendsAhead(self))
@@ -134,11 +135,11 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
         return cast(T, _AbilityInChild(self, protocol))
 
     def use_ability(self, call: AbilityCall, obs: Obs | None) -> Any:
-        """Let the child use an ability of this session's agent, or of the loaded policy before the
+        """Use an ability of this session's agent in the child, or of the loaded policy before the
         first reset, and return the result.
 
         Raises:
-            NotReset: There is an observation, but no session.
+            NotReset: The call has an observation, but there is no session.
         """
         if self._session is not None:
             return (self._ask(Request("call", obs, kwargs=asdict(call))).info or {}).get("result")
@@ -153,8 +154,8 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
         return self.child.gpu_work()
 
     def check_health(self) -> None:
-        """Raise `PolicyUnavailable` if the child has ended, as it does if its policy is not
-        healthy.
+        """Raise `PolicyUnavailable` if the child has ended, which it does if its policy is
+        unhealthy.
         """
         self.child.process.require_alive()
 
@@ -196,7 +197,7 @@ class _SendsAhead:
 
     def prepare(self, obs: Obs) -> StoredObservation | None:
         """Send an observation to the child, and return a reference to it there; None if the child
-        does not take it, so that the act fails with the reason.
+        rejects the observation. The act then fails with the reason.
         """
         session = self._agent._session
         try:

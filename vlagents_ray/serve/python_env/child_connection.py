@@ -26,10 +26,10 @@ _CONNECT_S = 10.0
 class ChildConnection:
     """The calls of a replica to the engine in its child process, and its sessions there.
 
-    They are sent through shared memory (`vlagents_ray.client.transports.shm`): a batch is one
-    message, and each session of the replica has a session in the child. Calls that run while the
-    policy acts have a separate channel, as each channel has one message at a time. So has each
-    thread that sends observations ahead of their acts. All methods may be called from any thread.
+    The calls are sent through shared memory (`vlagents_ray.client.transports.shm`): a batch is one
+    message, and each session of the replica has a session in the child. Since each channel has one
+    message at a time, there are separate channels for calls that run while the policy computes, and
+    for each thread that sends observations in advance. All methods may be called from any thread.
     """
 
     def __init__(self, process: ChildProcess, policy: LoadedPolicy) -> None:
@@ -43,7 +43,7 @@ class ChildConnection:
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._acts = _Channel(process, policy.address)
         self._background = _Channel(process, policy.address)
-        # Channels for calls that are executed at once, which no thread uses at the moment.
+        # Channels for `IMMEDIATE_OPS` that no thread uses at the moment.
         self._immediate: queue.SimpleQueue[_Channel] = queue.SimpleQueue()
         self._numbers = itertools.count(1)  # numbers of stored observations
 
@@ -51,8 +51,8 @@ class ChildConnection:
         self._abilities: dict[str, bool] = {}
         self._names = itertools.count(1)  # numbers of sessions
         self._free: deque[str] = deque()  # names of closed sessions
-        # Names of the sessions, and of the versions of weights, to close, and messages about stored
-        # observations to drop; None ends the thread that closes them.
+        # Names of the sessions to close, numbers of the versions of weights to drop, and messages
+        # that drop stored observations; None ends the thread that sends them.
         self._dropped: queue.SimpleQueue[str | int | Request | None] = queue.SimpleQueue()
         closer = threading.Thread(
             target=self._close_dropped, name="policy-process-sessions", daemon=True
@@ -116,7 +116,7 @@ class ChildConnection:
 
         Raises:
             ConnectionLost: The process has ended.
-            VLAgentsError: The child does not take it.
+            VLAgentsError: The child has rejected the observation.
         """
         number = next(self._numbers)
         request = Request("prepare", obs, session=session, kwargs={"number": number})
@@ -134,8 +134,8 @@ class ChildConnection:
         return memory
 
     def gpu_work(self) -> GpuWork:
-        """Return what the process has done on its GPUs since the last call; nothing if it has
-        ended.
+        """Return the GPU work of the process since the last call; empty if the process
+        has ended.
         """
         try:
             return GpuWork(**self.call_at_once(Request("gpu_work")))
@@ -152,7 +152,9 @@ class ChildConnection:
             ) from error
 
     def has(self, protocol: type) -> bool:
-        """Return whether the loaded policy has an ability; the process is asked once for each."""
+        """Return whether the loaded policy has an ability. The process is asked only once for each
+        ability.
+        """
         name = name_of(protocol)
         if name not in self._abilities:
             answer = self.call_in_background("ability", protocol=name)
@@ -160,7 +162,7 @@ class ChildConnection:
         return self._abilities[name]
 
     def open_session(self) -> str:
-        """Return a name for a new session; names are reused, since each takes memory until the
+        """Return a name for a new session. Names are reused, since each name takes memory until the
         connection ends.
         """
         try:
@@ -172,14 +174,14 @@ class ChildConnection:
 
     def drop(self, name: str | int | Request) -> None:
         """Close a session, drop a version of the weights, or send a message about a stored
-        observation, soon; the garbage collector may call this at any time.
+        observation on another thread, soon. The garbage collector may call this method at any time.
         """
         self._dropped.put(name)
 
     def close(self) -> None:
         """Close the policy, and end its process and the connection."""
         self._dropped.put(None)
-        self.process.close()  # a call that hangs ends with its process
+        self.process.close()  # a hanging call ends when its process ends
         self._acts.close()
         self._background.close()
         while not self._immediate.empty():
@@ -198,7 +200,7 @@ class ChildConnection:
                     self.call([Request("weights", kwargs={"forget": name})])
                     continue
                 self.call([Request("close", session=name)])
-            except VLAgentsError:  # the process has ended, and its sessions with it
+            except VLAgentsError:  # the process and therefore its sessions have ended
                 return
             self.sessions.discard(name)
             self._free.append(name)
@@ -206,14 +208,14 @@ class ChildConnection:
 
 @dataclass(slots=True, eq=False)
 class StoredObservation:
-    """A reference to an observation in the child, which keeps it until an act names it, or this
-    reference is dropped.
+    """A reference to an observation in the child, which keeps the observation until an act refers
+    to it, or until this reference is dropped.
     """
 
     connection: ChildConnection
-    session: str  # name of the session that it belongs to
+    session: str  # name of the session to which the observation belongs
     number: int
-    is_named: bool = False  # whether an act has named it
+    is_named: bool = False  # whether an act has referred to it
 
     def waits_for(self, connection: ChildConnection, session: str) -> bool:
         """Return whether the child keeps the observation for an act of this session."""
@@ -249,7 +251,7 @@ class _Channel:
             except PolicyUnavailable as error:
                 raise ConnectionLost(self._process.describe_end()) from error
 
-        if len(replies) != len(requests):  # a single reply to the whole message
+        if len(replies) != len(requests):  # the only reply, to the whole message
             raise replies[0].error or PolicyFailed(
                 f"expected {len(requests)} replies, one for each request, got {len(replies)}"
             )

@@ -3,11 +3,11 @@ cannot use.
 
     python -m vlagents_ray.serve.python_env.child_main
 
-It needs the light install and pydantic, not Ray. The first line of its standard input is
+The process needs the light install and pydantic, not Ray. The first line of its standard input is
 `Settings`, as JSON. It writes a line of JSON for each step of a long load and, when the policy is
 loaded, a line with the contract and the address of its `ShmServer`, which receives all requests; if
-the policy does not load, that line contains the error. A further line of input makes it close the
-policy and end. The end of its input, or the death of its parent, ends it at once.
+the policy does not load, that line contains the error. At the next line of input, the process
+closes the policy and ends. It ends immediately at the end of its input or when its parent ends.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from vlagents_ray.serve.weights import WeightUpdates
 from vlagents_ray.weights.trainable import dtype_name
 
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the
-# child does not.
+# child does none of this.
 _NO_LIMITS = MessageLimits(**dict.fromkeys([limit.name for limit in fields(MessageLimits)], 2**40))
 _NEVER_S = 1e6
-_CHECK_S = 1.0  # interval of the health checks, which are those of a replica
+_CHECK_S = 1.0  # interval of the health checks, which are the same as in a replica
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +53,13 @@ class Settings:
     policy: str
     config: dict[str, Any]
     batch: int  # maximum number of observations in one forward pass
-    version: str  # version of the deployment: sessions move between equal versions only
+    version: str  # version of the deployment: sessions move only between equal versions
     wrappers: Sequence[Any] = ()  # wrappers of the policy, as in a deployment file
 
 
 def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -> dict[str, Any]:
-    """Build the policy without loading it, and return its contract, if it has one already, or the
-    error.
+    """Build the policy without loading it, and return its contract, if the policy already has one,
+    or the error.
 
     Returns:
         `{"contract": ...}`, as JSON values or None, or `{"code": ..., "error": ...}`.
@@ -146,7 +146,7 @@ def run() -> None:
 
 
 def _describe_trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
-    """Return types and shapes of the values that a learner trains, by name, or the reason why
+    """Return the types and shapes of the values that a learner trains, by name, or the reason why
     there are none.
     """
     values = {}

@@ -28,7 +28,7 @@ _LAST_LINES = 20  # number of lines at the end of the child's error output that 
 
 @dataclass(frozen=True, slots=True)
 class ChildProgram:
-    """The program of a child process: an interpreter with a policy."""
+    """The program of a child process: an interpreter and a policy."""
 
     python: str  # path of the interpreter
     settings: Settings
@@ -66,7 +66,8 @@ class ChildProcess:
             ConfigError: The interpreter cannot be started.
         """
         self._python = program.python
-        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)  # of the child's error output
+        # Last lines of the child's error output.
+        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
         self._closed = False
 
         # The kernel kills the child when the thread that started it ends; this thread ends after
@@ -150,8 +151,8 @@ class ChildProcess:
         program: ChildProgram,
         started: queue.SimpleQueue[subprocess.Popen[bytes] | OSError],
     ) -> None:
-        """Start the process, copy its error output to that of this process, and wait until it
-        ends.
+        """Start the process, copy its error output to the error output of this process, and wait
+        until it ends.
         """
         try:
             process = subprocess.Popen(  # noqa: S603 - the deployment's own interpreter
@@ -174,7 +175,9 @@ class ChildProcess:
         process.wait()
 
     def _write(self, data: bytes) -> None:
-        """Write to the standard input of the process; its end is detected elsewhere."""
+        """Write to the standard input of the process; the end of the process is
+        detected elsewhere.
+        """
         stream = self._process.stdin
         if stream is not None:
             with contextlib.suppress(BrokenPipeError):

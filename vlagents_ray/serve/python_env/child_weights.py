@@ -25,7 +25,8 @@ from vlagents_ray.weights.trainable import portable, require_fit
 class ChildWeights(ModelWeights):
     """The versions of the weights in a child process, whose values stay there, on its GPU.
 
-    This process decides which version acts, and the child makes versions while the policy acts.
+    This process decides which version is used, and the child makes versions while the policy
+    computes.
     """
 
     def __init__(
@@ -61,8 +62,8 @@ class ChildWeights(ModelWeights):
         pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
     ) -> WeightsVersion:
-        """Make a version in the child from new values, which travel in a file in memory or are
-        shared on the GPU.
+        """Make a version in the child from new values, which are sent in a file in memory or shared
+        on the GPU.
         """
         name = next(self._numbers)
         if isinstance(pushed, SharedValues):
@@ -118,7 +119,9 @@ class ChildWeights(ModelWeights):
 
 
 def _memory_file() -> BinaryIO:
-    """Return a file in memory that is freed when it is closed, however the other process ends."""
+    """Return a file in memory that is freed when it is closed, even if the other
+    process crashes.
+    """
     return os.fdopen(os.memfd_create("vlagents_weights"), "w+b")
 
 

@@ -36,7 +36,7 @@ _SHOWN = 2000  # number of characters at the end of uv's output that an error qu
 _CUDA_12 = "torch<2.11"  # the versions whose wheels on PyPI are for CUDA 12
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
-# pip's variables for package sources, and those of uv, which take precedence.
+# pip's variables for package sources, and the corresponding variables of uv, which take precedence.
 _PIP_VARIABLES = {
     "PIP_INDEX_URL": "UV_DEFAULT_INDEX",
     "PIP_EXTRA_INDEX_URL": "UV_INDEX",
@@ -50,11 +50,11 @@ def python_in(folder: Path) -> Path:
 
 
 def create(folder: Path, python: str | None = None, progress: Progress = lambda _: None) -> Path:
-    """Create an empty environment in `folder`, unless there is one already.
+    """Create an empty environment in `folder`, unless the folder already contains an environment.
 
     Args:
         folder: The folder of the environment.
-        python: A version or the path of an interpreter; by default this process's.
+        python: A version or the path of an interpreter; by default the interpreter of this process.
         progress: Called with a line about each step.
 
     Returns:
@@ -68,10 +68,10 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
         return interpreter
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(
-            f"{folder}: expected a new folder or a Python environment, got another folder; name a "
-            "new one"
+            f"{folder}: expected a new folder or a Python environment, got another folder; choose "
+            "a new folder"
         )
-    progress(f"making {folder} with Python {python or platform.python_version()}")
+    progress(f"creating {folder} with Python {python or platform.python_version()}")
     _uv(["venv", "--quiet", "--python", python or sys.executable, str(folder)])
     return interpreter
 
@@ -79,7 +79,8 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
 def find_python(version: str) -> str:
     """Return the path of an interpreter of that minor version, such as "3.12".
 
-    It may be this process's own, one on PATH, or one that pyenv or uv has installed for this user.
+    It may be the interpreter of this process, an interpreter on PATH, or an interpreter that pyenv
+    or uv has installed for this user.
 
     Raises:
         ConfigError: There is no such interpreter.
@@ -97,7 +98,7 @@ def find_python(version: str) -> str:
     raise ConfigError(
         f"expected Python {version}, which the requirements need, got none: looked for "
         f"python{version} on PATH, in {pyenv} and in {uv}; install it (`uv python install "
-        f"{version}`), or name one: --python /path/to/python{version}"
+        f"{version}`), or give its path: --python /path/to/python{version}"
     )
 
 
@@ -118,18 +119,18 @@ def make_environment(
     cuda: bool = False,
     progress: Progress = lambda _: None,
 ) -> Path:
-    """Create an environment for a policy, with this package and the installed plug-ins in it.
+    """Create an environment for a policy, with this package and the installed plug-ins.
 
-    On a machine without an NVIDIA GPU it gets the version of torch of this environment, and the
-    replacements for other requirements in `NAME.cpu.txt`, in the folder of `requirements`. Where
-    the GPU's driver is too old for CUDA 13, it gets a torch for CUDA 12, unless `UV_TORCH_BACKEND`
-    is set.
+    On a machine without an NVIDIA GPU, the new environment gets the torch version of the current
+    environment, and the replacements for other requirements in `NAME.cpu.txt`, a file next to
+    `requirements`. If the GPU's driver is too old for CUDA 13, it gets a torch for CUDA 12, unless
+    `UV_TORCH_BACKEND` is set.
 
     Args:
         requirements: The requirements file of the policy.
         folder: The folder of the environment.
         more: Further requirements files.
-        python: See `create`; by default the version that the requirements name, `# python: 3.12`,
+        python: See `create`; by default the version in a line `# python: 3.12` of the requirements,
             if any.
         light: Whether to omit Ray, for a child process; always true for another Python minor
             version, in which no replica can run.
@@ -165,7 +166,7 @@ def make_environment(
     try:
         _fill(interpreter, files, light=light, cuda=cuda, progress=progress)
     except BaseException:
-        if is_new:  # otherwise it would later be taken for a complete environment
+        if is_new:  # otherwise the folder would later count as a complete environment
             shutil.rmtree(folder)
         raise
     return interpreter
@@ -181,7 +182,10 @@ def _fill(
         theirs = _minor(python)
         ours = _minor(Path(sys.executable))
         if theirs != ours:
-            progress(f"Python {theirs} is not this one's {ours}: without Ray, for a child process")
+            progress(
+                f"Python {theirs} differs from this environment's {ours}: installing without Ray, "
+                "for a child process"
+            )
             light = True
 
     with tempfile.TemporaryDirectory() as name:
@@ -209,7 +213,7 @@ def _core(light: bool, scratch: Path) -> list[str]:
     """Return uv's arguments for this package as it is installed here, with the same Ray, or
     pydantic if `light`.
 
-    The package is never installed by its name: an index may have another package of that name.
+    The package is never installed by its name: an index may contain another package of that name.
     """
     extra = "" if light else "[serve]"
     source = Path(vlagents_ray.__file__).parents[1]
@@ -229,8 +233,8 @@ def _core(light: bool, scratch: Path) -> list[str]:
 def _plugins(scratch: Path) -> list[str]:
     """Return uv's arguments for the plug-ins as they are installed here.
 
-    They are installed without their dependencies: those of a model or a simulator are in the
-    requirements.
+    They are installed without dependencies, since the requirements contain the packages of a model
+    or a simulator.
     """
     arguments = []
     for distribution in plugin_distributions():
@@ -249,7 +253,7 @@ def _editable_source(installed: importlib.metadata.Distribution) -> Path | None:
     See https://packaging.python.org/en/latest/specifications/direct-url.
     """
     checkout = Path(str(installed.locate_file("")))
-    # A checkout on the path of modules has metadata that are not an installation's.
+    # A checkout on Python's path has metadata that do not describe an installation.
     if (checkout / "pyproject.toml").is_file():
         return checkout
 
@@ -289,7 +293,9 @@ def _is_in_wheel(file: importlib.metadata.PackagePath) -> bool:
 
 
 def _overrides(requirements: Path, scratch: Path) -> list[Path]:
-    """Return uv's override files for a machine without a GPU: CPU builds, and our torch."""
+    """Return uv's override files for a machine without a GPU: CPU builds, and the torch of this
+    environment.
+    """
     overrides = []
     cpu_builds = requirements.with_suffix(f".cpu{requirements.suffix}")
     if cpu_builds.is_file():
@@ -308,7 +314,7 @@ def _overrides(requirements: Path, scratch: Path) -> list[Path]:
 
 def _constraints_of_driver(scratch: Path, progress: Progress) -> list[str]:
     """Return uv's arguments for a torch that runs with this machine's driver, unless uv's own
-    variable chooses one.
+    variable selects a torch.
     """
     driver = driver_version()
     if (
@@ -319,8 +325,8 @@ def _constraints_of_driver(scratch: Path, progress: Progress) -> list[str]:
         return []
 
     progress(
-        f"the driver, {driver}, is older than {OLDEST_DRIVERS[13]}, the first for CUDA 13: taking "
-        f"{_CUDA_12}"
+        f"the driver, {driver}, is older than {OLDEST_DRIVERS[13]}, the first driver for CUDA 13: "
+        f"using {_CUDA_12}"
     )
     constraints = scratch / "constraints.txt"
     constraints.write_text(f"{_CUDA_12}\n")
@@ -335,9 +341,9 @@ def require_no_cuda(python: Path, arguments: Sequence[str]) -> None:
         raise ConfigError(
             "stopped before downloading several GB: the requirements include CUDA packages "
             f"({', '.join(cuda_packages[:3])}, …), but this machine has no visible NVIDIA GPU; "
-            "name CPU builds in a file NAME.cpu.txt next to NAME.txt, and their index in "
-            "PIP_FIND_LINKS or PIP_INDEX_URL, or install the CUDA packages with --cuda: they "
-            "also run on a CPU"
+            "list CPU builds in a file NAME.cpu.txt next to NAME.txt, and set their index in "
+            "PIP_FIND_LINKS or PIP_INDEX_URL, or install the CUDA packages with --cuda: they also "
+            "run on a CPU"
         )
 
 
@@ -353,8 +359,8 @@ def _install_import_fixes(python: Path) -> None:
 
 
 def has_gpu() -> bool:
-    """Return whether this machine shows an NVIDIA GPU, other than a Jetson's, which PyPI's torch
-    does not support.
+    """Return whether this machine has a visible NVIDIA GPU, other than a Jetson's, which PyPI's
+    torch does not support.
     """
     # WSL2 has no /dev/nvidia0.
     is_wsl = Path("/dev/dxg").exists() and shutil.which("nvidia-smi") is not None
@@ -363,15 +369,15 @@ def has_gpu() -> bool:
 
 
 def _minor(python: Path) -> str:
-    """Return the minor version of an interpreter, such as "3.12"; "" if it does not run, as some
-    shims of pyenv.
+    """Return the minor version of an interpreter, such as "3.12"; "" if the interpreter does not
+    run, as is the case for some shims of pyenv.
     """
     command = [str(python), "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()  # noqa: S603
 
 
 def _uv(arguments: Sequence[str]) -> str:
-    """Run uv and return its error output, which reports its work."""
+    """Run uv and return its error output, in which uv reports its steps."""
     if importlib.util.find_spec("uv") is not None:
         command = [sys.executable, "-m", "uv"]
     else:

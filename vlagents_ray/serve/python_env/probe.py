@@ -21,8 +21,8 @@ from vlagents_ray.serve.config.deployment import EnvironmentArgs
 _PACKAGES = ("ray", "numpy", "vlagents-ray")
 _TIMEOUT_S = 120.0  # imports from a network drive without a cache are slow
 OLDEST = (3, 10)
-# The program must run in any interpreter, including an old Python; imports may print before the
-# last line.
+# The program must run in any interpreter, including an old Python. Its last line is the result,
+# since imports may print other lines.
 _PROBE = """
 import json, sys
 found = {"python": "%d.%d.%d" % sys.version_info[:3]}
@@ -44,20 +44,20 @@ print("VLA" + json.dumps(found))
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentProbe:
-    """The answer of an interpreter."""
+    """The results of probing an interpreter."""
 
     # Versions of "python", "ray", "numpy" and "vlagents-ray", as far as they are installed.
     versions: dict[str, str]
     policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
 
     def obstacle_to_replicas(self) -> str | None:
-        """Return the reason why a replica of this process's cluster cannot run there; None if it
-        can.
+        """Return the reason why a replica of this process's cluster cannot run in the environment;
+        None if it can.
         """
         ours = platform.python_version()
         theirs = self.versions["python"]
         if _minor(ours) != _minor(theirs):
-            return f"it is Python {theirs}, the cluster's is {ours}"
+            return f"it has Python {theirs}, the cluster has Python {ours}"
 
         our_ray = importlib.metadata.version("ray")
         their_ray = self.versions.get("ray")
@@ -85,7 +85,7 @@ def probe(
         if inside.is_file():
             cure = f"did you mean {inside}?"
         else:
-            cure = f"make one with `{_command_for(python)}`"
+            cure = f"create one with `{_command_for(python)}`"
         raise ConfigError(
             f"environment.python: expected an interpreter, got {python!r}, which does not exist; "
             f"{cure}"
@@ -95,7 +95,8 @@ def probe(
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
             [python, "-c", _PROBE, *_PACKAGES],
-            # The settings are no argument, as every user of the machine could read that.
+            # The settings are not a command-line argument, which every user of the machine could
+            # read.
             input=json.dumps({"policy": policy, "version": version}),
             capture_output=True,
             text=True,
@@ -134,15 +135,15 @@ def probe(
     if theirs != version:
         installed = f"vlagents-ray {theirs}" if theirs else "no vlagents-ray"
         raise ConfigError(
-            f"environment.python: expected {version} as here, got {installed} in {python}; "
-            f"install the same there, or make the environment with `{_command_for(python)}`"
+            f"environment.python: expected {version} as here, got {installed} in {python}; install "
+            f"that version there, or create the environment with `{_command_for(python)}`"
         )
     return EnvironmentProbe(versions, examined)
 
 
 def _command_for(python: str) -> str:
-    """Return the command that creates an interpreter's environment: the folder .venv-NAME is for
-    the requirements NAME.
+    """Return the command that creates an interpreter's environment: the folder .venv-NAME belongs
+    to the requirements NAME.
     """
     folder = Path(python).parent.parent
     prefix, _, name = folder.name.partition(".venv-")
@@ -152,8 +153,8 @@ def _command_for(python: str) -> str:
 
 
 def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:
-    """Return the settings with `process` "auto" decided; raise `ConfigError` if the policy
-    cannot run as stated.
+    """Return the settings with a decision instead of the `process` "auto"; raise `ConfigError` if
+    the policy cannot run as configured.
     """
     if environment.python is None:
         return environment
@@ -170,7 +171,7 @@ def check_policy(
         The contract; None if the policy has none before it is loaded.
 
     Raises:
-        ConfigError: The policy cannot be built there, or the environment is unusable or names no
+        ConfigError: The policy cannot be built there, or the environment is unusable or has no
             interpreter.
     """
     if environment.python is None:
@@ -190,14 +191,16 @@ def check_policy(
 def _process(
     environment: EnvironmentArgs, interpreter: EnvironmentProbe
 ) -> Literal["replica", "child"]:
-    """Return where the policy runs; raise `ConfigError` if it cannot run where `process` says."""
+    """Return where the policy runs; raise `ConfigError` if it cannot run in the configured
+    `process`.
+    """
     if environment.process == "child":
         return "child"
     obstacle = interpreter.obstacle_to_replicas()
     if obstacle is not None and environment.process == "replica":
         raise ConfigError(
             "environment.process: expected 'child' or 'auto', got 'replica', which cannot run in "
-            f"{environment.python}: {obstacle}; use one of them, or make the environment again "
+            f"{environment.python}: {obstacle}; use one of them, or create the environment again "
             "with `vlagents-ray venv create`"
         )
     return "child" if obstacle else "replica"

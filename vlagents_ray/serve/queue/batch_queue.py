@@ -2,10 +2,10 @@
 batches.
 
 The queue is work-conserving except for one short wait: as soon as the policy is free, it takes all
-waiting requests up to the batch limit, so that batching never delays a lone request.
+waiting requests up to the batch limit, so that batching never delays a single request.
 `vlagents_ray.serve.queue.fair_queue` defines the order. Expired and finished requests never reach
-the policy, but are only dropped when it is next free; a caller that needs an earlier notice of its
-expired deadline sets a timer.
+the policy, but they are only dropped when the policy is free again. A caller that needs to know
+earlier that its deadline has expired sets a timer.
 
 The queue waits for the remaining requests of a group of sessions that were answered together and
 are about to send their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for
@@ -30,28 +30,29 @@ from vlagents_ray.serve.requests import PendingRequest
 
 _SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
 _LONG_BATCH_S = 0.5  # duration of a batch after which another thread polls in any case
-_DENSE_S = 500e-6  # interval between two requests below which the next one is expected as quickly
+# Interval between two requests below which the next request is expected after the same interval.
+_DENSE_S = 500e-6
 
 
 class Taken(NamedTuple):
-    """The work that the policy's thread takes at once; both lists are empty after a long time
-    without requests.
+    """The requests that the policy's thread takes from the queue together; both lists are empty
+    after a long time without requests.
     """
 
     batch: list[PendingRequest]
-    # Requests whose deadlines have passed, or whose clients have left: not in the batch, and still
-    # unanswered.
+    # Requests whose deadlines have passed, or whose clients have left: they are not in the batch,
+    # and still unanswered.
     expired: list[PendingRequest]
 
 
 class BatchQueue:
     """The waiting requests, and the watched files that deliver new ones.
 
-    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last
-    `poller.close`. The thread waits on file descriptors, among them the sockets of local clients,
-    whose requests reach the policy without a thread switch. While batches take milliseconds and are
-    not all for one session, a second thread polls these files, so that the next batch is already
-    decoded when the current one ends.
+    One thread, the policy's thread, calls `bind`, then repeatedly `next`, `begin` and `end`, and
+    finally `poller.close`. This thread waits on file descriptors. Among them are the sockets of
+    local clients, whose requests therefore reach the policy without a thread switch. While batches
+    take milliseconds and are not all for one session, a second thread polls these files, so that
+    the next batch is already decoded when the current one ends.
 
     Args:
         idle_s: Time without a request after which `next` returns nothing, s.
@@ -94,8 +95,8 @@ class BatchQueue:
         self._begun = 0.0  # start of the running batch, s
 
     def bind(self, *, driven: bool = False) -> None:
-        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` signals
-        when to call `take`.
+        """Make the calling thread the policy's thread. If the queue is `driven`, the poller's
+        `wake` signals when to call `take`.
         """
         self._thread = 0 if driven else threading.get_ident()
         self._driven = self._asleep = driven
@@ -118,25 +119,21 @@ class BatchQueue:
             self._wake()
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer; no batch takes them, except a reset whose checkpoint
-        was loaded.
+        """End requests without an answer; no batch contains them later, except a reset whose
+        checkpoint was loaded.
         """
         with self._lock:
             for pending in requests:
                 pending.over = True
 
     def give_back(self, requests: Iterable[PendingRequest]) -> None:
-        """Record that the policy has not received these requests, although a batch has taken
-        them.
-        """
+        """Record that the policy has not received these requests, although they are in a batch."""
         with self._lock:
             for pending in requests:
                 pending.begun = False
 
     def cancel(self, pending: PendingRequest) -> bool:
-        """End a request without an answer, unless a batch has taken it; return whether it was
-        ended.
-        """
+        """End a request without an answer, unless it is in a batch; return whether it was ended."""
         with self._lock:
             if pending.begun:
                 return False
@@ -167,7 +164,7 @@ class BatchQueue:
         return Taken(batch, expired)
 
     def begin(self, batch: Sequence[PendingRequest]) -> None:
-        """Record that the policy begins to act on a batch; another thread polls during it, if
+        """Record that the policy begins a batch; another thread polls during the batch, if
         worthwhile.
         """
         self._begun = self._clock()
@@ -187,7 +184,7 @@ class BatchQueue:
         """Record that the batch has ended."""
         ended = self._clock()
         with self._lock:
-            self._running = ()  # its observations may be in the sender's memory
+            self._running = ()  # the observations in the batch may be in the sender's memory
             self.window.record_end(ended, ended - self._begun)
             self._waiting.costs_s = self.window.costs_s
         self.poller.reclaim()
@@ -197,7 +194,7 @@ class BatchQueue:
         any thread.
 
         Another thread reads later requests until the batch ends, so that they can be rejected while
-        it hangs.
+        the batch hangs.
         """
         with self._lock:
             self._load_timer.count(self._waiting.size, self._clock())
@@ -224,18 +221,16 @@ class BatchQueue:
         return dict(zip(Priority, self._waiting.depth, strict=True))
 
     def quiet_s(self) -> float:
-        """Return the time since the last batch began, s; 0 while one runs, or requests wait. May
-        be called on any thread.
+        """Return the time since the last batch began, s; 0 while a batch runs, or requests wait.
+        May be called on any thread.
         """
         if self._running or self._waiting.size:
             return 0.0
         return self._clock() - self._begun
 
     def load_s(self) -> tuple[float, float]:
-        """Return the total time for which the policy's thread has been idle, and all requests have
-        waited so far, s.
-
-        The growth rate of the latter is the mean queue length.
+        """Return the total idle time of the policy's thread, and the total waiting time of all
+        requests so far, s. The growth rate of the waiting time is the mean queue length.
         """
         with self._lock:
             return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
@@ -252,13 +247,13 @@ class BatchQueue:
             return self._waiting.clear()
 
     def _wake(self) -> None:
-        # If the policy's thread calls this, it is awake.
+        # The policy's thread need not be woken if it calls this method itself.
         if self._asleep and threading.get_ident() != self._thread:
             self._asleep = False
             self.poller.wake()
 
     def _wait_for_request(self) -> bool:
-        """Poll the watched files until a request waits or the queue is closed; False after
+        """Poll the watched files until a request waits or the queue is closed; return False after
         `idle_s` without events.
         """
         while True:
@@ -277,7 +272,7 @@ class BatchQueue:
         `idle_s`.
 
         If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since
-        waking up takes as long as a fast policy. While polling it yields the core to other
+        waking up takes as long as a fast policy. While it polls, it yields the core to other
         processes.
         """
         begun = self._load_timer.mark_idle()
@@ -298,7 +293,7 @@ class BatchQueue:
                 return
             self._wait_over.clear()
             self._gathering = True
-        # Epoll waits for whole milliseconds, the event below for exact times.
+        # Epoll waits for whole milliseconds; the wait for the event below is more precise.
         self.poller.hand_to_reader()
         complete = self._wait_over.wait(wait_s)
         self.poller.reclaim()
@@ -333,7 +328,7 @@ class LoadTimer:
         self._counted = now
 
     def waited_s(self, waiting: int) -> float:
-        """Return the total waiting time of all requests, s, including the `waiting` ones that
+        """Return the total waiting time of all requests, s, including the `waiting` requests that
         wait now.
         """
         return self._waited + waiting * max(0.0, time.perf_counter() - self._counted)

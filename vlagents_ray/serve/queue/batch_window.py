@@ -3,22 +3,23 @@ threads or clocks.
 
 The simulations of a group that was answered together send their next requests within about a
 millisecond. Without a wait, the first request would start a batch alone, and the others would wait
-for it. From then on the group would be split into two batches, each of which waits for the other.
-So the first request waits for the others, under these conditions:
+for it. From then on, the group would be split into two batches, each of which waits for the other
+batch. Therefore the first request waits for the other requests, under these conditions:
 
 - The queue only waits for sessions of the last batch whose recent return time is about the time
-  that has passed since that batch. It does not wait again for a session that was late before that
-  session has returned in time once.
+  that has passed since that batch. After a session was late, the queue does not wait for it again
+  until it has returned in time once.
 - The wait is at most `patience` times the duration of the last batch. It is also at most the time
-  that one batch saves over two: the fixed cost of a batch, estimated from the durations of the last
-  batches.
+  that one batch saves compared with two: the fixed cost of a batch, estimated from the durations of
+  the last batches.
 - No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not
   fill the batch.
 
-Robots that act as soon as they are answered, such as those behind their rate, are split in the same
-way, and each of their acts then takes two batches. So they wait for one another for as long as one
-batch saves over two, at most half of the last batch. Robots whose usual return time is longer than
-that have a rate of their own: they neither wait nor are waited for. A lone session never waits.
+Robots that send the next request as soon as they are answered, such as robots that are behind their
+rate, are split in the same way, and each of their acts then takes two batches. Therefore they wait
+for one another for at most the time that one batch saves compared with two, and at most half of the
+last batch. Robots whose usual return time is longer than this limit act at their own rate: they do
+not wait, and other robots do not wait for them. A single session never waits.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from vlagents_ray.serve.requests import PendingRequest
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
 _NEWEST = 0.25  # weight of the last batch in the mean duration of batches
-_NEWEST_OF_SIZE = 0.1  # the same, in the mean duration of the batches of one size
-_CURVE_BATCHES = 32  # number of batches after which the curve of durations is drawn again
-# Longest wait of robots for one another, as a share of the last batch: usual policies save less,
-# and it bounds the wait while the fixed cost is not known. Eight robots of one process return
-# within 30 ms, more than `patience` allows.
+_NEWEST_OF_SIZE = 0.1  # weight of the last batch in the mean duration of the batches of one size
+_CURVE_BATCHES = 32  # number of batches after which the curve of durations is computed again
+# Longest wait of robots for one another, as a share of the last batch's duration. One batch usually
+# saves less than that; the limit matters while the fixed cost is not known. It is larger than
+# `patience`, since eight robots of one process return within 30 ms.
 _ROBOTS = 0.5
 SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another thread could wake up
 
@@ -66,8 +67,8 @@ class _AnsweredBatch:
 class BatchCost:
     """The measured durations of batches over their sizes; older batches have less weight.
 
-    They are a weighted linear fit, and the mean of each size, since a compiled policy pads a batch
-    to the next size that it is compiled for.
+    They consist of a weighted linear fit and of the mean for each size, since a compiled policy
+    pads a batch to the next size for which it is compiled.
     """
 
     def __init__(self) -> None:
@@ -93,7 +94,7 @@ class BatchCost:
     def curve(self, largest: int) -> CostCurve | None:
         """Return the durations up to batches of size `largest`; None if no batch was added.
 
-        The largest size has the duration of the line, until there was such a batch. If all batches
+        Until a batch of the largest size has run, its duration is that of the line. If all batches
         had one size, further rows count as free, until larger batches show their cost.
         """
         if not self._means_s:
@@ -107,13 +108,14 @@ class BatchCost:
         table: list[tuple[int, float]] = []
         longest_s = 0.0
         for size, duration_s in sorted(durations_s.items()):
-            # A larger batch takes no less time: where it seems to, its batches were too few.
+            # A larger batch never takes less time. If its mean is lower, there were too few batches
+            # of its size.
             longest_s = max(longest_s, duration_s)
             table.append((size, longest_s))
         return CostCurve(table=tuple(table)) if table[0][1] > 0 else None
 
     def line(self) -> tuple[float, float] | None:
-        """Return the fixed duration of a batch and that of a row, s; None until batches of
+        """Return the fixed duration of a batch and the duration of a row, s; None until batches of
         different sizes were added.
         """
         count, size, duration, squares, products = self._sums
@@ -126,8 +128,8 @@ class BatchCost:
 
 
 class BatchWindow:
-    """Decides on the wait from the last two batches. Not thread-safe: its callers must hold one
-    lock.
+    """Decides on the wait from the last two batches. Not thread-safe: its callers must hold a
+    common lock.
 
     Args:
         patience: Longest wait, as a multiple of the duration of the last batch.
@@ -144,17 +146,18 @@ class BatchWindow:
         # Whether batches take longer than `SLOW_S`; otherwise the window keeps no records.
         self.slow = False
         # Whether other threads should work on the next requests while a batch runs: batches are
-        # slow, and the last two were not both for one session, nor the last one if there is no
-        # other session.
+        # slow, and the last two batches were not both for the same single session. If only one
+        # batch is known, it must be for several sessions.
         self.overlaps = False
         self._cost = BatchCost()
-        self._until_curve = 0  # number of batches until the curve is drawn again
+        self._until_curve = 0  # number of batches until the curve is computed again
         self._curve: CostCurve | None = None  # the measured durations of slow batches
-        # The same by size, from 0 to the largest, for `FairQueue`; empty if there is no curve.
+        # Durations by size, from 0 to the largest size, for `FairQueue`; empty if there is no
+        # curve.
         self.costs_s: Sequence[float] = ()
         self._missing: set[str] = set()
         self._priority = Priority.SIMULATION  # priority of the missing sessions
-        self._bound = self._until = 0.0  # the longest wait, s, and its end
+        self._bound = self._until = 0.0  # the longest wait, s, and the time at which it ends, s
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
         """Record that a batch begins."""
@@ -188,8 +191,8 @@ class BatchWindow:
         return self._curve
 
     def describe_costs(self) -> dict[str, Any] | None:
-        """Return the measured durations for the metadata, ms by batch size, with the fixed one and
-        that of a row; None if there were no slow batches.
+        """Return the measured durations for the metadata, ms by batch size, with the fixed duration
+        and the duration of a row; None if there were no slow batches.
         """
         if self._curve is None:
             return None
@@ -199,7 +202,7 @@ class BatchWindow:
         return {"fixed_ms": fixed_ms, "row_ms": row_ms, "ms_by_size": table}
 
     def _draw_curve(self) -> None:
-        """Draw the curve of durations again: often while it is new."""
+        """Compute the curve of durations again, more often at the beginning."""
         self._curve = self._cost.curve(self._size)
         if self._curve is None:
             return
@@ -209,8 +212,8 @@ class BatchWindow:
     def record_arrival(self, pending: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.
 
-        The estimate rises to a longer time at once, and falls to a shorter one by half the
-        difference.
+        A longer time replaces the estimate immediately; a shorter time reduces the estimate by half
+        the difference.
         """
         for answered in (self._last, self._previous):
             returns = answered.returns[pending.priority]
@@ -252,9 +255,9 @@ class BatchWindow:
         return not self._missing or waiting.sessions >= self._size or self._must_not_wait(pending)
 
     def _must_not_wait(self, pending: PendingRequest) -> bool:
-        """Return whether a request prevents the wait, for its robot, or for its deadline.
-
-        The deadline may pass if the policy waits, and then takes as long as for the last batch.
+        """Return whether a request prevents the wait, because of its robot or its deadline. A
+        deadline prevents the wait if it would pass during the wait and a following batch as long as
+        the last batch.
         """
         if pending.priority is Priority.ROBOT:
             at_once = pending.return_s is not None and pending.return_s <= self._bound

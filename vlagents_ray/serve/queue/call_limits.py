@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import is_device_failure
 
-# Calls of a kind that may take long: the first one compiles, the second one compiles for dynamic
-# sizes.
+# Number of calls of a kind that may take long: the first call compiles, and the second call
+# compiles for dynamic sizes.
 _WARM_UP_CALLS = 2
 _MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
 LOAD = "load"
@@ -31,7 +31,8 @@ FAILED_BATCHES = 20
 class CallLimits:
     """Time limits for calls of the policy, s."""
 
-    # Limit of a call; ten times the longest call of its kind so far if that is more.
+    # Limit of a call, or ten times the duration of the longest call of its kind so far, whichever
+    # is longer.
     act_s: float = 60.0
     warm_up_s: float = 600.0  # limit of each of the first two calls of a kind
     load_s: float = 3600.0  # limit for loading a checkpoint
