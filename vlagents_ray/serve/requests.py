@@ -3,19 +3,20 @@ answer.
 
 An endpoint creates an `IncomingMessage` when the last byte has arrived, decodes it, and passes its
 requests to a `Sender`, which creates a `PendingRequest` for each. The decoded `Request` is not
-modified on the way: the server's decisions are in the `PendingRequest`. Only the observations are
-removed after use, since their memory may belong to the sender.
+modified: the server's decisions are in the `PendingRequest`. Only the observations are removed
+after use, since their memory may belong to the sender.
 
-An answer is a value, a request with its reply. A request has a reference to its message, and the
-message to its receiver: the connection that it arrived on, or the caller that waits for it.
-`PendingRequest.finish` stores a reply in the message, once; the message with its last reply is
-delivered to the receiver, which encodes all replies together (`vlagents_ray.serve.endpoints`).
+An answer is a value: a request and its reply. A request refers to its message, and the message
+refers to its receiver: the connection on which it arrived, or the caller that waits for the
+replies. `PendingRequest.finish` stores a reply in the message, once. After the last reply, the
+message is delivered to the receiver, which encodes all replies together
+(`vlagents_ray.serve.endpoints`).
 
-Requests arrive on the thread that reads the connections (the policy's own, or a reader while a
-batch runs) or on an event loop. The policy's thread runs batches and finishes their requests;
-another thread may send the answers to simulations. Requests that reach no batch are finished by
-other threads: the event loop at a deadline or if a call hangs, the thread that loads a checkpoint,
-or the one that closes the engine.
+Requests arrive on the thread that reads the connections (the policy's thread, or a reader thread
+while a batch runs) or on an event loop. The policy's thread runs batches and finishes their
+requests; another thread may send the answers to simulations. Requests that reach no batch are
+finished by other threads: the event loop at a deadline or if a call hangs, the thread that loads a
+checkpoint, or the thread that closes the engine.
 """
 
 from __future__ import annotations
@@ -43,23 +44,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 HasLeft: TypeAlias = Callable[[], bool]
-"""Returns whether a client has left: closed its connection, which the thread that reads the
-connection may not know yet. Called on any thread.
+"""Returns whether a client has closed its connection, even if the thread that reads the connection
+does not know this yet. Called on any thread.
 """
 
 CERTAIN_S = 1e-3
-"""Wait of a request, s, up to which its client is not asked whether it has left: a client waits
-longer, and to ask takes about 2 us.
+"""Wait of a request, s, up to which it is not checked whether its client has left: a client waits
+longer than that, and the check takes about 2 us.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointChoice:
-    """The checkpoint that a session requested: by default the deployment's own."""
+    """The checkpoint that a session has requested; by default, the deployment's own checkpoint."""
 
-    # Name of one of the deployment's `choices`; None for the deployment's own.
+    # Name of one of the deployment's `choices`; None for the deployment's own checkpoint.
     name: str | None = None
-    # Training step of the checkpoint; None for the step that the settings name.
+    # Training step of the checkpoint; None for the step in the settings.
     step: int | None = None
 
     def __str__(self) -> str:
@@ -81,19 +82,21 @@ class Origin:
     """The origin of one sender's requests."""
 
     transport: str = ""  # transport, for the metrics
-    owner: str = ""  # connection with which its sessions end; empty if there is none
-    # The sender, whose requests share one turn in the queue; if empty, each session has a turn.
-    # It starts with the prefix, so that callers with different keys never share a turn.
+    # Id of the connection whose end also ends its sessions; empty without a connection.
+    owner: str = ""
+    # Id of the sender, whose requests share one turn in the queue. If it is empty, each session has
+    # its own turn. The id starts with the prefix, so that callers with different keys never share a
+    # turn.
     connection: str = ""
-    caller: Caller | None = None  # None if no key is required
+    caller: Caller | None = None  # the holder of the key; None if no key is required
     prefix: str = ""  # prefix of the session ids of the caller's key
-    # The owner's sessions, by their ids in the engine: the step at which the episode began that the
-    # owner last reset or acted in; None if it has done neither.
+    # The owner's sessions, by their ids in the engine. The value is the first step of the episode
+    # in which the owner last sent a reset or an act; None if it has sent neither.
     sessions: dict[str, int | None] = field(default_factory=dict)
     opened: float = 0.0  # time at which the connection was opened, s, of the engine's clock
-    # Whether the connection has ended, so that its waiting requests do nothing more.
+    # Whether the connection has ended; its waiting requests then have no effect.
     ended: bool = False
-    # Whether the client connects to another replica if a reply asks for it.
+    # Whether the client connects to another replica if a reply requests it.
     can_move: bool = False
 
 
@@ -105,57 +108,58 @@ class Opening:
     """The server's decisions about the episode that a reset begins."""
 
     choice: CheckpointChoice
-    kwargs: dict[str, Any]  # the options of the request that are for the policy
-    follows: bool  # whether the episode takes the newest version of the weights
+    kwargs: dict[str, Any]  # the request's options for the policy
+    follows: bool  # whether the episode uses the newest version of the weights
     first: int  # step at which the episode begins
     # First step of the connection's previous episode, which continues if the reset is undone; None
     # if there is none.
     previous: int | None
-    slo: Slo | None = None  # what the robot needs, if its reset or the deployment states it
+    slo: Slo | None = None  # SLO of the robot, if its reset or the deployment contains one
 
 
 @dataclass(slots=True, eq=False)
 class ReservedAct:
-    """The reservation of an act: its session and episode, and what was done in advance."""
+    """The reservation of an act: its session and episode, and the work that was done in advance."""
 
-    session: Any  # the `Session` at its arrival
-    model: Any  # the `LoadedModel` whose contract it was checked against, or None
-    # Step at which the episode began that it was sent in; None for the session's latest one.
+    session: Any  # the `Session` when the act arrived
+    model: Any  # the `LoadedModel` with whose contract the act was compared, or None
+    # First step of the episode in which the act was sent; None for the session's latest episode.
     episode: int | None
-    preparation: Preparation | None  # preparation of its observation, on another thread
+    preparation: Preparation | None  # preparation of the act's observation, on another thread
 
 
 @dataclass(slots=True, eq=False)
 class PendingRequest:
     """One request in flight, from its message to its answer."""
 
-    session_id: str  # the id in the engine
+    session_id: str  # id of the session in the engine
     request: Request
-    message: IncomingMessage  # the message that contained it, which gets its reply
+    message: IncomingMessage  # the message that contained the request, which stores the reply
     priority: Priority = Priority.ROBOT
-    # Time of arrival, s, of the engine's clock, which is this one by default.
+    # Time of arrival, s, of the engine's clock, which is `time.perf_counter` by default.
     arrived: float = field(default_factory=time.perf_counter)
     deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
-    # Time at which the robot needs the answer, s, of the engine's clock; 0.0 if it states no slack:
-    # as soon as possible.
+    # Time at which the robot needs the answer, s, of the engine's clock; 0.0 if the robot sends no
+    # slack and needs the answer as soon as possible.
     needed: float = 0.0
-    # Whether the requests of other robots go first, as the replica cannot serve all in time.
+    # Whether the requests of other robots are served first, since the replica cannot serve all
+    # robots in time.
     waits_behind_others: bool = False
     origin: Origin = NOWHERE
-    has_left: HasLeft | None = None  # of its client; None if that cannot be asked
-    # Time until which its client has certainly not left, s, of the engine's clock.
+    has_left: HasLeft | None = None  # whether the client has left; None if that cannot be checked
+    # Time until which the client has certainly not left, s, of the engine's clock.
     certain_until: float = math.inf
-    over: bool = False  # whether it was answered, or its caller no longer waits
-    begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
-    sought: bool = False  # whether other replicas were searched for its session
-    # What was reserved for an act or a reset before it was queued; see `Intake.reserve`.
+    over: bool = False  # whether the request was answered, or its caller no longer waits
+    begun: bool = False  # whether the request is in a batch; set under the queue's lock
+    sought: bool = False  # whether other replicas were searched for the request's session
+    # The reservation of an act or a reset, made before it was queued; see `Intake.reserve`.
     reserved: ReservedAct | Opening | None = None
-    # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset
-    # runs even if it is over, to release the checkpoint.
+    # If a reset had to wait for its checkpoint: the time at which the checkpoint was loaded, s.
+    # Such a reset runs even if it is over, so that the checkpoint is released.
     loaded: float | None = None
-    # Recent time from an answer to the session's next request, s, if known.
+    # Recent time from an answer to the session's next request, s; None if it is unknown.
     return_s: float | None = None
-    index: int = 0  # index among the requests of its message
+    index: int = 0  # index of the request in its message
     # For observers: the image files of its message, and the observers' own data until the answer.
     files: DecodedFiles = None  # type: ignore[assignment]
     observer_data: dict[Any, Any] = None  # type: ignore[assignment]
@@ -163,8 +167,8 @@ class PendingRequest:
     def finish(self, reply: Reply) -> None:
         """Store the reply in the message, unless the request is over; called on any thread.
 
-        If it is the last reply of its message, the message is delivered. An error of its receiver
-        is logged, and affects no other request.
+        The last reply of a message causes its delivery. An error of the receiver is logged, and
+        affects no other request.
         """
         if self.over:
             return
@@ -194,11 +198,9 @@ class PendingRequest:
     @property
     def latest_begin(self) -> float:
         """Latest time at which the episode of an act can have begun if the connection has not used
-        that episode before, s.
-
-        A client that continues an episode has begun it before it opened the connection. A later
-        episode may have begun after the client sent the act, since requests of several connections
-        arrive in any order.
+        that episode before, s. A client that continues an episode began it before it opened the
+        connection. A later episode may have begun after the client sent the act, since requests of
+        several connections arrive in any order.
         """
         return self.origin.opened if self.origin.owner else self.arrived
 
@@ -209,9 +211,10 @@ class PendingRequest:
     def is_useless(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s, or the client has left.
 
-        The queue asks this of each request before a batch takes it, whatever its way to the queue:
-        a client leaves a frozen replica, and its session continues at another one. When the replica
-        continues, it may execute what has waited before it reads that the client has left.
+        The queue checks this for each request before it enters a batch, regardless of the request's
+        transport. A client leaves a frozen replica, and its session continues at another replica.
+        When the frozen replica continues, it might otherwise execute the waiting requests before it
+        reads that the client has left.
         """
         if self.origin.ended or now > self.deadline:
             return True
@@ -224,7 +227,9 @@ class PendingRequest:
 
 
 Answer: TypeAlias = tuple[PendingRequest, Reply]
-"""The answer to a request: what a call of the policy returns, before it is delivered."""
+"""The answer to a request: the request and its reply, which a call of the policy returns before the
+delivery.
+"""
 
 
 def deliver(answers: Iterable[Answer]) -> None:
@@ -237,7 +242,7 @@ class Receiver(Protocol):
     """Receives messages with all their replies: a connection, or a caller that waits."""
 
     def deliver(self, message: IncomingMessage) -> None:
-        """Take the replies of a message, on the thread of the last one."""
+        """Receive a message with all its replies, on the thread of the last reply."""
 
 
 class IncomingMessage:
@@ -246,7 +251,7 @@ class IncomingMessage:
 
     Args:
         transport: Transport, for the metrics.
-        op: Operation of its only request, if that is known before decoding.
+        op: Operation of its only request, if the operation is known before decoding.
         priority: Priority of that request.
         charge: Charge of the message to its sender's key, if a `Sender` submits it.
     """
@@ -282,9 +287,10 @@ class IncomingMessage:
         self.replies: list[Reply] = []  # complete when the message is delivered
         self.receiver: Receiver  # set by `expect`
         self.sender: Receiver | None = None  # see `expect`
-        self.admission: MessageAdmission | None = None  # is released before the delivery
+        # Admission that is released before the delivery.
+        self.admission: MessageAdmission | None = None
         self.observed: Sequence[PendingRequest] = ()  # the requests that observers have seen
-        self.size = 0  # bytes that count as unanswered at its connection
+        self.size = 0  # number of bytes that count as unanswered at the connection
         self._missing = 0
         self._lock = threading.Lock()
 
@@ -300,20 +306,20 @@ class IncomingMessage:
             self.kinds.insert(index, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
-        """Record that `requests` requests, all of the message's own `op` and `priority`, are
-        decoded.
+        """Record that `requests` requests are decoded, which all have the message's `op` and
+        `priority`.
         """
         self.decoded_at = time.perf_counter()
         self.kinds = [self.kinds[0]] * requests
 
     def expect(self, requests: int, receiver: Receiver, sender: Receiver | None = None) -> None:
-        """Expect this number of replies, and deliver the message to `receiver` with the last one.
+        """Expect a number of replies, and deliver the message to `receiver` with the last reply.
 
         Args:
             requests: Number of requests, including those that could not be decoded.
-            receiver: Takes the replies.
-            sender: The `Sender` of the message, if it has one: it gets the message first, and
-                passes it on.
+            receiver: Receives the message with its replies.
+            sender: The `Sender` of the message, if any. It gets the message first, and passes it to
+                `receiver`.
         """
         self.replies = [None] * requests  # type: ignore[list-item]  # replaced by `answer`
         self.receiver = receiver
@@ -325,7 +331,8 @@ class IncomingMessage:
         if reply.error is None:
             reply.timing["decode_ms"] = (self.decoded_at - self.arrived) * 1e3
         else:
-            reply.error.__traceback__ = None  # its frames would retain this message and its bytes
+            # The traceback's frames would keep this message and its bytes in memory.
+            reply.error.__traceback__ = None
         with self._lock:
             if self.replies[index] is not None:
                 return

@@ -27,10 +27,11 @@ from vlagents_ray.serve.weights import WeightsVersion
 M = TypeVar("M")  # type of a loaded model
 
 
-# Number of remembered sessions that left, whose older states are rejected (about 500 bytes each).
+# Number of remembered sessions that have left (about 500 bytes each). Older states of these
+# sessions are rejected.
 _REMEMBERED = 4096
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step
-# Maximum number of acts at other replicas that neither the client nor this replica has seen.
+# Maximum number of acts at other replicas that neither the client nor this replica knows.
 _UNSEEN = 2**20
 _MOST_STEP = 2**62  # larger steps that clients report are ignored
 
@@ -47,22 +48,25 @@ Version = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SessionState:
-    """All that a replica passes on with a session: another one continues it from there exactly.
+    """The data that a replica transfers with a session, from which another replica continues it
+    exactly.
 
-    It is what `export` answers and `adopt` takes. A client, which has only seen observations and
-    actions, begins the session again from less: see `vlagents_ray.client.recovery.ResumePoint`.
+    It is the answer to `export`, and the argument of `adopt`. A client, which only knows
+    observations and actions, begins the session again with less data: see
+    `vlagents_ray.client.recovery.ResumePoint`.
     """
 
-    agent: bytes  # the policy's private state, by `AgentCopies.dump`
-    steps: int  # see `Session`, as `first`, `moves`, `follows` and `instruction`
+    agent: bytes  # the policy's private state, from `AgentCopies.dump`
+    steps: int  # see `Session`, also for `first`, `moves`, `follows` and `instruction`
     first: int
     moves: int
-    # Time from the reset of its episode to the call for this state, s. Clocks of replicas differ.
+    # Time from the reset of the session's episode to the request for this state, s. It is a
+    # duration, since the clocks of replicas differ.
     age_s: float
     policy: Sequence[str]  # version of the policy and of its shared objects
-    choice: Sequence[Any]  # fields of its `CheckpointChoice`
-    settings: dict[str, Any]  # settings of its checkpoint
-    weights: Sequence[Any]  # number and fingerprint of its version of the weights
+    choice: Sequence[Any]  # fields of the session's `CheckpointChoice`
+    settings: dict[str, Any]  # settings of the session's checkpoint
+    weights: Sequence[Any]  # number and fingerprint of the session's version of the weights
     follows: bool
     instruction: str
     robot: Sequence[Any] = ()  # see `RobotPlan.to_list`
@@ -74,11 +78,11 @@ class SessionState:
 
     @classmethod
     def from_info(cls, info: Mapping[str, Any]) -> SessionState:
-        """Return the state of an answer to `export`, or of a request to `adopt`."""
+        """Return the state in an answer to `export`, or in a request to `adopt`."""
         return cls(**info)
 
     def info(self) -> dict[str, Any]:
-        """Return the state as the info of an answer, which may pass to another process."""
+        """Return the state as the info of an answer, which can be sent to another process."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -88,35 +92,40 @@ class Session(Generic[M]):
 
     id: str
     agent: Agent | None = None  # None until the first `reset` succeeded; see `set_agent`
-    prepares: Prepares | None = None  # ability of its agent, which is asked for once in an episode
-    # Observations that wait for the acts that name them, with their preparations, by number.
+    # Ability of the session's agent, which is looked up once in an episode.
+    prepares: Prepares | None = None
+    # Observations that wait for the acts that refer to them, and their preparations, by number.
     stored: dict[int, tuple[Obs, Preparation | None]] = field(default_factory=dict)
     # Model of which `agent` is a copy; only the model manager and its cache set it.
     model: M | None = None
-    weights: WeightsVersion | None = None  # version of the weights that it acts with
-    instruction: str = ""  # instruction of its last reset
-    # Whether it uses the newest version of the weights, otherwise the pinned one.
+    weights: WeightsVersion | None = None  # version of the weights with which the session acts
+    instruction: str = ""  # instruction of the session's last reset
+    # Whether the session uses the newest version of the weights; otherwise it uses the pinned
+    # version.
     follows: bool = True
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
-    # Origin of its last request; without an owner it ends when closed or idle for long.
+    # Origin of the session's last request. Without an owner, the session ends when it is closed or
+    # idle for too long.
     origin: Origin = NOWHERE
-    # Step of its state: drawn at each reset, above all earlier steps, and incremented by each act.
+    # Step of the session's state. Each reset draws a new step above all earlier steps, and each act
+    # adds 1.
     steps: int = 0
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
-    # Time at which the last reset arrived that was run, s, of the engine's clock.
+    # Arrival time of the last reset that was run, s, of the engine's clock.
     began: float = 0.0
-    last_reset: float = 0.0  # time at which the latest reset arrived, which may still be queued, s
+    last_reset: float = 0.0  # arrival time of the latest reset, which may still be queued, s
     moves: int = 0  # number of moves between replicas since the last reset
-    # Time at which it came from another replica, s, of the engine's clock; -inf if it began here.
+    # Time at which the session arrived from another replica, s, of the engine's clock; -inf if it
+    # began here.
     moved_in: float = -math.inf
-    # Whether it was announced to the other replicas, which then keep no older state.
+    # Whether the session was announced to the other replicas, which then keep no older state.
     announced: bool = False
-    used: float = field(default_factory=time.monotonic)  # time of its last request, s
-    # What its robot has reported at this replica; None before the first report.
+    used: float = field(default_factory=time.monotonic)  # time of the session's last request, s
+    # Reports of the session's robot at this replica; None before the first report.
     times: RobotTimes | None = None
-    plan: RobotPlan = field(default_factory=RobotPlan)  # what its robot needs
+    plan: RobotPlan = field(default_factory=RobotPlan)  # needs of the session's robot
 
     @property
     def version(self) -> Version:
@@ -124,15 +133,15 @@ class Session(Generic[M]):
         return max((self.steps, self.moves), (self.expected, 0))
 
     def set_agent(self, agent: Agent | None) -> None:
-        """Act with this agent from now on; None without an episode. Observations that were stored
-        for the agent before are dropped.
+        """Set the agent with which the session acts from now on; None without an episode.
+        Observations that were stored for the previous agent are dropped.
         """
         self.stored.clear()
         self.prepares = None if agent is None else ability(agent, Prepares)
         self.agent = agent
 
     def wrong_step(self, step: int) -> UnknownSession:
-        """Return the error for an act at another step, which would repeat or skip an act."""
+        """Return the error for an act at a wrong step, which would repeat or skip an act."""
         return UnknownSession(
             f"session {self.id!r}: expected step {self.steps}, got {step} from its client; an "
             "answer was lost, or this is another episode: reset it"
@@ -158,15 +167,15 @@ class SessionFinder(Protocol):
         caller: str = "",
         user: Callable[[SessionState, float], Origin | None] = ...,
     ) -> bool:
-        """Fetch a session if a request can act on it (`user`), then call `then` whether it was
-        found or not; return False if `caller` has too many searches.
+        """Fetch a session if a request can act on it (`user`), then call `then` whether the session
+        was found or not; return False if `caller` has too many searches.
         """
 
     def announce(self, session_id: str, step: int, answer: Answer | None = None) -> None:
         """Announce to the other replicas that the session has begun an episode at this replica at
         `step`, so that they drop older states.
 
-        The `answer` to the reset is delivered once they have done so, or after a short time.
+        The `answer` to the reset is delivered once these states are dropped, or after a short time.
         """
 
 
@@ -181,9 +190,9 @@ class SessionTable(Generic[M]):
     """The sessions of a replica, by id. Thread-safe.
 
     A session never returns to an older state: a replica keeps the newest state that it has had, and
-    rejects older ones. Steps are drawn from the wall clock, so that a step drawn at another replica
-    exceeds all steps drawn before. A new step is always above all steps that the session's client
-    and this replica know, even if the clocks are wrong.
+    rejects older states. Steps are drawn from the wall clock, so that a step drawn at another
+    replica exceeds all steps drawn before. A new step is always above all steps that the session's
+    client and this replica know, even if the clocks are wrong.
     """
 
     def __init__(
@@ -199,7 +208,7 @@ class SessionTable(Generic[M]):
             limit: Largest number of sessions.
             idle_s: Time without a request after which a session may be dropped, s.
             clock: Wall clock, ns.
-            models: The models that the sessions hold; None if they hold none.
+            models: The models that the sessions hold; None if sessions hold no models.
         """
         self._models = models
         self._sessions: dict[str, Session[M]] = {}
@@ -260,12 +269,13 @@ class SessionTable(Generic[M]):
 
         Args:
             session: The session.
-            known: The step that its client reports; the drawn one is above it.
+            known: The step that the client reports; the drawn step is above it.
             arrived: Time at which the reset arrived, s, of the engine's clock.
-            origin: Origin of the reset, whose connection is in that episode from now on.
+            origin: Origin of the reset, whose connection belongs to the new episode from now on.
 
         Returns:
-            The step, and that of the connection's previous episode, or None without one.
+            The step, and the step of the connection's previous episode, which is None if there is
+            none.
         """
         with self._lock:
             before = max(session.version, self._left.get(session.id, (0, 0)))[0]
@@ -299,8 +309,8 @@ class SessionTable(Generic[M]):
         origin: Origin = NOWHERE,
         previous: int | None = None,
     ) -> None:
-        """Undo `begin` for a reset that was cancelled. The current episode continues, at this
-        replica or at another one.
+        """Undo `begin` for a reset that was cancelled. The current episode continues, at this or
+        another replica.
         """
         with self._lock:
             if origin.sessions.get(session_id) == first:
@@ -314,8 +324,8 @@ class SessionTable(Generic[M]):
                 self._end(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
-        """Return whether the session is past an episode that was to begin at that step, at this
-        replica or at another one.
+        """Return whether the session, at this or another replica, is past an episode that should
+        begin at the given step.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -339,7 +349,8 @@ class SessionTable(Generic[M]):
     def enter(self, arriving: Session[M]) -> None:
         """Add a session from another replica, which replaces an older state of the session.
 
-        Its old replica has already released it, so it is added even if the table has become full.
+        The old replica has already released the session, so it is added even if the table has
+        become full.
 
         Raises:
             Outdated: This replica has, or had, a state that is at least as new.
@@ -378,7 +389,7 @@ class SessionTable(Generic[M]):
             self._expected.append(arriving)
 
     def abandon(self, arriving: Session[M]) -> None:
-        """End a session that was to arrive from another replica, and will not."""
+        """End a session that was expected from another replica, but will not arrive."""
         with self._lock:
             self.forget_expected(arriving)
             self._end(arriving)
@@ -394,7 +405,9 @@ class SessionTable(Generic[M]):
             self._left.pop(session_id, None)
 
     def versions_of(self, session_ids: Iterable[str]) -> dict[str, Version]:
-        """Return the versions of those of the sessions that this table has with an episode."""
+        """Return the versions of the given sessions that this table contains, and that have an
+        episode.
+        """
         with self._lock:
             sessions = [self._sessions.get(session_id) for session_id in session_ids]
             return {
@@ -441,8 +454,8 @@ class SessionTable(Generic[M]):
         return sum(name.startswith(prefix) for name in names)
 
     def close(self, session_id: str, origin: Origin = NOWHERE) -> None:
-        """Close the session, which is its connection's no more unless that has sent a reset since;
-        unknown ids are ignored.
+        """Close the session. It no longer belongs to its connection, unless the connection has sent
+        a reset meanwhile. Unknown ids are ignored.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -452,8 +465,8 @@ class SessionTable(Generic[M]):
             self._forget(session_id)
 
     def release(self, session_id: str, version: Version) -> bool:
-        """Release the session to another replica, which has a copy of that version; return False if
-        the session's version differs.
+        """Release the session to another replica, which has a copy of the given version; return
+        False if the session's version differs.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -468,18 +481,18 @@ class SessionTable(Generic[M]):
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.origin.owner == connection:
-                    # This voids a waiting reset.
+                    # Setting this makes a waiting reset void.
                     self._forget(session_id, (max(session.steps, session.expected), _ANY))
 
     def close_those_of(self, model: M) -> None:
-        """Close all sessions of that model."""
+        """Close all sessions of a model."""
         with self._lock:
             of_model = [session for session in self._sessions.values() if session.model is model]
             for session in of_model:
                 self._forget(session.id)
 
     def all(self) -> list[Session[M]]:
-        """Return all sessions, without a lock, so that callers may hold their locks."""
+        """Return all sessions. The method takes no lock, so callers may hold locks."""
         return list(self._sessions.values())
 
     def by_transport(self) -> dict[str, int]:
@@ -492,8 +505,8 @@ class SessionTable(Generic[M]):
         return [session.times for session in self.all() if session.times is not None]
 
     def movable_by_connection(self, within_s: float) -> Counter[str]:
-        """Return the number of sessions by connection whose clients can be asked to reconnect, and
-        that were used within the last `within_s`.
+        """Return the number of sessions by connection whose clients can be requested to reconnect,
+        and that were used within the last `within_s`.
         """
         since = time.monotonic() - within_s
         with self._lock:
@@ -523,7 +536,7 @@ class SessionTable(Generic[M]):
             self._end(session)
 
     def _end(self, session: Session[M]) -> None:
-        """Mark a session as ended that is removed; the caller holds the lock."""
+        """Mark a removed session as ended; the caller holds the lock."""
         session.over = True
         session.stored.clear()
         if self._models is not None:
@@ -536,11 +549,10 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections that are to move to another replica: all of them if this replica drains,
-    otherwise those for which other replicas have room. The next reply over each of the latter asks
-    the client to reconnect, once. Thread-safe.
-
-    `vlagents_ray.serve.scaling.rebalancer` selects the latter.
+    """The connections that should move to another replica. If this replica drains, these are all
+    connections. Otherwise `vlagents_ray.serve.scaling.rebalancer` marks connections for which other
+    replicas have room; the next reply over each marked connection requests the client to reconnect,
+    once. Thread-safe.
     """
 
     def __init__(self) -> None:
@@ -555,15 +567,15 @@ class DrainList:
         self.draining = True
 
     def mark(self, connections: set[str]) -> None:
-        """Replace the set of connections whose clients are asked to reconnect."""
+        """Replace the set of connections whose clients are requested to reconnect."""
         with self._lock:
             self._marked = connections
 
     def ask(self, connection: str) -> bool:
-        """Return whether the current reply must ask for the reconnection of this connection alone;
-        if so, record that.
+        """Return whether the current reply must request the reconnection of a marked connection; if
+        so, record the request.
         """
-        if not self._marked:  # nearly always the case; then no lock is taken
+        if not self._marked:  # this is nearly always the case, and saves the lock
             return False
         with self._lock:
             if connection not in self._marked:
@@ -573,13 +585,17 @@ class DrainList:
             return True
 
     def asked_within(self, seconds: float) -> set[str]:
-        """Return the connections whose clients were asked to reconnect in the last `seconds`."""
+        """Return the connections whose clients were requested to reconnect in the last
+        `seconds`.
+        """
         since = time.monotonic() - seconds
         with self._lock:
             return {connection for connection, when in self._asked.items() if when >= since}
 
     def forget_older(self, seconds: float) -> None:
-        """Forget the connections whose clients were asked to reconnect more than `seconds` ago."""
+        """Forget the connections whose clients were requested to reconnect more than
+        `seconds` ago.
+        """
         since = time.monotonic() - seconds
         with self._lock:
             self._asked = {

@@ -1,4 +1,4 @@
-"""A token bucket: the limit of a rate, with bursts."""
+"""A token bucket, which limits a rate and allows bursts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class TokenBucket:
 
         Args:
             rate: Tokens that are added each second.
-            now: The present time, s.
+            now: The current time, s.
             capacity: Maximum number of tokens; by default the tokens of one second, at least one.
         """
         self.rate = rate
@@ -32,5 +32,5 @@ class TokenBucket:
         return 0.0
 
     def give_back(self, number: int = 1) -> None:
-        """Return tokens that were taken for nothing."""
+        """Return tokens that were taken but not needed."""
         self._tokens += number

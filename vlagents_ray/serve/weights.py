@@ -1,15 +1,15 @@
 """The versions of one model's weights, and the version with which each session acts.
 
 Version 0 is the loaded checkpoint. A push stages a version, which is checked and stored but not
-used, and commits it when all replicas have it; a part of the replica coordinates that
+used, and commits it when all replicas have it. A part of the replica coordinates the push
 (`serve.replica`). A commit copies and loads nothing: before a batch, a reset or an observation, the
 policy's thread loads the sessions' version into the agent (`ModelWeights.use`), which takes no time
-if the agent already has it. A version is freed when no session acts with it and it is neither the
-newest nor the pinned one.
+if the agent already has it. A version is freed when no session acts with it, unless it is the
+newest or the pinned version.
 
-On a GPU, the agent's version is in its parameters, where loading another version replaces it. The
-GPU's memory holds at most two versions, the agent's and a staged one. Versions with which no
-session acts are moved to the memory of the host.
+On a GPU, the version in use is stored in the agent's parameters, and loading another version
+replaces it. The GPU's memory holds at most two versions: the version in use and a staged version.
+Versions with which no session acts are moved to the memory of the host.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 PushMode = Literal["keep", "next_episode"]
 """When a session changes to a new version: between two of its acts, or at its next reset."""
 RestStep = Literal["sleep", "restore", "wake"]
-"""No acts, and less memory; the memory back, still without acts; and acts again."""
+"""The steps of a rest. "sleep": the policy stops acting, and frees memory. "restore": the memory is
+restored, but the policy does not act yet. "wake": the policy acts again.
+"""
 OPTION = "weights"  # option of a reset
 _LARGEST = 2**53 - 1  # largest version number, which JSON represents exactly
 _LONGEST_REST_S = 86_400.0
@@ -69,11 +71,12 @@ class PushOptions:
     """The options of a push."""
 
     mode: PushMode = "next_episode"  # when sessions change to the new weights
-    partial: bool = False  # whether names may be missing; their values are then kept
+    partial: bool = False  # whether names may be missing; the missing values are then kept
     allow_same: bool = False  # whether all values may equal those of the newest version
     # Whether sessions that do not follow the newest version also get it, at their next reset.
     pin: bool = False
-    # The number of the version, such as the training step; by default, one above the newest.
+    # The number of the version, such as the training step; by default, one above the newest
+    # version.
     version: int | None = None
 
     def __post_init__(self) -> None:
@@ -98,7 +101,7 @@ class WeightsVersion:
         self.number = number
         self.fingerprint = digest
         self.values = values  # by name; None if only the agent has them
-        self.on_host = False  # whether they were moved out of the GPU's memory
+        self.on_host = False  # whether the values were moved out of the GPU's memory
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
 
@@ -126,8 +129,9 @@ class Rest:
 class FollowingSession(Protocol):
     """The part of a session's interface that concerns weights."""
 
-    weights: WeightsVersion | None  # version that it acts with; None without an episode
-    follows: bool  # whether it uses the newest version, otherwise the pinned one
+    weights: WeightsVersion | None  # version with which the session acts; None without an episode
+    # Whether the session uses the newest version; otherwise it uses the pinned version.
+    follows: bool
 
 
 class ModelWeights:
@@ -143,20 +147,20 @@ class ModelWeights:
         """Make the weights of an initialized agent version 0.
 
         Args:
-            agent: The agent, which acts with one version at a time.
+            agent: The agent, which uses one version at a time.
             busy: The lock that is held while the agent runs.
-            digest: The fingerprint of an agent that names no parameters.
+            digest: The fingerprint of an agent that declares no parameters.
             model: A value that is equal in replicas with the same checkpoint and settings.
         """
         self.model = model
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._busy = busy
-        self._device: Any = "cpu"  # the GPU of its values, if they are on one
-        # The agent's values, if other versions are loaded into the same memory.
+        self._device: Any = "cpu"  # the GPU of the agent's values, if they are on a GPU
+        # The agent's own values, if other versions are loaded into the same memory.
         self._live_values: Mapping[str, Any] = {}
         self._lock = threading.Lock()
         self._sleeps = ability(agent, Sleeps)
-        # None if the policy names no parameters.
+        # None if the policy declares no parameters.
         self._trainable: Trainable | None = None
         try:
             trained = require_trainable(agent)
@@ -186,20 +190,19 @@ class ModelWeights:
             )
             self._device = next(on_gpu, "cpu")
         self.newest = self.pinned = first
-        # Number of the last version with which all following sessions act, since its mode was
-        # "keep".
+        # Number of the last version with the mode "keep", with which all following sessions act.
         self.kept = 0
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
-        # Version in the agent; None if loading one has failed.
+        # Version in the agent; None if loading a version has failed.
         self._live: WeightsVersion | None = first
         self._alive = WeakValueDictionary({0: first})
         self._asleep = False
-        # Copies of the GPU's values in the memory of the host, while the policy sleeps.
+        # Copies of the values on the GPU in the memory of the host, while the policy sleeps.
         self._moved: list[tuple[Any, Any]] = []
         self._moved_arrays = MovedArrays()
         # A counter that is increased before and after another version is loaded into the agent, so
-        # it is odd in between.
+        # it is odd during the load.
         self._switches = 0
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
@@ -210,15 +213,14 @@ class ModelWeights:
             return session.weights
 
     def end(self, session: FollowingSession) -> None:
-        """Hold no version for the session any more, since its episode has ended."""
+        """Release the session's version, since its episode has ended."""
         with self._lock:
             session.weights = None
 
     def find(self, number: int, digest: str, *, follows: bool = False) -> WeightsVersion:
-        """Return the version for a session from another replica, which acts with that number there.
-
-        A session that `follows` the newest version gets a newer one that was pushed since with the
-        mode "keep".
+        """Return the version for a session from another replica, where it acts with the version
+        `number`. A session that `follows` the newest version gets a newer version if one was pushed
+        since with the mode "keep".
 
         Raises:
             VersionNotHeld: This replica does not have the version; see `restore`.
@@ -229,7 +231,8 @@ class ModelWeights:
             version = self._alive.get(number)
         if version is None or version.fingerprint != digest or version is self._staged:
             raise VersionNotHeld(
-                f"version {number} of the weights ({digest}) is not held here; reset the session"
+                f"version {number} of the weights ({digest}) does not exist at this replica; reset "
+                "the session"
             )
         return version
 
@@ -255,8 +258,8 @@ class ModelWeights:
             return self._alive.setdefault(number, restored)
 
     def catch_up(self, session: FollowingSession) -> None:
-        """Change a session, which was not in the table of sessions at the time, to the last version
-        that was pushed with the mode "keep".
+        """Change a session to the last version that was pushed with the mode "keep", if the session
+        was not in the table of sessions at the time of the push.
         """
         with self._lock:
             acts_with = session.weights
@@ -273,9 +276,10 @@ class ModelWeights:
             return
         self._switches += 1
         outgoing, self._live = None if self._live is None else ref(self._live), None
-        live = None if outgoing is None else outgoing()  # None if nothing else refers to it
+        # None if nothing else refers to the version.
+        live = None if outgoing is None else outgoing()
         kept = live if self._in_place and live is not None and live.values is None else None
-        # All use of versions' memory is on that stream, which waits here for the acts before.
+        # All work on the memory of versions uses this stream, which waits here for earlier acts.
         with beside_acts(self._device):
             if (
                 kept is not None
@@ -288,7 +292,7 @@ class ModelWeights:
             else:
                 if kept is not None:
                     kept.values = trainable.own_copies(self._own_values())
-                # Without values, the agent still has its own.
+                # For a version without stored values, the agent still has its own values.
                 if version.values is not None and self._trainable is not None:
                     self._trainable.load_parameters(version.values)
         self._live = version
@@ -307,9 +311,9 @@ class ModelWeights:
             options: The options of the push.
 
         Raises:
-            NotTrainable: The agent names no parameters.
-            MessageTooLarge: The header is twice as long as one with the agent's own names would be.
-                It is not parsed.
+            NotTrainable: The agent declares no parameters.
+            MessageTooLarge: The header is more than twice as long as a header with the agent's own
+                names would be. It is not parsed.
             MalformedMessage: The header is invalid.
             InvalidWeights: The values do not fit.
         """
@@ -340,13 +344,13 @@ class ModelWeights:
         It is dropped unless it is committed within a minute, since its learner may have died.
 
         Args:
-            number: The number of the version, above that of the newest one.
-            pushed: Its values, by name.
+            number: The number of the version, above the number of the newest version.
+            pushed: The values of the version, by name.
             options: The options of the push.
             sessions: Returns the sessions of the replica, without a lock.
 
         Raises:
-            NotTrainable: The agent names no parameters.
+            NotTrainable: The agent declares no parameters.
             Overloaded: Another version is staged, or the number is not above that of the newest
                 version.
             InvalidWeights: The values do not fit.
@@ -360,7 +364,7 @@ class ModelWeights:
             if number <= newest.number:
                 raise Overloaded(
                     f"weights: expected a version above {newest.number}, the newest here, got "
-                    f"{number}, as another push was faster; push again"
+                    f"{number}, since another push was faster; push again"
                 )
             if self._staged is not None:
                 raise Overloaded(
@@ -393,8 +397,8 @@ class ModelWeights:
         pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
     ) -> WeightsVersion:
-        """Return a version of pushed values, which have been checked. Names that are missing have
-        the values of the newest version.
+        """Return a version of pushed values, which have been checked. Missing names have the values
+        of the newest version.
         """
         with (
             self._uncaptured(pushed),
@@ -414,12 +418,12 @@ class ModelWeights:
             return WeightsVersion(number, trainable.fingerprint(values), values)
 
     def register(self, version: WeightsVersion) -> None:
-        """Let `find` return a version as long as it is in use."""
+        """Make a version available to `find` as long as it is in use."""
         self._alive[version.number] = version
 
     def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
-        """Act with a version in all sessions and later episodes. It is called in a child process,
-        whose replica chooses the version.
+        """Act with a version in all sessions and later episodes. This method is called in a child
+        process, whose replica chooses the version.
         """
         with self._lock:
             self.newest = self.pinned = version
@@ -438,7 +442,7 @@ class ModelWeights:
             sessions: Returns the sessions of the replica, without a lock.
 
         Raises:
-            WeightsNotStaged: The version is neither staged nor the newest one.
+            WeightsNotStaged: The version is neither staged nor the newest version.
         """
         with self._lock:
             if self.newest.number == number:
@@ -455,7 +459,7 @@ class ModelWeights:
             if options.mode == "keep":
                 self.kept = number
                 for session in sessions():
-                    acts_with = session.weights  # of this model, or of another one
+                    acts_with = session.weights  # weights of this model, or of another model
                     if (
                         session.follows
                         and acts_with is not None
@@ -464,7 +468,7 @@ class ModelWeights:
                         session.weights = self.newest
 
     def drop(self, number: int) -> None:
-        """Drop a staged version; the last committed one is kept."""
+        """Drop a staged version; the last committed version is kept."""
         with self._lock:
             if self._staged is None or self._staged.number != number:
                 return
@@ -483,10 +487,10 @@ class ModelWeights:
         """Free the memory in torch's cache until `wake`. With `offload`, also free the memory of
         all versions and graphs.
 
-        The caller must keep the agent from acting until then.
+        The caller must prevent the agent from acting until then.
 
         Raises:
-            NotTrainable: The agent names no parameters, which `offload` would move.
+            NotTrainable: The agent declares no parameters that `offload` could move.
         """
         if offload and self._refusal is not None:
             raise self._refusal
@@ -503,7 +507,7 @@ class ModelWeights:
         free_memory()
 
     def wake(self) -> None:
-        """Move the versions back, and make the graphs again; does nothing if the agent is awake.
+        """Move the versions back, and capture the graphs again; does nothing if the agent is awake.
 
         Raises:
             PolicyUnavailable: The GPU has too little memory; the agent still sleeps.
@@ -521,13 +525,13 @@ class ModelWeights:
                     raise
                 raise PolicyUnavailable(
                     "wake: the GPU has too little memory for the policy, which still sleeps; free "
-                    "the learner's, "
-                    f"with torch.cuda.empty_cache(), and call wake again ({error})"
+                    "the learner's memory with torch.cuda.empty_cache(), and call wake again "
+                    f"({error})"
                 ) from error
             self._asleep = False
 
     def _arrays_to_host(self) -> None:
-        """Move JAX arrays to the host, if an agent keeps no more than references to them."""
+        """Move JAX arrays to the host, if the agent keeps only references to them."""
         if self._in_place or self._trainable is None:
             return
         for version in list(self._alive.values()):
@@ -557,12 +561,12 @@ class ModelWeights:
         """Return a context manager for work on versions, which may run during acts, but not during
         the capture of a CUDA graph.
 
-        The work waits for no act: acts only read the agent's values, and `use` has waited for those
-        that read the memory of a freed version.
+        The work need not wait for acts: they only read the agent's values, and `use` has waited for
+        the acts that read the memory of a freed version.
 
         Args:
-            pushed: The values that are pushed. The GPU may still compute those of this process;
-                another process has waited for it.
+            pushed: The pushed values. The GPU may still be computing values of this process;
+                another process has waited before it sent its values.
 
         Raises:
             PolicyUnavailable: The policy sleeps.
@@ -570,15 +574,15 @@ class ModelWeights:
         with CAPTURES.pushes:
             if self._asleep:
                 raise PolicyUnavailable(
-                    "weights: expected a policy that is awake, got one that sleeps; give wake() "
-                    "the new values, or call it first"
+                    "weights: expected a policy that is awake, got one that sleeps; pass the new "
+                    "values to wake(), or call wake() first"
                 )
             is_computed = isinstance(pushed, SharedValues) or not trainable.has_gpu_tensors(pushed)
             with beside_acts(self._device, waits=not is_computed):
                 yield
 
     def _own_values(self) -> dict[str, Any]:
-        """Return references to the agent's values, by name; empty if it names none."""
+        """Return references to the agent's values, by name; empty if it declares no parameters."""
         return {} if self._trainable is None else self._trainable.parameters()
 
     def _forget_staged(self) -> None:
@@ -595,8 +599,8 @@ class ModelWeights:
         return self._parameters() if values is None or version.on_host else values
 
     def _parameters(self) -> Mapping[str, Any]:
-        """Return the agent's values. Lazy layers have none before the first act, which sets their
-        sizes.
+        """Return the agent's values. Lazy layers have no values before the first act, which sets
+        their sizes.
         """
         if not self._live_values:
             with self._busy:
@@ -604,10 +608,9 @@ class ModelWeights:
         return self._live_values
 
     def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:
-        """Return the result of a function of a version's values, which may be the agent's.
-
-        It does not wait for acts. If another version is loaded into the same memory meanwhile, the
-        function is called once more, between two acts.
+        """Return the result of a function of a version's values, which may be the agent's own
+        values. The method does not wait for acts. If another version is loaded into the same memory
+        meanwhile, the function is called once more, between two acts.
         """
 
         def result() -> T:
@@ -635,8 +638,8 @@ class ModelWeights:
         return trainable.own_copies(values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
-        """Move the pinned and the newest version out of the GPU's memory, unless the agent has it
-        or it is in `used`.
+        """Move the pinned and the newest version out of the GPU's memory, except versions in the
+        agent or in `used`.
         """
         for version in {self.pinned, self.newest} - used:
             switches, values = self._switches, version.values
@@ -644,7 +647,8 @@ class ModelWeights:
                 continue
             moved = trainable.mapped(trainable.on_host, values)
             with self._busy:
-                if self._switches == switches:  # otherwise another version may have got its memory
+                # Otherwise another version may already use its memory.
+                if self._switches == switches:
                     version.values, version.on_host = moved, True
 
 
@@ -665,14 +669,14 @@ class NewestVersion:
     number: int
     # Equal in replicas that loaded the same checkpoint with the same settings.
     model: tuple[str, str]
-    # UUIDs of the GPUs whose memory it can copy: the GPU of its weights and the peers of that GPU;
-    # empty if the weights are not on a single GPU
+    # UUIDs of the GPUs whose memory the replica can copy: the GPU of its weights and the peers of
+    # that GPU; empty if the weights are not on a single GPU
     gpus: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class HeldVersion:
-    """A pushed version, sent to a replica that lacks it."""
+    """A pushed version in the form in which it is sent to a replica that lacks it."""
 
     number: int
     pinned: bool
@@ -681,7 +685,7 @@ class HeldVersion:
 
 
 class OwnWeights(Protocol):
-    """The models of a replica, as far as their weights are concerned."""
+    """The part of `ModelManager` that concerns weights."""
 
     @property
     def own_weights(self) -> ModelWeights:
@@ -689,7 +693,7 @@ class OwnWeights(Protocol):
 
 
 class AllSessions(Protocol):
-    """The sessions of a replica, as far as their weights are concerned."""
+    """The part of `SessionTable` that concerns weights."""
 
     def all(self) -> Sequence[FollowingSession]:
         """Return all sessions, without a lock."""
@@ -706,17 +710,17 @@ class WeightUpdates:
         """Update the weights of a replica.
 
         Args:
-            models: Has the weights of the deployment's own model.
-            sessions: The sessions, which act with them.
+            models: Contains the weights of the deployment's own model.
+            sessions: The sessions that use these weights.
         """
         self._models, self._sessions = models, sessions
         # Held while the policy's thread runs a batch, and while the policy sleeps.
         self.acting_lock = threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
-        # The weights of the policy that sleeps; `acting_lock` is then held.
+        # The weights of the sleeping policy; `acting_lock` is held while it sleeps.
         self._asleep: ModelWeights | None = None
         self._alarm: threading.Timer | None = None
-        # In a child process: the versions to which its replica refers, by their names.
+        # In a child process: the versions to which the replica refers, by their names.
         self._by_name: dict[int, WeightsVersion] = {}
 
     def current(self) -> ModelWeights:
@@ -736,7 +740,9 @@ class WeightUpdates:
         self.current().commit(number, options, self._sessions.all)
 
     def pushed_versions(self) -> list[HeldVersion]:
-        """Return the pinned and the newest version, the older one first, if they were pushed."""
+        """Return the pinned and the newest version, in ascending order, without versions that were
+        not pushed.
+        """
         weights = self.current()
         pinned, newest = weights.pinned, weights.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
@@ -753,12 +759,13 @@ class WeightUpdates:
     def rest(self, rest: Rest) -> None:
         """Make the policy sleep after the running batch, restore its memory, or let it act again.
 
-        Requests wait in the queue meanwhile. "restore" and "wake" do nothing if it is awake.
+        Requests wait in the queue meanwhile. "restore" and "wake" do nothing if the policy is
+        awake.
 
         Raises:
             PolicyUnavailable: The policy loads, or its GPU has too little memory, so that it still
                 sleeps.
-            Overloaded: It sleeps already.
+            Overloaded: The policy already sleeps.
             NotTrainable: See `ModelWeights.sleep`.
         """
         weights = self.current()
@@ -803,12 +810,12 @@ class WeightUpdates:
             try:
                 self.rest(Rest("wake"))
             except Exception:
-                logger.exception("the policy does not wake; tried again in %g s", seconds)
+                logger.exception("the policy does not wake; the next attempt is in %g s", seconds)
                 self._set_alarm(seconds)
 
-    # The following methods run in a child process. Its replica decides which version acts, and when
-    # one is dropped. The replica gives version 0 the name 0, and other versions numbers as names,
-    # since a version may be pushed twice.
+    # The following methods run in a child process. Its replica decides which version is used, and
+    # when a version is dropped. The replica gives version 0 the name 0, and other versions
+    # consecutive numbers as names, since a version may be pushed twice.
 
     def make(
         self,
@@ -818,7 +825,9 @@ class WeightUpdates:
         pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
     ) -> str:
-        """Make a version from pushed values and those of `base`, and return its fingerprint."""
+        """Make a version from pushed values and the values of `base`, and return its
+        fingerprint.
+        """
         weights = self.current()
         version = weights.make(number, self.version_named(base), pushed, options)
         self._by_name[name] = version
@@ -826,14 +835,14 @@ class WeightUpdates:
         return version.fingerprint
 
     def version_named(self, name: int) -> WeightsVersion:
-        """Return the version with this name of the replica."""
+        """Return the version to which the replica has given this name."""
         if not self._by_name:
             self._by_name[0] = self.current().newest
         return self._by_name[name]
 
     def obey(self, use: int | None = None, forget: int | None = None) -> None:
-        """Change to one version, or drop one. It is called on the policy's thread, between two
-        batches.
+        """Change to a version, or drop a version. This method is called on the policy's thread,
+        between two batches.
         """
         if use is not None:
             self.current().act_with(self.version_named(use), self._sessions.all())
@@ -841,13 +850,13 @@ class WeightUpdates:
             self._by_name.pop(forget, None)
 
     def acting(self) -> tuple[int, str]:
-        """Return number and fingerprint of the version with which all sessions act."""
+        """Return the number and the fingerprint of the version with which all sessions act."""
         newest = self.current().newest
         return newest.number, newest.fingerprint
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
-        """Return number and fingerprint of the newest and the pinned version, for the metadata;
-        None while it loads.
+        """Return the number and the fingerprint of the newest and the pinned version, for the
+        metadata; None while the policy loads.
         """
         try:
             weights = self.current()

@@ -39,8 +39,8 @@ class CallLimits:
 
 
 class PolicyCall:
-    """Context manager around the calls of one kind, on one thread at a time; measures their
-    durations.
+    """Context manager around the calls of one kind, on one thread at a time. It measures the
+    durations of the calls.
     """
 
     __slots__ = ("_calls", "_count", "_longest_s", "_process", "_thread", "began", "ended", "op")
@@ -51,7 +51,7 @@ class PolicyCall:
         self.began = self.ended = 0.0
         self._thread = self._process = 0
         self._count = 0
-        # Duration of the longest call; of the warm-up calls only the shortest counts.
+        # Duration of the longest call, s. Among the warm-up calls, only the shortest counts.
         self._longest_s = 0.0
 
     def __enter__(self) -> PolicyCall:
@@ -62,9 +62,9 @@ class PolicyCall:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if os.getpid() != self._process:
-            # The policy forked this process during the call; the process shares the clients'
-            # sockets.
-            message = f"a child that the policy forked in {self.op!r} has returned; it is ended\n"
+            # The policy forked this process during the call. The process shares the clients'
+            # sockets, so it must end.
+            message = f"a process that the policy forked in {self.op!r} has returned; it is ended\n"
             os.write(2, message.encode())
             os._exit(1)
         if error is not None:
@@ -80,7 +80,7 @@ class PolicyCall:
 
     @property
     def limit_s(self) -> float:
-        """Time limit of the running call or, if none runs, of the next one, s."""
+        """Time limit of the running call or, if no call is running, of the next call, s."""
         limits = self._calls.limits
         if self.op == LOAD:
             return limits.load_s
@@ -127,8 +127,8 @@ class PolicyCalls:
             self.broken = error
 
     def record_batch(self, results: Sequence[object]) -> None:
-        """Count consecutive batches with errors of the policy only; errors of requests do not
-        count.
+        """Count consecutive batches in which every row failed with an error of the policy; errors
+        of requests do not count.
         """
         errors = [result for result in results if isinstance(result, Exception)]
         for error in errors:
@@ -142,8 +142,8 @@ class PolicyCalls:
             self.failed_batches += 1
 
     def require_device(self) -> None:
-        """Raise `PolicyUnavailable` if the accelerator failed, so that clients begin again at
-        another replica.
+        """Raise `PolicyUnavailable` if the accelerator failed, so that clients restart their
+        episodes at another replica.
         """
         if self.broken is not None:
             error = f"{type(self.broken).__name__}: {str(self.broken).partition(chr(10))[0]}"
@@ -153,7 +153,9 @@ class PolicyCalls:
             ) from self.broken
 
     def check_health(self) -> None:
-        """Raise if the accelerator failed, or the last batches all did."""
+        """Raise an error if the accelerator failed, or if all of the last `FAILED_BATCHES` batches
+        failed.
+        """
         self.require_device()
         if self.failed_batches >= FAILED_BATCHES:
             raise PolicyFailed(

@@ -1,21 +1,23 @@
-"""The order in which waiting requests enter batches; uses no threads and no clock but the requests'
-arrival times.
+"""The order in which waiting requests enter batches. The module uses no threads, and no clock
+except the requests' arrival times.
 
-Robots go before simulations. Among requests of the same priority the *sources* take turns
+Robots are served before simulations. Among requests of the same priority the *sources* take turns
 (round-robin): a connection that sends 512 observations at once gets one slot, then the next source
-gets one, and so on until the batch is full. So a client with many requests delays the others of its
-priority by no more than one batch, and a client alone fills the batch. A session (one robot, one
-env) has at most one request in a batch, and its requests keep their order.
+gets one, and so on until the batch is full. A client with many requests therefore delays the other
+clients of its priority by at most one batch, and a single client can fill the batch. A session (one
+robot, one env) has at most one request in a batch, and its requests keep their order.
 
-A robot that executes an action chunk can state its slack: the time until its rows run out
-(`PendingRequest.needed`). One whose slack is long waits behind those that are *urgent*: robots
-whose answers are needed within two full batches, and those that state no slack. Urgent ones take
-turns, the others follow by the time at which they need their answers, and become urgent as that
-comes near. So a client gains nothing by stating less slack than it has. A batch takes no request
-that can wait, and no simulation, if its most urgent answer would be late only because of that row.
+A robot that executes an action chunk can send its slack: the time until its rows run out
+(`PendingRequest.needed`). A robot with a long slack waits behind *urgent* robots, which need their
+answers within the duration of two full batches or send no slack. Urgent robots take turns. The
+other robots follow in the order in which they need their answers, and become urgent as that time
+approaches. A client therefore gains nothing if it sends less slack than it has. No request that can
+wait, and no simulation, is added to a batch if its row alone would make the most urgent answer
+late.
 
-If the robots need more than the replica can do, those that it cannot serve in time
-(`PendingRequest.waits_behind_others`) wait behind all other robots, at most `BEHIND_OTHERS_S`.
+If the robots need more than the replica can compute, the robots that it cannot serve in time
+(`PendingRequest.waits_behind_others`) wait behind all other robots, but at most for
+`BEHIND_OTHERS_S`.
 
 Robots may use the whole throughput of the policy. Simulations then advance slowly: once the request
 of the next simulation has waited for longer than `PATIENCE_S`, it gets a slot in every second
@@ -33,9 +35,9 @@ from collections.abc import Sequence
 from vlagents_ray.protocol.messages import Priority
 from vlagents_ray.serve.requests import PendingRequest
 
-# Time after which a simulation gets a slot although robots' requests keep arriving.
+# Time after which a simulation gets a slot although robots' requests keep arriving, s.
 PATIENCE_S = 1.0
-# Time for which the request of a robot waits behind those of other robots at most, s.
+# Maximum time for which the request of a robot waits behind the requests of other robots, s.
 BEHIND_OTHERS_S = 60.0
 
 # Requests of one session, in order; never empty while the session waits.
@@ -89,7 +91,7 @@ class _PatientQueue:
     __slots__ = ("_heap", "_numbers")
 
     def __init__(self) -> None:
-        # The number keeps the order of arrival where two need their answers at the same time.
+        # The number keeps the order of arrival if two sessions need their answers at the same time.
         self._heap: list[tuple[float, int, _SessionQueue]] = []
         self._numbers = itertools.count()
 
@@ -105,7 +107,7 @@ class _PatientQueue:
         return heapq.heappop(self._heap)[2]
 
     def is_behind_others(self) -> bool:
-        """Return whether the next session is one that waits behind others."""
+        """Return whether the next session waits behind other robots."""
         return bool(self._heap) and self._heap[0][2][0].waits_behind_others
 
     def first_needed(self) -> float:
@@ -114,20 +116,20 @@ class _PatientQueue:
 
 
 def _needed(pending: PendingRequest) -> float:
-    """Return the time before which a robot's request is to be answered, s."""
+    """Return the time before which a robot's request should be answered, s."""
     if pending.waits_behind_others:
         return pending.arrived + BEHIND_OTHERS_S
     return pending.needed
 
 
 class FairQueue:
-    """The waiting requests. Adding or taking one takes constant time for any number of others, or
-    with slack logarithmic time. Not thread-safe.
+    """The waiting requests. Adding or removing a request takes constant time regardless of the
+    number of requests, or logarithmic time for requests with slack. Not thread-safe.
     """
 
     costs_s: Sequence[float] = ()
-    """The duration of a batch by its number of requests, s, from 0 to the largest; empty if
-    unknown: all robots are urgent then.
+    """The duration of a batch by its number of requests, s, from 0 to the largest number. It is
+    empty if the durations are unknown; all robots are then urgent.
     """
 
     def __init__(self) -> None:
@@ -156,7 +158,7 @@ class FairQueue:
         return [queue[0] for queue in self._sessions.values()]
 
     def add(self, pending: PendingRequest) -> None:
-        """Add a request behind the others of its session."""
+        """Add a request behind the other requests of its session."""
         self.depth[pending.priority] += 1
         self.size += 1
         if self.size == 1:
@@ -182,7 +184,7 @@ class FairQueue:
     def _enqueue(self, queue: _SessionQueue, now: float) -> None:
         """Add the queue of a session that did not wait before."""
         head = queue[0]
-        # A request that states no slack is needed at 0.0.
+        # For a request without slack, the time is 0.0.
         can_wait = head.priority is Priority.ROBOT and _needed(head) > now + self._urgent_s()
         if can_wait:
             self._patient.add(queue)
@@ -190,8 +192,8 @@ class FairQueue:
             self._queues_by_priority[head.priority].add(queue)
 
     def _urgent_s(self) -> float:
-        """Return the slack up to which a robot is urgent, s: the batch that may be running, and one
-        more, if both are full.
+        """Return the slack up to which a robot is urgent, s: the duration of two full batches, the
+        batch that may be running and the next one.
         """
         return 2 * self.costs_s[-1] if self.costs_s else math.inf
 
@@ -215,7 +217,7 @@ class FairQueue:
             lone is not None
             and not (lone.over or lone.origin.ended)
             and now <= lone.deadline
-            # Nothing is called for most requests, which are taken at once.
+            # For most requests, which are taken immediately, the second check makes no call.
             and (now <= lone.certain_until or not lone.is_useless(now))
         ):
             self._lone = None
@@ -239,7 +241,8 @@ class FairQueue:
             and simulations.is_impatient(now)
         ):
             self._pick(simulations.next(), now, batch, expired, still_waiting)
-        # It has not yielded if all requests of that session are over or have expired.
+        # The batch has no slot for a simulation if all requests of that session are over or have
+        # expired.
         self._yielded = bool(batch)
 
         while robots.sources and len(batch) < size:
@@ -257,8 +260,8 @@ class FairQueue:
         return batch, expired
 
     def _size_in_time(self, batch: Sequence[PendingRequest], size: int, now: float) -> int:
-        """Return how many requests the batch may have, of at most `size`, so that no answer is late
-        that is in time without further ones.
+        """Return how many requests the batch may have, at most `size`, so that further requests
+        make no answer late that is otherwise in time.
         """
         if not self.costs_s:
             return size
@@ -303,7 +306,7 @@ class FairQueue:
             self.depth[pending.priority] -= 1
             self.size -= 1
 
-            # A reset whose checkpoint was loaded must run, to release that checkpoint.
+            # A reset whose checkpoint was loaded must run, so that the checkpoint is released.
             if pending.loaded is None:
                 if pending.over:
                     continue

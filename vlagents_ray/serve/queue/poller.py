@@ -1,10 +1,10 @@
 """The poller of the policy's thread: the files that it watches, and the thread that polls while the
 policy runs.
 
-The policy's thread waits on file descriptors, so that a local client's socket can be one of them: a
-request then reaches the policy without a thread switch. While a batch runs that takes milliseconds,
-a reader thread polls instead, and decodes the next batch. Callbacks run on either thread, never on
-both at once.
+The policy's thread waits on file descriptors, so that a local client's socket can be one of them. A
+request then reaches the policy without a thread switch. While a batch that takes milliseconds is
+running, a reader thread polls instead, and decodes the next batch. Callbacks run on either of these
+threads, but never on both at the same time.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ logger = logging.getLogger(__name__)
 
 
 class Poller:
-    """Watches files and a wake-up pipe. One thread owns the poller, and lends it to a reader
-    thread at times.
+    """Watches files and a wake-up pipe. One thread owns the poller, and sometimes lends it to a
+    reader thread.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,8 @@ class Poller:
         self._scheduled: deque[Callable[[], None]] = deque()
         # A heap of times (s), numbers and callbacks.
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
-        self._timer_numbers = itertools.count()  # so that no two callbacks are compared
+        # Makes entries differ, so that the heap compares no callbacks.
+        self._timer_numbers = itertools.count()
 
     def watch(self, file: socket.socket, ready: Callable[[], None]) -> None:
         """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or
@@ -154,13 +155,13 @@ class Poller:
                 return
             ready = self._ready.get(descriptor)
             if ready is None:
-                continue  # an earlier callback of this loop has stopped watching it
+                continue  # an earlier callback in this loop has stopped watching the file
             try:
                 ready()
             except Exception:
                 logger.exception("the callback of a watched file failed")
                 if self._ready.pop(descriptor, None) is not None:
-                    with contextlib.suppress(OSError):  # it may be closed already
+                    with contextlib.suppress(OSError):  # the file may already be closed
                         self._poll.unregister(descriptor)
 
     def _run_scheduled(self) -> None:

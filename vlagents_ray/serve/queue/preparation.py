@@ -1,8 +1,8 @@
-"""Preparation of observations on other threads than the policy's, so that the next batch is ready
-when one ends.
+"""Preparation of observations on threads other than the policy's, so that the next batch is ready
+when a batch ends.
 
-A batch does not wait for preparations that have not begun: the policy's thread runs those itself,
-beginning with the last one. So a robot whose request arrives last does not wait for the
+A batch does not wait for preparations that have not begun: the policy's thread runs them itself,
+beginning with the last one. A robot whose request arrives last therefore does not wait for the
 preparations of earlier simulations.
 """
 
@@ -65,8 +65,9 @@ class Preparations:
         """Finish the preparations of a batch; called on the policy's thread.
 
         Args:
-            preparations: Of each request, what `begin` returned, and the present ability of the
-                session's agent, which is another one if the session has been reset since.
+            preparations: For each request, the result of `begin`, and the current ability of the
+                session's agent. That ability differs from the one at `begin` if the session has
+                been reset since.
 
         Returns:
             The errors of preparations by their indices in the batch.
@@ -74,7 +75,7 @@ class Preparations:
         errors: dict[int, Exception] = {}
 
         def finish_at(index: int, *, begun: bool) -> None:
-            """Finish one preparation, on this thread unless another one has begun it."""
+            """Finish one preparation, on this thread unless another thread has begun it."""
             preparation, prepares = preparations[index]
             # The session may have been reset.
             if preparation is None or prepares is not preparation.prepares:

@@ -1,12 +1,13 @@
-"""The load of a replica by what its robots need, and the pace at which they replan.
+"""The load of a replica from the needs of its robots, and the pace at which the robots replan.
 
-A robot that asks again as soon as it is answered makes all robots of a busy replica wait in the
-queue, where their observations grow old. So each answer names the time at which the robot's next
-request is useful, and the robot waits at home, with fresher observations.
+If the robots of a busy replica sent their next requests as soon as they are answered, all requests
+would wait in the queue, and their observations would become old. Therefore each answer contains the
+time at which the robot's next request is useful. The robot waits until then, and sends a fresher
+observation.
 
-If the robots need more than the replica can do, those that came first are *admitted* up to the
-largest load at which all of them are in time. The requests of the others wait behind those of the
-admitted ones. If all robots shared what is missing, all of them would be a little late.
+If the robots need more than the replica can compute, the robots that arrived first are *admitted*,
+up to the largest load at which all of them are in time. The requests of all other robots wait
+behind the requests of admitted robots. Otherwise, all robots would be slightly late.
 """
 
 from __future__ import annotations
@@ -32,43 +33,48 @@ from vlagents_ray.serve.fleet import (
 from vlagents_ray.slo import SHARE, Slo
 
 _READ_S = 0.5  # time after which the needs of all sessions are read again
-# The same after the first time; it doubles until it is `_READ_S`. The first curve is of one batch,
-# and the next ones are soon better.
+# The same time at the beginning; it then doubles until it is `_READ_S`. The first curve is computed
+# from a single batch, and later curves are soon more accurate.
 _FIRST_READ_S = 0.02
-# Share by which the observed rate of a robot must differ from the known one to replace it, so that
-# the needs of equal robots are equal.
+# Share by which the observed rate of a robot must differ from the known rate to replace it. Equal
+# robots thereby have equal needs.
 _DIFFERS = 0.1
-# Load up to which further robots are admitted where there are too many. Those that are admitted
-# stay so up to `USABLE`: measured costs vary, and no robot should come and go.
+# Load up to which further robots are admitted if there are too many robots. Admitted robots stay
+# admitted up to `USABLE`, so that variations of the measured costs do not withdraw and restore
+# admissions.
 _ADMITTED_LOAD = 0.86
-# Time without a request, beyond that of its rows, after which a robot does not count: it is paused,
-# or its client has gone without a word.
+# Time without a request, in addition to the duration of its rows, after which a robot does not
+# count, s. It is then paused, or its client has left without ending the session.
 _PRESENT_S = 10.0
-# Load and interval up to which robots may ask a little more often than they are paced.
+# Load, and interval in ticks, up to which robots may send requests slightly more often than their
+# pace.
 _IDLE_LOAD, _FEW_TICKS = 0.5, 4
-_KINDS = 4  # kinds of robots that are tried for the room that is left, as each costs time
-_MOST_SLACK_MS = 60_000.0  # so that no request waits for longer in a queue that is never empty
+# Maximum number of kinds of robots for which the remaining room is searched, to save time.
+_KINDS = 4
+_MOST_SLACK_MS = 60_000.0  # limits the wait of a request in a queue that is never empty
 
 
 @dataclass(slots=True)
 class RobotPlan:
-    """What a session's robot needs, and what its last request showed of its plan."""
+    """The needs of a session's robot, and the state of its plan according to its last request."""
 
-    need: RobotNeed | None = None  # None until it is known
-    is_stated: bool = False  # whether an SLO states the rate
-    share: float = SHARE  # least share of its ticks with an action in time
-    most_rows: int | None = None  # rows of an answer that it executes at most; None: all of them
-    # Whether it is among those that the replica can serve in time; None until that is decided.
+    need: RobotNeed | None = None  # None until the need is known
+    is_stated: bool = False  # whether the rate comes from an SLO
+    share: float = SHARE  # smallest required share of ticks with an action in time
+    # Maximum number of rows of an answer that the robot executes; None for all.
+    most_rows: int | None = None
+    # Whether the robot is among the robots that the replica can serve in time; None until that is
+    # decided.
     is_admitted: bool | None = None
-    key: str = ""  # prefix of the sessions of its key; empty if there is none
-    heard: float = math.inf  # time at which its last reset or act arrived, s; inf: just now
-    asked: float = 0.0  # time at which its last act arrived, s; 0.0 before the first one
-    # Time from which the robot executes the rows of its last answer, if it does not hold, s. The
-    # time in which it held still, as its rows had run out, does not count.
+    key: str = ""  # prefix of the session ids of the robot's key; empty without a key
+    heard: float = math.inf  # time at which the robot's last reset or act arrived, s; inf means now
+    asked: float = 0.0  # time at which the robot's last act arrived, s; 0.0 before the first act
+    # Time at which the robot begins to execute the rows of its last answer, s. If its rows had run
+    # out, the time for which it stood still is skipped.
     begins: float = 0.0
 
     def to_list(self) -> list[Any]:
-        """Return the plan for another replica, to which the session moves."""
+        """Return the plan as a list, for the replica to which the session moves."""
         need = self.need
         if need is None:
             return []
@@ -87,7 +93,7 @@ class RobotPlan:
 
     @classmethod
     def from_slo(cls, slo: Slo, rows: int) -> RobotPlan:
-        """Return the plan of a robot with that SLO, if an answer has `rows` rows."""
+        """Return the plan of a robot with the SLO `slo`, if an answer has `rows` rows."""
         return cls(need_of(slo, rows), is_stated=True, share=slo.share, most_rows=slo.rows)
 
     def is_present(self, now: float) -> bool:
@@ -97,23 +103,24 @@ class RobotPlan:
 
     @property
     def waits_behind_others(self) -> bool:
-        """Whether the requests of admitted robots go before those of this one."""
+        """Whether the requests of admitted robots are served before the requests of this robot."""
         return self.is_admitted is False
 
     def observe(self, rows: int, arrived: float, needed: float, now: float) -> None:
-        """Learn from an act what the robot needs.
+        """Update the needs of the robot from an act.
 
         Args:
             rows: The number of rows of the answer.
             arrived: The time at which the act arrived, s.
-            needed: The time at which the robot runs out of rows, s; 0.0 if it did not state it.
-            now: The time at which it is answered, s.
+            needed: The time at which the robot runs out of rows, s; 0.0 if the robot did not send
+                its slack.
+            now: The time at which the act is answered, s.
         """
         if self.most_rows is not None:
             rows = min(rows, self.most_rows)
         asked, self.asked = self.asked, arrived
         began = self.begins
-        # Rows are skipped for the actions that the robot executed while it waited.
+        # The robot skips one row for each action that it executed while it waited.
         self.begins = now - min(now - arrived, max(0.0, needed - arrived))
         if self.is_stated:
             if self.need is not None and self.need.rows != rows:
@@ -122,8 +129,8 @@ class RobotPlan:
         if not needed or needed <= arrived or not asked:
             return
 
-        # The rows that are left are those of the answer to the request before. With one row an
-        # answer, there is a request at each tick.
+        # The robot's remaining rows come from the previous answer. If an answer has one row, the
+        # robot sends a request at each tick.
         plan_s = needed - began if rows > 1 else arrived - asked
         if plan_s <= 0:
             return
@@ -134,16 +141,16 @@ class RobotPlan:
 
 
 def need_of(slo: Slo, rows: int) -> RobotNeed:
-    """Return what a robot with that SLO needs, if an answer has `rows` rows."""
+    """Return the needs of a robot with the SLO `slo`, if an answer has `rows` rows."""
     executed_rows = rows if slo.rows is None else min(rows, slo.rows)
     return RobotNeed(slo.hz, executed_rows, None if slo.age_ms is None else slo.age_ms / 1e3)
 
 
 def stated_slack_s(info: Mapping[str, Any]) -> float | None:
-    """Return the slack in the info of an observation, s; None if it states none.
+    """Return the slack in the info of an observation, s; None if there is none.
 
     Raises:
-        InvalidInput: It is not a finite number of at least 0.
+        InvalidInput: The slack is not a finite number of at least 0.
     """
     slack_ms = info.get(SLACK)
     if slack_ms is None:
@@ -181,14 +188,14 @@ class ReplicaPace:
         self._depth = depth
         self._load = IDLE  # load of all robots that can be in time
         self._admitted_load = IDLE
-        # The size up to which batches are filled with requests of robots that are not admitted:
-        # with larger ones, the admitted robots would wait for longer than they can.
+        # The size up to which batches are filled with requests of robots that are not admitted. In
+        # larger batches, the answers of the admitted robots would be late.
         self.most_with_others: float = math.inf
         self._robots = 0
-        self._others = 0  # robots that are not admitted
-        self._throughput_hz = math.inf  # largest number of answers a second
+        self._others = 0  # number of robots that are not admitted
+        self._throughput_hz = math.inf  # maximum number of answers per second
         self._read = -math.inf  # time at which the needs were read, s
-        self._reread_s = _FIRST_READ_S  # time after which they are read again, s
+        self._reread_s = _FIRST_READ_S  # time after which the needs are read again, s
 
     def load(self) -> ReplicaLoad:
         """Return the load, at most half a second old, of the robots that can be in time."""
@@ -203,12 +210,12 @@ class ReplicaPace:
         """Return whether one more robot can be in time here, as the info of its reset.
 
         Args:
-            newcomer: What it needs.
+            newcomer: The needs of the new robot.
             key: The prefix of the sessions of its key.
         """
         self.load()
         load = self._load_with(newcomer)
-        # Robots that wait to be admitted come before it.
+        # Robots that wait for admission come before the new robot.
         most = _ADMITTED_LOAD if self._others else USABLE
         if load.load <= most or self._fits_share(newcomer, key):
             return {"load": load.load, "in_time": True}
@@ -225,8 +232,8 @@ class ReplicaPace:
         return {"load": load.load, "in_time": False, "reason": reason}
 
     def _fits_share(self, newcomer: RobotNeed, key: str) -> bool:
-        """Return whether one more robot of a key fits into the part of the load that is kept for
-        that key, whatever the robots of the other keys need.
+        """Return whether one more robot of a key fits into the part of the load that is reserved
+        for that key, regardless of the needs of other keys' robots.
         """
         curve = self._curve()
         if curve is None:
@@ -240,8 +247,8 @@ class ReplicaPace:
         return self._load_of(needs, curve).load <= _ADMITTED_LOAD / len(keys)
 
     def _load_with(self, newcomer: RobotNeed) -> ReplicaLoad:
-        """Return the load of the admitted robots with one more; it is `inf` if that cannot be in
-        time here.
+        """Return the load of the admitted robots and a new robot; `inf` if the new robot cannot be
+        in time at this replica.
         """
         curve = self._curve()
         if curve is None:
@@ -254,17 +261,18 @@ class ReplicaPace:
         return self._load_of(needs, curve)
 
     def replan_s(self, plan: RobotPlan) -> float:
-        """Return the time from now until the next request of a robot is useful, s; 0 if it may ask
-        at once.
+        """Return the time from now until the next request of a robot is useful, s; 0 if the robot
+        may send it immediately.
 
         Args:
             plan: The plan of the robot, which has observed the act that is answered now.
         """
         self.load()
         need, now = plan.need, self._clock()
-        # The requests of robots that are not admitted wait behind its own.
+        # For an admitted robot, the requests of robots that are not admitted do not count, since
+        # they wait behind its requests.
         waiting = self._depth() if plan.waits_behind_others else self._depth() - self._others
-        # A request that is sent before those that wait are answered would wait.
+        # A request that is sent before the waiting requests are answered would have to wait.
         waiting_s = max(0, waiting) / self._throughput_hz
         if need is None:
             return waiting_s
@@ -274,17 +282,19 @@ class ReplicaPace:
         load = self._admitted_load
         longest_s = need.interval_s(load.latency_s)
         if plan.waits_behind_others:
-            # Each answer is worth most if all rows before it were executed.
+            # An answer is most useful if all earlier rows have been executed.
             interval_s = max(longest_s, need.rows / need.hz)
         else:
-            # If several robots asked at once, the one that is answered first asks again first, so
-            # that their next requests do not come at once again.
+            # If several robots sent requests at the same time, the robot that is answered first
+            # sends its next request first. Their next requests then do not arrive at the same time
+            # again.
             waited_s = now - plan.asked
             earlier_s = (waiting_s - max(0.0, waited_s - load.latency_s)) / 2
             backlog_s = now - plan.begins + waiting_s
             interval_s = min(longest_s, max(backlog_s, load.replan_s(need) - earlier_s))
-        # A robot sends its request at the next tick, half a period later on average. Where there is
-        # time, and a tick is a large part of the interval, it rather sends it earlier than later.
+        # A robot sends its request at the next tick, half a period later on average. If the load is
+        # low and a tick is a large part of the interval, the time is rounded so that the robot
+        # sends the request earlier instead.
         is_early = load.load <= _IDLE_LOAD and interval_s <= _FEW_TICKS / need.hz
         early_s = (1.0 if is_early else 0.5) / need.hz
         return max(0.0, plan.begins + interval_s - early_s - now)
@@ -295,8 +305,8 @@ class ReplicaPace:
         return [plan for plan in self._plans() if plan.need is not None and plan.is_present(now)]
 
     def _withdraw_admissions(self) -> None:
-        """Withdraw the admission of robots that send no requests. It is decided on again when they
-        do.
+        """Withdraw the admission of robots that send no requests. Their admission is decided again
+        when they send requests.
         """
         now = self._clock()
         for plan in self._plans():
@@ -324,17 +334,18 @@ class ReplicaPace:
         self._admitted_load = self._load_of(_needs_of(admitted), curve)
         self.most_with_others = self._admitted_load.batch_size
         self._others = len(plans) - len(admitted)
-        # Each value is set once: the threads that admit requests read it.
+        # Each value is assigned only once here, since the threads that accept requests read it.
         admitted_ids = {id(plan) for plan in admitted}
         for plan in plans:
             plan.is_admitted = id(plan) in admitted_ids
 
     def _choose_admitted(self, plans: Sequence[RobotPlan], curve: CostCurve) -> list[RobotPlan]:
-        """Return the robots that can be in time together: those that are admitted already, then the
-        oldest ones. A part of the load is kept for each key, so that the robots of one key do not
-        make those of another wait, however many they are and whenever they came.
+        """Return the robots that can be in time together: first the robots that are already
+        admitted, then the oldest other robots. A part of the load is reserved for each key. The
+        robots of one key therefore never displace the robots of another key, regardless of their
+        number and their time of arrival.
         """
-        # A robot that cannot be in time at all is admitted nowhere.
+        # A robot that cannot be in time even alone is never admitted.
         soonest_s = answer_s(curve, 1, len(plans))
         servable = [
             plan for plan in plans if plan.need is not None and plan.need.interval_s(soonest_s) > 0
@@ -370,8 +381,8 @@ class ReplicaPace:
         most: float,
         curve: CostCurve,
     ) -> int:
-        """Return how many of the candidates, the first ones, fit beside the admitted robots with a
-        load of at most `most`.
+        """Return how many of the first candidates fit next to the admitted robots with a load of at
+        most `most`.
         """
         fits, too_many = 0, len(candidates) + 1
         while too_many - fits > 1:
@@ -387,7 +398,8 @@ class ReplicaPace:
         robots = sum(needs.values())
         if not robots:
             return IDLE
-        # A robot that cannot be in time at all says nothing about the others.
+        # A robot that cannot be in time even alone does not count, since the load would be `inf`
+        # because of it.
         soonest_s = answer_s(curve, 1, robots)
         servable = {need: count for need, count in needs.items() if need.interval_s(soonest_s) > 0}
         return replica_load(curve, servable, self._max_batch_size)

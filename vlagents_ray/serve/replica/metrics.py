@@ -65,7 +65,7 @@ class Exporter:
         """Create the series of an engine with the `tags` application, deployment, replica and
         policy.
 
-        The state of the file of the `keys` is exported, if there are any.
+        If there are `keys`, the state of their file is also exported.
         """
         make = partial(series, tags)
         self._engine = engine
@@ -113,7 +113,7 @@ class Exporter:
         self._uncompiled = make(
             Gauge, "uncompiled", "Batch sizes that run without the compilation that is set."
         )
-        # The next five series are of robots that report their ticks.
+        # The next five series describe robots that report their ticks.
         self._ticks = make(
             Counter, "ticks", "Ticks at which the policy was to act, as robots report.", "priority"
         )
@@ -185,7 +185,7 @@ class Exporter:
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
 
     def _export_robots(self) -> None:
-        """Export the numbers of robots, and of those in time."""
+        """Export the number of robots, and the number of robots in time."""
         now, times = self._engine.clock(), self._engine.sessions.times()
         by_model = {
             "first": [robot for robot in times if not robot.is_of_further_model],
@@ -243,7 +243,7 @@ def series(
         series_class: The class in `ray.util.metrics`.
         name: The name of the series without the prefix.
         text: The description of the series.
-        tag_keys: The names of further tags, which each value sets.
+        tag_keys: The names of further tags, whose values are set with each measurement.
         options: Further arguments of `series_class`, such as the `boundaries` of a histogram.
     """
     created = series_class(
@@ -253,7 +253,7 @@ def series(
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:
-    """Yield each value, with short pauses so that the policy thread never waits long for the
+    """Yield each value, with short pauses, so that the policy's thread never waits long for the
     interpreter's lock.
     """
     until = time.perf_counter() + _SLICE_S

@@ -1,8 +1,8 @@
 """Parts of a replica that plug-ins add: routes, observers of requests, facts in the metadata, calls
 between replicas.
 
-A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and a deployment file
-turns it on:
+A plug-in registers a class in the entry-point group `vlagents_ray.replica`, and a deployment file
+turns the part on:
 
     args:
       policy: pi0
@@ -59,13 +59,13 @@ class OtherReplica(Protocol):
     name: str  # unique over time
 
     async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
-        """Call a method of a part there; raise `PeerEnded`, `PeerUnreachable` or the method's
-        own `VLAgentsError`.
+        """Call a method of a part of this replica; raise `PeerEnded`, `PeerUnreachable` or the
+        method's own `VLAgentsError`.
         """
 
 
 async def no_siblings() -> Sequence[OtherReplica]:
-    """Return the other replicas of an application that has only one."""
+    """Return the other replicas of an application that has only one replica: an empty list."""
     return []
 
 
@@ -75,10 +75,10 @@ class PartContext:
 
     engine: Engine
     replica: str  # name of the replica, unique over time
-    node: str  # name of its node
+    node: str  # name of the replica's node
     metadata: Callable[[], Mapping[str, Any]]  # the document of `GET /v1/metadata`
-    part: str = ""  # name of the part, its key in the deployment file
-    # Tags of its metrics, see `replica.metrics.series`.
+    part: str = ""  # name of the part, which is its key in the deployment file
+    # Tags of the replica's metrics, see `replica.metrics.series`.
     metric_tags: Mapping[str, str] = field(default_factory=dict)
     # The application's other replicas.
     siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings
@@ -107,15 +107,16 @@ class SiblingPart:
         self._methods = methods
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
-        """Call a method of the part there with `args`, and return its result.
+        """Call a method of the other replica's part with `args`, and return its result.
 
         Args:
             method: One of the part's `sibling_methods`, such as `Counter.count`.
 
         Raises:
             PeerEnded: The replica has ended.
-            PeerUnreachable: It does not answer in time, has no such part, or the method raised
-                another error than a `VLAgentsError`; the method may or may not have been executed.
+            PeerUnreachable: The replica does not answer in time or has no such part, or the method
+                raised an error other than a `VLAgentsError`. The method may or may not have been
+                executed.
             VLAgentsError: The method raised it.
         """
         name = method.__name__
@@ -127,8 +128,8 @@ class ReplicaPart:
 
     A replica calls them in this order: `open` before it loads the policy, `before_ready` when the
     policy is loaded, `run` while the replica is ready, and `close` after the last answer was sent.
-    If `open` or `before_ready` raises an error, the replica does not start, and `serve status` has
-    the reason.
+    If `open` or `before_ready` raises an error, the replica does not start, and `serve status`
+    shows the reason.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
@@ -139,9 +140,10 @@ class ReplicaPart:
 
     pages: ClassVar[Mapping[str, str]] = {}
     """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve`
-    prints their addresses. They need no key, as a browser cannot send one with them. Therefore a
-    page itself must contain no data. Each page must be a route of the part; otherwise the replica
-    does not start."""
+    prints their addresses. Pages need no key, since a browser cannot send a key when it opens a
+    page. Therefore a page itself must contain no data. Each page must be a route of the part;
+    otherwise the replica does not start.
+    """
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -152,19 +154,19 @@ class ReplicaPart:
         """Open files and start threads."""
 
     async def before_ready(self) -> None:
-        """Do the preparations that need the loaded policy, on the replica's event loop.
-
-        Serve sends the replica no requests before this returns.
+        """Prepare everything that needs the loaded policy, on the replica's event loop. Serve sends
+        the replica no requests before this returns.
         """
 
     async def run(self) -> None:
-        """Do periodic work on the replica's event loop; the replica cancels it before it closes.
+        """Do periodic work on the replica's event loop; the replica cancels this work before it
+        closes.
 
         An error is logged, and ends only this work.
         """
 
     def close(self) -> None:
-        """Close what `open` has opened."""
+        """Close the files and threads that `open` has opened."""
 
     def routes(self) -> Sequence[BaseRoute]:
         """Return the routes that are added to the replica's HTTP server."""
@@ -184,8 +186,8 @@ class ReplicaPart:
         return {}
 
     async def siblings(self) -> list[SiblingPart]:
-        """Return this part of each other replica of the application; they may change between two
-        calls.
+        """Return this part in each other replica of the application. The replicas may change
+        between two calls.
         """
         replicas = await self.context.siblings()
         return [
@@ -213,8 +215,8 @@ class ReplicaParts:
             server: All routes of the server, in the order in which they are tried.
 
         Raises:
-            ConfigError: A request for a page would be answered by a route of another part or of
-                the server, which would then need no key either.
+            ConfigError: A route of another part or of the server would answer the request for a
+                page. That route would then need no key either.
         """
         paths = set()
         for name, part in self._parts.items():
@@ -228,7 +230,7 @@ class ReplicaParts:
         return frozenset(paths)
 
     def describe(self) -> dict[str, Any]:
-        """Return the facts of the parts that have some, by name.
+        """Return the facts of all parts that have facts, by name.
 
         A part that raises an error is left out, and its error is logged.
         """
@@ -247,7 +249,7 @@ class ReplicaParts:
         """Call one of the `sibling_methods` of a part.
 
         Raises:
-            LookupError: This replica has no such part, or the part no such method.
+            LookupError: This replica has no such part, or the part has no such method.
         """
         opened = self._parts.get(part)
         if opened is None or method not in opened.sibling_methods:
@@ -291,8 +293,8 @@ def _route_of(path: str, routes: Sequence[BaseRoute]) -> BaseRoute | None:
 
 
 def open_parts(args: PartArgs, context: PartContext) -> ReplicaParts:
-    """Create and open the parts that a deployment file turns on. If one fails, the earlier ones are
-    closed.
+    """Create and open the parts that a deployment file turns on. If a part fails, the parts that
+    were opened before it are closed.
     """
     parts: dict[str, ReplicaPart] = {}
     with ExitStack() as opened:

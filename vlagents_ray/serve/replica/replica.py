@@ -78,25 +78,26 @@ from vlagents_ray.serve.scaling.slo_load import RobotsLoad, RobotsLoadMeter
 logger = logging.getLogger(__name__)
 
 _WATCH_S = 0.25
-# Delay after a call's limit, which `notice_hung` reports unless the interpreter's lock is held.
+# Delay after a call's time limit before a thread without the interpreter's lock reports the call.
+# `notice_hung` reports it earlier unless the call holds the lock.
 _LOCKED_S = 1.0
 _STDERR = 2
 _GATEWAY_POLL_S = 10.0
-# Interval in which a replica looks for changes of its robots' load, and the change that it reports
-# at once.
+# Interval at which a replica checks its robots' load for changes, s, and the smallest change that
+# it reports immediately.
 _CHANGES_S, _CHANGED_LOAD = 0.5, 0.05
-# Time in which clients of a draining replica connect to another one before their WebSockets are
-# closed.
+# Time for clients of a draining replica to connect to another replica before their WebSockets are
+# closed, s.
 _LEAVE_S = 5.0
 
 
 class PolicyReplica(ClientApi, SiblingApi):
     """One replica of the policy, with all endpoints for clients.
 
-    Ray calls its methods by name: Serve the methods of a deployment, clients inside the cluster
-    those of `ClientApi`, and other replicas those of `SiblingApi`. Until the first replica runs,
-    Serve's proxies reply for the application: see `vlagents_ray.serve.scaling.router` and
-    `vlagents_ray.serve.launch.haproxy`.
+    Ray calls its methods by name: Serve calls the methods of a deployment, clients inside the
+    cluster call the methods of `ClientApi`, and other replicas call the methods of `SiblingApi`.
+    Until the first replica runs, Serve's proxies reply for the application: see
+    `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
     """
 
     _opened = False  # whether `close` has anything to close
@@ -116,7 +117,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._code, self._program = settings.code()
         self._keys = settings.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, settings.access.insecure)
-        write_audit()  # even without keys, to log the buttons pressed on the live page
+        write_audit()  # also without keys, since it logs the buttons pressed on the live page
         if self._keys is not None and not settings.access.plain_http:
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
@@ -137,7 +138,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
         self._robots_load = RobotsLoadMeter(self._engine)
-        self._reported = RobotsLoad()  # last load that Serve's controller has got
+        self._reported = RobotsLoad()  # last load that was reported to Serve's controller
 
         # The parts that plug-ins add, and the metrics.
         node = ray.get_runtime_context().get_node_id()[:8]
@@ -168,7 +169,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._stream = (
             _stream_endpoint(self._engine, settings, check_key) if settings.stream.enabled else None
         )
-        # Those of the server's port, once Serve has asked for its application.
+        # The WebSockets of the server's port, once Serve has requested its application.
         self._websockets: AsgiWebSockets | None = None
         self._opened = True
         for endpoint in (self._local, self._plasma, self._stream):
@@ -179,10 +180,10 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Apply the file's `user_config`; called by Serve before the replica is ready, and when the
         settings change.
 
-        The first call loads the policy, so that Serve reports RUNNING only when it can act, and
-        `serve status` has the reason why it cannot. Later calls return immediately and raise no
-        error, as an error would end the replica. The metadata and the log show the result of the
-        swap.
+        The first call loads the policy, so that Serve reports RUNNING only when the policy can act,
+        and `serve status` shows the reason if it cannot. Later calls return immediately and raise
+        no error, since an error would end the replica. The metadata and the log show the result of
+        the swap.
 
         Args:
             settings: The policy's settings that replace those in `args`.
@@ -191,7 +192,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         """
         config = {**self._args.config, **(settings or {})}
         if self._configured:
-            logger.info("new settings, to be loaded next to the present ones: %s", config)
+            logger.info("new settings, to be loaded next to the current ones: %s", config)
         self._engine.models.configure(config)
         if self._configured:
             return
@@ -203,8 +204,8 @@ class PolicyReplica(ClientApi, SiblingApi):
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
             logger.exception("the policy did not load")
-            # Errors of this package contain the remedy; without this, `serve status` would show
-            # both tracebacks first.
+            # Errors of this package contain the remedy. Without `from None`, `serve status` would
+            # show both tracebacks first.
             raise PolicyFailed(str(error)) from None
 
         await self._parts.before_ready()
@@ -221,8 +222,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
-        """Close everything: first the sources of requests, then the engine, the endpoints, and last
-        the parts.
+        """Close the replica: first the sources of requests, then the engine, the endpoints, and
+        last the parts.
 
         In this order the engine can answer waiting requests over open endpoints, no client waits
         for the parts, and their observers receive all answers.
@@ -309,7 +310,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def _direct_address(self) -> StreamAddress | None:
         """Return the address of this replica's own port for clients of the server's port; None if
-        the server's port is encrypted, since the own one is not.
+        the server's port is encrypted, since the replica's own port is not encrypted.
         """
         is_encrypted = http_options().ssl_certfile is not None
         return None if self._stream is None or is_encrypted else self._stream.address
@@ -340,7 +341,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             node: The id of the client's node, which is in the cluster; replicas on this node are
                 preferred.
             boot_id: The boot id of the client's machine.
-            must_be_near: Whether the client's transport reaches no other machine.
+            must_be_near: Whether the client's transport reaches only its own machine.
         """
         location = ClientLocation(node, boot_id, must_be_near)
         return await self._rebalancer.redirect(location) or self._connection_info()
@@ -362,7 +363,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         return await asyncio.to_thread(self._plasma.pool.lease, length)
 
     async def nodes(self) -> dict[str, int]:
-        """Return the number of replicas that accept sessions by node, so that clients can be
+        """Return the number of replicas that accept sessions on each node, so that clients can be
         placed near them.
         """
         loads = [self._rebalancer.load(), *await self._peers.loads()]
@@ -439,8 +440,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._shutdown.begin(_LEAVE_S if self._engine.draining else 0.0)
 
     async def _report_changes(self) -> None:
-        """Report the load to Serve's controller as soon as the robots need clearly more or less, so
-        that a burst of robots need not wait for the next report.
+        """Report the load to Serve's controller as soon as the needs of the robots change clearly,
+        so that a burst of robots need not wait for the next report.
         """
         while True:
             await asyncio.sleep(_CHANGES_S)
@@ -474,10 +475,11 @@ def _stream_endpoint(
 
 
 def hide_gpus(assigned: Sequence[str]) -> None:
-    """Hide the node's GPUs from this process and its children, unless Ray has `assigned` it some.
+    """Hide the node's GPUs from this process and its children, unless Ray has `assigned` GPUs to
+    it.
 
     Ray itself does not hide them from a replica with `num_gpus: 0`, which would use unreserved
-    memory of the first one. Call this before anything uses CUDA.
+    memory of the first GPU. Call this before anything uses CUDA.
     """
     if assigned:
         return
@@ -485,8 +487,8 @@ def hide_gpus(assigned: Sequence[str]) -> None:
     gpus = gpus_here()
     if gpus:
         logger.warning(
-            "this node has %g GPUs, which are hidden from the policy, as its resources are "
-            "num_gpus: 0; with resources: {num_gpus: 1} it gets one",
+            "this node has %g GPUs, which are hidden from the policy, since its resources are "
+            "num_gpus: 0; with resources: {num_gpus: 1} it gets a GPU",
             gpus,
         )
     os.environ[VISIBLE] = ""
@@ -497,13 +499,14 @@ async def answer_frame(
 ) -> bytes | float:
     """Execute a frame of requests from inside the cluster, and return the frame of the replies.
 
-    A caller has no connection that shows whether it still waits. If the process was paused, it may
-    have left since, so nothing is executed, and the pause is returned. A caller that still waits
-    sends the frame again, with that `pause`, which shows that the frame is newer.
+    A caller has no connection that shows whether it still waits. If the process was paused, the
+    caller may have left meanwhile, so nothing is executed, and the pause is returned. A caller that
+    still waits sends the frame again with that `pause`, which shows that the new frame was sent
+    after the pause.
     """
 
     def may_have_left() -> bool:
-        """Return whether the frame may have waited in a pause that its caller does not name."""
+        """Return whether the frame may have waited in a pause that its caller does not know."""
         return engine.pauses.latest() not in (0.0, pause)
 
     sender = Sender(

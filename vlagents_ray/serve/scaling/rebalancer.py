@@ -1,15 +1,16 @@
-"""Balances sessions over the replicas: new sessions go to the least loaded one, by what its robots
-need as far as that is known, and surplus sessions are moved.
+"""Balances sessions over the replicas: new sessions go to the least loaded replica, according to
+the needs of its robots as far as they are known, and surplus sessions are moved.
 
 A connection stays at its replica until it ends, and so does a client that sends HTTP requests to a
-replica's own port, so a new replica would not relieve the others. Therefore each replica compares
-its number of sessions with the others' every few seconds, or what its robots need, if that is known
-of all. If it has clearly more than its share, it asks some clients to reconnect. Their sessions
-then move in the same way as when a replica stops (`vlagents_ray.serve.scaling.session_migration`).
+replica's own port. A new replica alone would therefore not relieve the other replicas. Therefore
+each replica compares its load with the other replicas every few seconds: the needs of the robots if
+all needs are known, otherwise the number of sessions. If its load is clearly above its share, it
+requests some clients to reconnect. Their sessions then move in the same way as when a replica stops
+(`vlagents_ray.serve.scaling.session_migration`).
 
-Clients that cannot be asked are those that read JSON at the server's port, and those of dialects.
-The load balancer's hash of their session's name selects their replica, again after each change of
-the replicas; a WebSocket of a dialect stays until it ends.
+Clients that read JSON at the server's port, and clients of dialects, cannot be requested to
+reconnect. The load balancer's hash of their session's name selects their replica, again after each
+change of the replicas. A WebSocket of a dialect stays at its replica until it ends.
 """
 
 from __future__ import annotations
@@ -46,20 +47,20 @@ _AT_ONCE = 32  # largest number of sessions to send away after one comparison
 class ReplicaLoad:
     """The load of one replica, as that replica reports it."""
 
-    replica: str  # name of its actor
-    sessions: int  # its sessions, and those expected of clients that were just sent to it
+    replica: str  # name of the replica's actor
+    sessions: int  # its sessions, and the expected sessions of clients that were just sent to it
     accepts: bool  # whether its policy is loaded, and it is not stopping
     node: str  # Ray's id of its node
     boot_id: str  # boot id of its machine
-    # Version of the policy and its shared objects; sessions only move between equal ones.
+    # Version of the policy and its shared objects; sessions move only between equal versions.
     version: tuple[str, str]
-    robots: int = 0  # those of its sessions whose needs are known
-    load: float = 0.0  # what these robots need, see `scaling.slo_load`
+    robots: int = 0  # number of its sessions whose needs are known
+    load: float = 0.0  # load of these robots, see `scaling.slo_load`
 
     @property
     def needs_are_known(self) -> bool:
-        """Whether its load says more than the number of its sessions."""
-        # A replica that has answered no robot yet knows no costs.
+        """Whether `load` covers all sessions of the replica."""
+        # A replica that has not answered a robot yet does not know its costs.
         return self.robots == self.sessions and (self.load > 0 or not self.robots)
 
 
@@ -67,8 +68,8 @@ class ReplicaLoad:
 class ClientLocation:
     """The location of a client, as far as the client reports it. Replicas nearby are preferred."""
 
-    node: str = ""  # Ray's id of its node; empty outside the cluster
-    boot_id: str = ""  # boot id of its machine; empty if unknown
+    node: str = ""  # Ray's id of the client's node; empty outside the cluster
+    boot_id: str = ""  # boot id of the client's machine; empty if it is unknown
     must_be_near: bool = False  # whether the client's transport only reaches its own machine
 
     def is_near(self, load: ReplicaLoad) -> bool:
@@ -79,8 +80,8 @@ class ClientLocation:
 
 
 def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> ReplicaLoad | None:
-    """Return the least loaded replica near the client, or the least loaded one of all if its load
-    is clearly lower.
+    """Return the least loaded replica near the client, or the least loaded of all replicas if its
+    load is clearly lower.
 
     Among equally loaded replicas, the first is chosen. The result is None if no replica accepts
     sessions, or if the client needs a near replica and there is none.
@@ -111,11 +112,11 @@ class _Candidate(NamedTuple):
 
 
 def mean_sessions(loads: Sequence[ReplicaLoad]) -> list[float]:
-    """Return the load of each replica as a number of sessions that need as much as the mean robot
-    of all of them. Without known needs, that is the number of its sessions.
+    """Return the load of each replica as a number of mean sessions: sessions that need as much as
+    the mean robot of all replicas. If no needs are known, the result is the number of sessions.
 
-    A session whose need is not known counts as one, such as that of a client that was just sent to
-    a replica, or of a robot at a replica that has not measured its batches yet.
+    A session with unknown needs counts as one, such as the session of a client that was just sent
+    to a replica, or of a robot at a replica that has not measured its batches yet.
     """
     known = [load for load in loads if load.load > 0]
     robots = sum(load.robots for load in known)
@@ -140,7 +141,7 @@ def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int
     Args:
         mine: Number of sessions of the replica.
         siblings: Numbers of sessions of the other replicas.
-        leaving: Number of its sessions that are about to move away.
+        leaving: Number of the replica's sessions that are about to move away.
     """
     loads = [mine, *siblings]
     mean = sum(loads) / len(loads)
@@ -150,7 +151,7 @@ def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int
 
 
 def excess_load(mine: ReplicaLoad, siblings: Sequence[ReplicaLoad], leaving: float = 0.0) -> float:
-    """Return the load that a replica should send away, without the `leaving` one.
+    """Return the load that a replica should send away, without the `leaving` load.
 
     It is the excess over the mean load; 0 if that is at most 25 % of the mean, or less than the
     replica's mean robot needs.
@@ -164,10 +165,9 @@ def excess_load(mine: ReplicaLoad, siblings: Sequence[ReplicaLoad], leaving: flo
 
 
 def choose_connections(connections: Counter[str], count: int) -> set[str]:
-    """Choose the connections to send away, given the number of sessions of each.
-
-    At most `count` sessions leave. All sessions of a connection move together, so a connection with
-    more sessions stays.
+    """Choose the connections to send away, from the number of sessions of each connection. At most
+    `count` sessions leave. All sessions of a connection move together, so a connection with more
+    sessions stays.
     """
     chosen = set()
     for connection, sessions in connections.most_common():
@@ -183,7 +183,7 @@ def _tolerated(sessions: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Excess:
-    """How much a replica should send away: sessions, or load in parts of a replica."""
+    """The excess that a replica should send away: a number of sessions, or a load in `PARTS`."""
 
     sizes: Counter[str]  # by connection
     amount: int  # in the unit of `sizes`
@@ -204,12 +204,12 @@ class Siblings(Protocol):
         """
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to that replica. Return its answer for the client; None if it does not
-        answer quickly.
+        """Announce a client to another replica. Return the replica's answer for the client; None if
+        it does not answer quickly.
         """
 
     def forget_silence(self, replica: str) -> None:
-        """Request that replica's load again, although it did not answer a moment ago."""
+        """Request the load of a replica again, although the replica did not answer a moment ago."""
 
 
 class Rebalancer:
@@ -228,15 +228,16 @@ class Rebalancer:
             own_load: Returns the load of this replica with the given number of sessions.
         """
         self._engine, self._siblings, self._own_load = engine, siblings, own_load
-        # Times at which clients were sent here that have no session yet.
+        # Times at which clients without a session so far were sent here.
         self._expected: deque[float] = deque()
         self._opened = 0
         self._sibling_loads: list[ReplicaLoad] = []
-        self._asked_at = float("-inf")  # time of the last request for the others' loads
+        self._asked_at = float("-inf")  # time of the last request for the loads of other replicas
         self._asked_near: set[ClientLocation] = set()  # locations of that request
-        self._wanted_near: set[ClientLocation] = set()  # those of clients that came after it
+        # Locations of clients that arrived after that request.
+        self._wanted_near: set[ClientLocation] = set()
         self._uneven = False  # whether the last comparison found too many sessions here
-        # Names of the replicas of the comparisons so far; None before the first one.
+        # Names of the replicas in the comparisons so far; None before the first comparison.
         self._compared: set[str] | None = None
         self._placing = asyncio.Lock()  # held while a replica for a client is chosen
         self._joined = asyncio.Event()  # whether a replica has joined since the last comparison
@@ -265,7 +266,7 @@ class Rebalancer:
         return self._own_load(len(self._engine.sessions) + len(self._expected))
 
     def replica_joined(self, replica: str) -> None:
-        """Compare the sessions now, as that replica has joined."""
+        """Compare the sessions now, since another replica has joined."""
         self._siblings.forget_silence(replica)
         self._joined.set()
 
@@ -287,7 +288,7 @@ class Rebalancer:
         arrived = time.monotonic()
         self._wanted_near |= set(locations)
         async with self._placing:
-            # Clients that arrived during the requests use those answers.
+            # Clients that arrived before the last request to the replicas use its answers.
             if arrived > self._asked_at or not self._asked_near.issuperset(locations):
                 self._asked_near, self._wanted_near = self._wanted_near, set()
                 try:
@@ -306,7 +307,7 @@ class Rebalancer:
         """
         mine = self.load()
         loads = [mine, *self._sibling_loads]
-        random.shuffle(loads)  # so that the choice among equally loaded replicas is random
+        random.shuffle(loads)  # the random order decides among equally loaded replicas
 
         choices = (choose_replica(loads, location) for location in locations)
         chosen = next((choice for choice in choices if choice is not None), None)
@@ -315,11 +316,12 @@ class Rebalancer:
         if chosen is mine:
             self.expect_client()
             return None
-        chosen.sessions += 1  # its need is not known; valid until that replica's load is read again
+        # The client's need is not known; this holds until the replica's load is read again.
+        chosen.sessions += 1
         return chosen.replica
 
     async def compare(self) -> None:
-        """Compare the loads, and ask clients to reconnect if this replica had too many sessions
+        """Compare the loads, and request clients to reconnect if this replica had too many sessions
         twice in a row, or if a replica has joined.
         """
         drain_list, sessions = self._engine.drain_list, self._engine.sessions
@@ -337,7 +339,7 @@ class Rebalancer:
             if siblings and all(load.version == mine.version for load in siblings):
                 excess = self._excess(mine, siblings, active, asked)
 
-        # An uneven moment may pass by itself. A replica that has joined stays empty.
+        # A temporary imbalance may end by itself, but a replica that has joined would stay empty.
         if excess.amount <= 0 or not (self._uneven or has_joined):
             drain_list.mark(set())
         else:
@@ -355,7 +357,9 @@ class Rebalancer:
         self._uneven = excess.amount > 0
 
     def _have_joined(self, siblings: Sequence[ReplicaLoad]) -> bool:
-        """Return whether some of the replicas were in no comparison before, and record them."""
+        """Return whether some of the replicas were not in any comparison before, and
+        record them.
+        """
         names = {load.replica for load in siblings}
         is_first, before = self._compared is None, self._compared or set()
         self._compared = names | before
@@ -368,13 +372,13 @@ class Rebalancer:
         active: Counter[str],
         asked: set[str],
     ) -> _Excess:
-        """Return how much this replica should send away.
+        """Return the excess that this replica should send away.
 
         Args:
             mine: The load of this replica.
-            siblings: The loads of the others.
-            active: The number of sessions by connection that can be asked to reconnect.
-            asked: The connections that were asked, and have not left.
+            siblings: The loads of the other replicas.
+            active: The number of sessions of each connection that can be requested to reconnect.
+            asked: The connections that were requested to reconnect, and have not left yet.
         """
         if all(load.needs_are_known for load in (mine, *siblings)):
             movable = [

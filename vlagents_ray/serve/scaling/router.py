@@ -1,4 +1,4 @@
-"""The request router for Serve's Python proxy, which is used where HAProxy is not the ingress.
+"""The request router for Serve's Python proxy, which is used if HAProxy is not the ingress.
 
 Serve sends this module by value to its proxies, so it imports no other module of this package. It
 uses private names of Serve (read in Ray 2.60): `RequestRouter._choose_replica_for_request`,

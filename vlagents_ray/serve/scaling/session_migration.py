@@ -3,10 +3,10 @@ another replica.
 
 A replica that gets a request for an unknown session searches the other replicas for it, and
 continues the session in exactly the same state, including instruction, history and random
-generator. A replica that stops lets the others fetch its remaining sessions.
+generator. A replica that stops offers its remaining sessions to the other replicas.
 
-A move never duplicates or loses a session. It has three steps, of which only the second one changes
-a session:
+A move never duplicates or loses a session. It has three steps. Only the second step changes a
+session:
 
 1. The new replica creates a copy that cannot act yet.
 2. The old replica releases the session if its state still equals the copy.
@@ -14,7 +14,7 @@ a session:
 
 A late or repeated message finds the session in another state (`Version`), and has no effect. The
 copy waits without a time limit until the old replica has answered the second step or has ended; all
-other calls may time out. If a fault leaves several copies, the newest one is the session.
+other calls may time out. If a fault leaves several copies, the newest copy is the session.
 """
 
 from __future__ import annotations
@@ -60,18 +60,19 @@ P = ParamSpec("P")
 T = TypeVar("T")
 InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
-FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
+# Fetches a session from the replica with the given name.
+FetchFrom = Callable[[str, str], Awaitable[bool]]
 UserOf = Callable[[SessionState, float], Origin | None]
-# Called when a search is over, and its request's `user` of `fetch`.
+# The function to call when a search is over, and the argument `user` of `fetch`.
 _Callback = tuple[Callable[[], None], UserOf]
 # Largest number of concurrent searches of a caller. Further requests get `UnknownSession`.
 _PENDING = 4096
-# Time limit for another replica's answer, which a frozen replica does not send. The clients of that
-# one do not wait for it, as they begin their sessions again.
+# Time limit for another replica's answer, which a frozen replica does not send. The clients of a
+# frozen replica do not wait for it, since they begin their sessions again.
 _ANSWER_S = 3.0
 # Time limit for the remaining answers, once a replica has answered that it holds the session.
 _OTHERS_S = 0.3
-_SILENT_S = 3.0  # time without further requests to a silent replica
+_SILENT_S = 3.0  # time for which a silent replica gets no further requests, s
 _ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
 _LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
 _BATCH_S = 0.002  # time for which searches are collected into one query
@@ -80,7 +81,7 @@ _AT_ONCE = 16  # largest number of sessions that are handed over, or unpickled, 
 
 
 class PeerEnded(Exception):
-    """Raised if the other replica has ended, and its sessions with it."""
+    """Raised if the other replica has ended, and therefore also its sessions."""
 
 
 class PeerUnreachable(Exception):
@@ -111,19 +112,18 @@ class HeldSessions:
         """
         self._engine, self._loop, self._name = engine, loop, name
         self._fetch_from, self._spawn = fetch_from, spawn
-        # Releases that other replicas requested.
+        # Releases that other replicas have requested.
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
         # Sessions that are being transferred, until another replica has them.
         self._leaving: dict[str, asyncio.Future[None]] = {}
 
-    # Operations for other replicas.
+    # Operations that other replicas call.
 
     async def versions_of(self, session_ids: Collection[str]) -> dict[str, Version]:
-        """Return the versions of those of the sessions that this replica has or is transferring to
-        another replica.
-
-        It never waits. The version of a session that is being transferred is (0, 0).
+        """Return the versions of the given sessions that this replica has or is transferring to
+        another replica. The method never waits. The version of a session that is being transferred
+        is (0, 0).
         """
         leaving = dict.fromkeys(filter(self.is_leaving, session_ids), (0, 0))
         return leaving | self._engine.sessions.versions_of(session_ids)
@@ -158,7 +158,7 @@ class HeldSessions:
         return await asyncio.to_thread(session.model.parameters.portable_values, session.weights)
 
     async def release(self, session_id: str, version: Version, claim: str) -> bool:
-        """Release the session if it still has that version; return whether it was released.
+        """Release the session if it still has the given version; return whether it was released.
 
         A repeated call with the same `claim` returns the same answer, and has no further effect.
         """
@@ -198,21 +198,21 @@ class HeldSessions:
             return False
         try:
             return await self._fetch_from(session_id, holder)
-        except Outdated:  # the call is a repetition, or a newer state arrived first
+        except Outdated:  # the call is a repetition, or a newer state has arrived before
             return True
         except VLAgentsError as error:
             logger.info("session %s: not taken over: %s", session_id, error)
             return False
 
     async def drop_older(self, steps: dict[str, int]) -> None:
-        """Close sessions that began an episode at another replica, at these steps."""
+        """Close the sessions that have begun an episode at another replica, at the given steps."""
         self._engine.sessions.drop_older(steps)
 
-    # Operations for this replica.
+    # Operations that this replica calls.
 
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> None:
-        """Offer the session to `peers` in turn, until one has fetched it. It stays at this replica
-        until the other one has a copy.
+        """Offer the session to `peers` in turn, until one has fetched it. The session stays at this
+        replica until the other replica has a copy.
         """
         self._leaving[session_id] = self._loop.create_future()
         try:
@@ -286,7 +286,8 @@ _Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]
 
 
 class SessionMigrator:
-    """Finds sessions at other replicas and takes them over, and hands over those of this replica.
+    """Finds sessions at other replicas and takes them over, and hands over the sessions of this
+    replica.
 
     `sessions` answers the calls of the other replicas. All work runs on the replica's event loop;
     `fetch` and `announce` may be called on any thread.
@@ -302,7 +303,7 @@ class SessionMigrator:
         """Create the migrator of a replica.
 
         Args:
-            name: The name of the replica for the other ones.
+            name: The name of the replica for the other replicas.
             peers: Returns the other replicas.
             loop: The event loop of the replica.
             in_thread: Runs a slow call (unpickling, loading a checkpoint) on another thread; by
@@ -319,8 +320,9 @@ class SessionMigrator:
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         # Steps at which episodes began that are not announced yet, by session.
         self._unannounced: dict[str, int] = {}
-        self._announced: list[Answer] = []  # delivered once those are announced
-        # Number of sessions that are being fetched since other replicas offered them.
+        # Answers that are delivered once these steps are announced.
+        self._announced: list[Answer] = []
+        # Number of sessions that are being fetched because other replicas offered them.
         self._offered = 0
         # Time until which a silent replica gets no request, by its name.
         self._silent: dict[str, float] = {}
@@ -382,8 +384,8 @@ class SessionMigrator:
         Args:
             session_id: The session.
             step: The step at which the episode began.
-            answer: The answer to the reset. It is delivered once the others have dropped those
-                states, or after `_OTHERS_S`.
+            answer: The answer to the reset. It is delivered once the other replicas have dropped
+                those states, or after `_OTHERS_S`.
         """
         with self._lock:
             is_first = not self._unannounced
@@ -395,7 +397,7 @@ class SessionMigrator:
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
     async def hand_over(self) -> None:
-        """Give all sessions to other replicas, since this one stops, and close the queue."""
+        """Give all sessions to other replicas, since this replica stops, and close the queue."""
         slots = asyncio.Semaphore(_AT_ONCE)
 
         async def transfer(session_id: str, peers: Sequence[Peer]) -> None:
@@ -418,7 +420,8 @@ class SessionMigrator:
             ]
             await asyncio.gather(*transfers)
             if not remaining:
-                # Sessions are still being fetched, for earlier requests or since they were offered.
+                # Sessions are still being fetched, for earlier requests or because they were
+                # offered.
                 await asyncio.sleep(ON_ITS_WAY_S)
 
         self._closed = True
@@ -426,7 +429,7 @@ class SessionMigrator:
         self._engine.stop(0.0)
 
     async def _responsive_first(self) -> list[Peer]:
-        """Return the other replicas. Those that do not answer quickly are last."""
+        """Return the other replicas. Replicas that do not answer quickly are last."""
         answers = {peer: self._spawn(self._query_peer(peer, [])) for peer in await self._peers()}
         if answers:
             await asyncio.wait(answers.values(), timeout=_OTHERS_S)
@@ -443,7 +446,7 @@ class SessionMigrator:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _search(self, session_id: str) -> None:
-        """Search for the session, and if it is not found, once more for the requests that joined
+        """Search for the session. If it is not found, search once more for the requests that joined
         the search late.
         """
         searching = True
@@ -460,16 +463,17 @@ class SessionMigrator:
                 searching = self._finish(session_id, waiting)
 
     async def _find(self, session_id: str) -> None:
-        """Take the session over from the replica that has it, unless there is none, or no
-        waiting request fits it.
+        """Take the session over from the replica that has it, unless there is no such replica, or
+        no waiting request can act on the session.
         """
-        # Consecutive attempts that found no holder; after two, the session is not moving either.
+        # Number of consecutive attempts without a holder. After two attempts, the session cannot be
+        # moving between replicas either.
         misses = 0
         begun = self._loop.time()
         for attempt in itertools.count():
             if attempt:
                 await asyncio.sleep(ON_ITS_WAY_S)
-                # Another replica has handed it over to this one.
+                # Another replica has handed the session over to this replica.
                 if self._engine.sessions.versions_of([session_id]):
                     return
 
@@ -489,8 +493,8 @@ class SessionMigrator:
                 return
 
     async def _fetch_from(self, session_id: str, holder: str) -> bool:
-        """Fetch a session from the replica called `holder`, which offers it; return whether that
-        succeeded.
+        """Fetch a session from the replica called `holder`, which has offered it; return whether
+        that succeeded.
         """
         self._offered += 1
         try:
@@ -502,11 +506,9 @@ class SessionMigrator:
             self._offered -= 1
 
     async def _move(self, session_id: str, peer: Peer, *, is_leaving: bool = False) -> bool:
-        """Move the session from that replica to this one; return False if its state there has
-        changed.
-
-        Unless the session `is_leaving` that replica, which stops, it is moved only if one of the
-        waiting requests can act on it.
+        """Move the session from the replica `peer` to this replica; return False if its state there
+        has changed. The session is moved only if a waiting request can act on it, or if
+        `is_leaving` is true because `peer` stops.
         """
         asked = self._engine.clock()
         copying = peer.ask(HeldSessions.copy, session_id, is_leaving)
@@ -514,8 +516,8 @@ class SessionMigrator:
         if state is None:
             return False
         # The other replica received the call after `asked`, so `began` is not later than the true
-        # begin of the episode. An act that arrived after the reset is therefore never mistaken for
-        # an act of an older episode.
+        # beginning of the episode. An act that arrived after the reset is therefore never mistaken
+        # for an act of an older episode.
         began = asked - state.age_s
         origin = NOWHERE if is_leaving else self._user_of(session_id, state, began)
         if origin is None:
@@ -527,7 +529,7 @@ class SessionMigrator:
             self._answer(peer.ask(HeldSessions.release, session_id, state.version, claim))
         )
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
-            # The replica hangs. Only the copy waits for it.
+            # The replica hangs. Only the copy of the session waits for it.
             if await self._query_peer(peer, []) is None:
                 self._finish(session_id)
         if not release.result():
@@ -545,12 +547,14 @@ class SessionMigrator:
     async def _prepare(
         self, peer: Peer, session_id: str, state: SessionState, began: float, origin: Origin
     ) -> Session[LoadedModel]:
-        """Create the copy of a session. If this replica does not have its version of the weights,
-        fetch that from the `peer`.
+        """Create the copy of a session. If this replica does not have the session's version of the
+        weights, fetch the version from `peer`.
         """
 
         async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
-            """Create the copy on another thread, with the values of its weights if given."""
+            """Create the copy on another thread, with the values of its weights if they were
+            fetched.
+            """
             create = self._engine.moves.prepare
             arriving: Session[LoadedModel] = await self._in_thread(
                 create, session_id, state, _LOAD_S, began, origin, weights
@@ -561,7 +565,7 @@ class SessionMigrator:
             return await prepare()
         async with self._fetching_weights:
             try:
-                return await prepare()  # another session may have fetched them meanwhile
+                return await prepare()  # another session may have fetched the weights meanwhile
             except VersionNotHeld:
                 weights = await self._answer(peer.ask(HeldSessions.weights, session_id), _LOAD_S)
                 if weights is None:
@@ -602,7 +606,7 @@ class SessionMigrator:
     async def _query_peer(
         self, peer: Peer, session_ids: Sequence[str]
     ) -> dict[str, Version] | None:
-        """Return that replica's answer; None if it does not answer in time."""
+        """Return a replica's answer; None if it does not answer in time."""
         try:
             return await asyncio.wait_for(
                 peer.ask(HeldSessions.versions_of, session_ids), _ANSWER_S
@@ -613,8 +617,8 @@ class SessionMigrator:
             return None
 
     async def _holders(self, session_id: str, answers: _Answers) -> list[tuple[Version, Peer]]:
-        """Return the replicas that have the session, with its version there, the newest version
-        first.
+        """Return the replicas that have the session, each with its version of the session, the
+        newest version first.
         """
         peer_of = {task: peer for peer, task in answers.items()}
         holders: list[tuple[Version, Peer]] = []
@@ -657,12 +661,12 @@ class SessionMigrator:
                     for peer in peers
                 ]
                 await asyncio.wait(answers, timeout=_OTHERS_S)
-        finally:  # also if the task is cancelled, as the replica stops
+        finally:  # also if the task is cancelled because the replica stops
             deliver(self._take_unannounced()[1] if announced is None else announced)
 
     def _take_unannounced(self) -> tuple[dict[str, int], list[Answer]]:
         """Return the steps at which episodes began, by session, and the answers that are due once
-        those are announced.
+        these steps are announced.
         """
         with self._lock:
             begun, self._unannounced = self._unannounced, {}
@@ -670,12 +674,12 @@ class SessionMigrator:
         return begun, announced
 
     def _finish(self, session_id: str, waiting: Collection[_Callback] | None = None) -> bool:
-        """Call the callbacks of a session whose search is over; if it was not found, only those of
-        `waiting`.
+        """Call the callbacks of a session whose search is over; if the session was not found, call
+        only the callbacks in `waiting`.
 
         Returns:
-            Whether requests have joined the search since those of `waiting`. The other replicas'
-            answers may be older.
+            Whether requests have joined the search after the requests in `waiting`. The other
+            replicas' answers may be older than these requests.
         """
         later: list[_Callback] = []
         is_here = bool(self._engine.sessions.versions_of([session_id]))
@@ -690,8 +694,8 @@ class SessionMigrator:
             try:
                 then()
             except Exception:
-                logger.exception("session %s: its request could not go on", session_id)
-        # If none of `waiting` is left, the later requests already have another search.
+                logger.exception("session %s: its request could not continue", session_id)
+        # If no callback of `waiting` is left, the later requests already have another search.
         return bool(callbacks and later)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:

@@ -30,16 +30,18 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 _NAMESPACE = "serve"
-# Time limit for a replica to answer that it is initialized. One that still loads does not answer,
-# and has no session. After a kill, every search waits for the replica that replaces the killed one.
+# Time limit for a replica to answer that it is initialized. A replica that is still loading does
+# not answer, and has no session. After a replica was killed, every search waits for its replacement
+# to answer.
 _INITIALIZED_S = 0.3
 _TRANSFER_S = 600.0  # time limit for the answer to a request that contains weights
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
-_STARTING_S = 0.05  # interval in which a replica asks itself whether it is initialized
-_SILENT_S = 3.0  # time without further requests for a silent replica's load
-# Replicas whose loads are requested at once, besides those near a client. The replicas of a large
-# server would otherwise be busy with one another: each compares its load every few seconds, and for
-# each new client. The least loaded one of so many is rarely far from the least loaded one of all.
+_STARTING_S = 0.05  # interval at which a replica checks whether it is initialized
+_SILENT_S = 3.0  # time for which the load of a silent replica is not requested again, s
+# Number of replicas whose loads are requested together, in addition to the replicas near a client.
+# The replicas of a large server would otherwise be busy with one another, since each replica
+# compares its load every few seconds, and for each new client. The lowest load among this number of
+# replicas is rarely far above the lowest load of all replicas.
 _MOST_ASKED = 32
 
 
@@ -47,12 +49,12 @@ class SiblingApi(Protocol):
     """The actor methods that the replicas of an application call on each other."""
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
-        """Expect a client that another replica redirects to this one; return the metadata for the
-        client, and the actor.
+        """Expect a client that another replica redirects to this replica; return the metadata for
+        the client, and the actor.
         """
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call the method of that name in `PEER_METHODS`, and return its result."""
+        """Call the method with the given name in `PEER_METHODS`, and return its result."""
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
         """Call a method in the `ReplicaPart.sibling_methods` of a part, and return its result."""
@@ -85,7 +87,7 @@ for moves of sessions, and for loads.
 
 
 class PeerStarting(PeerUnreachable):
-    """Raised if the other replica is not initialized yet, and will be in a moment."""
+    """Raised if the other replica is not initialized yet, but will be soon."""
 
 
 class SiblingReplica(Peer):
@@ -96,7 +98,7 @@ class SiblingReplica(Peer):
 
         Args:
             initialized: Names of the replicas that are known to be initialized; the name of this
-                one is added when it is.
+                replica is added when it is initialized.
         """
         self.name, self._actor, self._initialized = name, actor, initialized
 
@@ -121,7 +123,9 @@ class SiblingReplica(Peer):
         return await self._ask_actor(PEER_METHODS[name].limit_s, SiblingApi.peer, name, *args)
 
     async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
-        """Call a method of a part there, within a time limit; raises the same errors as `call`."""
+        """Call a method of a part of the other replica, within a time limit; raises the same errors
+        as `call`.
+        """
         return await self._ask_actor(limit_s, SiblingApi.call_part, part, method, *args)
 
     async def _ask_actor(
@@ -133,13 +137,13 @@ class SiblingReplica(Peer):
                 if not await asyncio.wait_for(
                     private.replica_is_initialized(self._actor), _INITIALIZED_S
                 ):
-                    raise PeerStarting("it is not initialized yet")
+                    raise PeerStarting("the replica is not initialized yet")
                 self._initialized.add(self.name)
             answer = call_replica(self._actor, method, *args)
             return await asyncio.wait_for(answer, limit_s)
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
-        except ray.exceptions.RayTaskError as error:  # the replica itself raised it
+        except ray.exceptions.RayTaskError as error:  # the replica itself has raised the error
             raise (
                 error.cause
                 if isinstance(error.cause, VLAgentsError)
@@ -161,7 +165,7 @@ class ReplicasInCluster:
     async def others(self) -> list[SiblingReplica]:
         """Return the replicas."""
         actors = dict(await asyncio.to_thread(lambda: list(self._actors())))
-        self._initialized &= actors.keys()  # without those that have ended
+        self._initialized &= actors.keys()  # without replicas that have ended
         return [SiblingReplica(name, actor, self._initialized) for name, actor in actors.items()]
 
     def _actors(self) -> Iterator[tuple[str, Any]]:
@@ -185,7 +189,8 @@ class SiblingReplicas(ReplicasInCluster):
         super().__init__([context.app_name], but=self.own_name)
         # Time until which a silent replica gets no request, by its name.
         self._silent: dict[str, float] = {}
-        self._last_loads: dict[str, ReplicaLoad] = {}  # by name; their replicas stay where they are
+        # Actors by the replica's name; a replica always has the same actor.
+        self._last_loads: dict[str, ReplicaLoad] = {}
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
@@ -207,7 +212,7 @@ class SiblingReplicas(ReplicasInCluster):
         asked, others = [], []
         for replica in audible:
             last = self._last_loads.get(replica.name)
-            # A replica that was never asked may be near.
+            # A replica whose location is unknown may be near.
             if last is None or any(location.is_near(last) for location in near):
                 asked.append(replica)
             else:
@@ -216,7 +221,7 @@ class SiblingReplicas(ReplicasInCluster):
         return await self._loads_of(asked)
 
     async def _audible(self) -> list[SiblingReplica]:
-        """Return the other replicas without those that did not answer a moment ago."""
+        """Return the other replicas, except replicas that did not answer a moment ago."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
         return [replica for replica in await self.others() if replica.name not in self._silent]
@@ -235,9 +240,9 @@ class SiblingReplicas(ReplicasInCluster):
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_this_replica(self) -> None:
-        """Let others compare their sessions with those of this replica, which has just joined them:
-        32 of them, so that the replicas of a large server are not busy with one another. The rest
-        notices it within a few seconds.
+        """Make 32 other replicas compare their sessions with this replica, which has just joined
+        them. The number is limited so that the replicas of a large server are not busy with one
+        another. All other replicas notice the new replica within a few seconds.
         """
         this_actor = ray.get_runtime_context().current_actor
         while not await private.replica_is_initialized(this_actor):
@@ -249,12 +254,12 @@ class SiblingReplicas(ReplicasInCluster):
         await asyncio.gather(*calls, return_exceptions=True)
 
     def forget_silence(self, replica: str) -> None:
-        """Request that replica's load again, although it did not answer a moment ago."""
+        """Request the load of a replica again, although the replica did not answer a moment ago."""
         self._silent.pop(replica, None)
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return its answer for the client, or None if there
-        is none within 0.3 s.
+        """Announce a client to another replica; return its answer for the client, None if the
+        replica does not answer within 0.3 s.
         """
         try:
             actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)

@@ -11,26 +11,27 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.fleet import USABLE, CostCurve, RobotNeed
 from vlagents_ray.serve.sessions import Session
 
-# Largest number of robots of a replica that is distinguished from any larger one.
+# Maximum result of `most_on_replica`.
 _MOST = 1_000_000
 PARTS = 1_000_000  # unit of `loads_by_connection`, as a share of a replica
-# Time after which no other replica counts a session that came from it, s: Ray Serve notices the end
-# of a killed one by a check each 5 s.
+# Time after which no other replica still counts a session that moved here, s. Ray Serve notices the
+# end of a killed replica with a check every 5 s.
 MOVED_S = 6.0
 _KEPT_S = 0.25  # time for which a load is kept
 
 
 class RobotsLoad(NamedTuple):
-    """What the robots of a replica need."""
+    """The load of a replica's robots."""
 
     robots: int = 0  # sessions whose needs are known
-    load: float = 0.0  # the replicas that they need, if each is loaded up to `USABLE`, times that
-    # The part of the load that came from other replicas a moment ago, which may count it as well.
+    # Number of replicas that the robots need with a load of `USABLE` each, times `USABLE`.
+    load: float = 0.0
+    # The part of the load that has just moved from other replicas, which may still count it.
     moved_load: float = 0.0
 
 
 def robots_load(engine: Engine) -> RobotsLoad:
-    """Return what the robots of a replica need. Before the first batch, they need nothing."""
+    """Return the load of a replica's robots, which is 0 before the first batch."""
     needs: Counter[RobotNeed] = Counter()
     moved: Counter[RobotNeed] = Counter()
     since = engine.clock() - MOVED_S
@@ -50,18 +51,18 @@ def robots_load(engine: Engine) -> RobotsLoad:
 
 
 class RobotsLoadMeter:
-    """Reads what the robots of a replica need, at most a few times a second, however often other
-    replicas ask. Thread-safe.
+    """Reads the load of a replica's robots at most a few times per second, even if other replicas
+    request it more often. Thread-safe.
     """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        # When it was read, s, the number of sessions then, and the load: one value, which readers
-        # replace as a whole.
+        # The time at which the load was read, s, the number of sessions at that time, and the load.
+        # This is one tuple, which readers replace as a whole.
         self._last = (-math.inf, 0, RobotsLoad())
 
     def read(self) -> RobotsLoad:
-        """Return the load, at most `_KEPT_S` old, of the sessions that there are."""
+        """Return the load of the current sessions, which is at most `_KEPT_S` old."""
         now, sessions = self._engine.clock(), len(self._engine.sessions)
         read_at, sessions_then, load = self._last
         if now - read_at > _KEPT_S or sessions != sessions_then:
@@ -71,7 +72,9 @@ class RobotsLoadMeter:
 
 
 def loads_by_connection(engine: Engine, sessions: Iterable[Session[Any]]) -> Counter[str]:
-    """Return the load of the sessions by connection, in `PARTS`: a `Counter` has integers."""
+    """Return the load of the sessions by connection, in `PARTS`, since a `Counter` has integer
+    values.
+    """
     costs = engine.queue.window.curve()
     loads: Counter[str] = Counter()
     if costs is None:
@@ -90,11 +93,11 @@ def loads_by_connection(engine: Engine, sessions: Iterable[Session[Any]]) -> Cou
 def slo_load(costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: int) -> float:
     """Return the load of robots that are spread over replicas.
 
-    This is not the load of the one replica that holds them now (`fleet.replica_load`): batches are
-    smaller where robots are spread, so the sum of these loads would depend on the number of
-    replicas. Here each robot counts as the share of a replica full of such robots, so the sum over
-    all replicas stays when sessions move. A robot that cannot be in time even alone counts as a
-    replica of its own.
+    This differs from the load of the replica that serves them now (`fleet.replica_load`): batches
+    are smaller if robots are spread, so the sum of those loads would depend on the number of
+    replicas. Here, each robot counts as its share of a replica that is full of such robots, so the
+    sum over all replicas does not change when sessions move. A robot that cannot be in time even
+    alone counts as one replica.
 
     Args:
         costs: The duration of batches.
@@ -110,13 +113,13 @@ def slo_load(costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: i
 def most_on_replica(costs: CostCurve, need: RobotNeed, max_batch_size: int) -> int:
     """Return the largest number of equal robots that a replica can serve in time, up to `_MOST`.
 
-    It is `fleet.most_robots` without its search, in a time that no need can make longer, as clients
-    state their needs.
+    It is computed as in `fleet.most_robots`, but without a search. Its duration must not depend on
+    the needs, since clients choose them.
     """
     alone_s = need.interval_s(costs.cost_s(1))
     most = 1 if USABLE * alone_s >= costs.cost_s(1) else 0
     for size in range(1, max_batch_size + 1):
-        # A request waits for the batch that runs, and then for its own.
+        # A request waits for the running batch, and then for its own batch.
         interval_s = need.interval_s(2 * costs.cost_s(size))
         robots = min(_MOST, USABLE * interval_s * size / costs.cost_s(size))
         if robots >= max(2, size):  # batches are no larger than the number of robots
