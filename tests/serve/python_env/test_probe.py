@@ -110,7 +110,7 @@ def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) ->
 def test_no_such_interpreter(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"expected an interpreter, got '/no/such/python', which does not exist; make one",
+        match=r"expected an interpreter, got '/no/such/python', which does not exist; create one",
     ):
         probe("/no/such/python")
     for deployment in sorted((ROOT / "deployments").glob("*.yaml")):
@@ -162,7 +162,7 @@ def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_
 
 def test_an_environment_without_this_package_or_with_another_version_of_it(bare: str) -> None:
     with pytest.raises(
-        ConfigError, match=r"expected .* as here, got no vlagents-ray in .*; install the same there"
+        ConfigError, match=r"expected .* as here, got no vlagents-ray in .*; install that version there"
     ):
         probe(bare)
     [packages] = Path(bare).parents[1].glob("lib/python*/site-packages")
