@@ -113,7 +113,9 @@ def test_the_first_act_is_made_with_the_weights_that_woke_the_policy(
         first = asked(engine)
         with pytest.raises(Overloaded, match="already asleep; call wake first"):
             weights.sleep()
-        with pytest.raises(PolicyUnavailable, match="got one that sleeps; pass the new values to wake"):
+        with pytest.raises(
+            PolicyUnavailable, match="got one that sleeps; pass the new values to wake"
+        ):
             weights.push(gains(1))
         assert weights.wake(gains(2)) == 1
         reply = first.get(timeout=30)

@@ -162,7 +162,8 @@ def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_
 
 def test_an_environment_without_this_package_or_with_another_version_of_it(bare: str) -> None:
     with pytest.raises(
-        ConfigError, match=r"expected .* as here, got no vlagents-ray in .*; install that version there"
+        ConfigError,
+        match=r"expected .* as here, got no vlagents-ray in .*; install that version there",
     ):
         probe(bare)
     [packages] = Path(bare).parents[1].glob("lib/python*/site-packages")
