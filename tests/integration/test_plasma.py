@@ -283,7 +283,7 @@ def test_faults_are_answered_and_harm_nobody(
     free = PlasmaAddress.REQUEST.pack(os.urandom(28), 0)
     for message, said in (
         (b"short", "bytes"),
-        (PlasmaAddress.REQUEST.pack(key, 0), "without a frame"),
+        (PlasmaAddress.REQUEST.pack(key, 0), "expected a frame"),
         (free, "lease"),
     ):
         connection.send(message)

@@ -135,7 +135,9 @@ class _LeasedChannel:
     def read(self) -> np.ndarray:
         """Return a copy of what the client wrote."""
         if self._content is None:
-            raise MalformedMessage("plasma: a message came without a frame in its channel")
+            raise MalformedMessage(
+                "plasma: expected a frame in the channel of the message, got none"
+            )
         return np.frombuffer(self._content, np.uint8).copy()
 
 

@@ -214,8 +214,8 @@ class LocalAddress:
     # A ping is a message of one byte from the client; the server replies with another byte.
     PING: ClassVar[bytes] = b"?"
     PONG: ClassVar[bytes] = b"!"
-    # Maximum number of memory files of a client. A policy that keeps observations needs more than
-    # one.
+    # Maximum number of memory files of a client. A policy that stores observations needs several
+    # files.
     FILES: ClassVar[int] = 16
 
 
@@ -391,8 +391,8 @@ class Budget:
         if self._left < 0:
             raise MessageTooLarge(
                 f"request: expected images and bytes of at most {self.limits.decoded_bytes} bytes "
-                "in all when decoded, got more (each counts as often as it is named); send fewer "
-                "or smaller ones, or raise `limits.decoded_bytes`"
+                "in all when decoded, got more (each counts as often as the request refers to "
+                "it); send fewer or smaller images, or raise `limits.decoded_bytes`"
             )
 
     def hold(self, size: int) -> None:
@@ -413,7 +413,7 @@ class Budget:
         if self._seconds_left < 0:
             raise MessageTooLarge(
                 f"request: decoding its images takes {-self._seconds_left:.3g} s longer than "
-                "allowed; send fewer or smaller ones, or raise `limits.decoded_bytes`, to which "
+                "allowed; send fewer or smaller images, or raise `limits.decoded_bytes`, to which "
                 "the allowed time is proportional"
             )
         yield

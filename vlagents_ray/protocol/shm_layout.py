@@ -2,10 +2,10 @@
 same at each step.
 
 An observation's layout (session, priority, names and sizes of cameras and state) is sent once, as
-JSON. Later messages refer to it by its number. The rest of a request is an `ITEM` and its arrays,
-which are stored in sequence in shared memory, each at an offset that is a multiple of 64. A reply
-consists of an `ANSWER`, the action, and the `WEIGHTS` that computed the action. All other messages
-(a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
+JSON. Later messages refer to the layout by its number. The remaining part of a request is an `ITEM`
+and its arrays, which are stored in sequence in shared memory, each at an offset that is a multiple
+of 64. A reply consists of an `ANSWER`, the action, and the `WEIGHTS` that computed the action. All
+other messages (a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
 """
 
 from __future__ import annotations

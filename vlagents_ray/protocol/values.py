@@ -302,7 +302,8 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
         raise InvalidObservation(f"state {name!r}: expected a list of numbers")
 
     array: np.ndarray = np.array(values, dtype=np.float64) if is_list else values
-    if array.dtype == _FLOAT32:  # numpy's `errstate` takes longer than all other work on a state
+    # Entering numpy's `errstate` takes longer than all other work on a state.
+    if array.dtype == _FLOAT32:
         return array
     try:
         with np.errstate(over="raise"):

@@ -69,8 +69,8 @@ class ReceiveBuffer(StreamReader):
 
     @property
     def size(self) -> int:
-        """Number of unparsed bytes. On threads other than that of `parse`, only the comparison with
-        0 is reliable.
+        """Number of unparsed bytes. On threads other than the thread of `parse`, only the
+        comparison with 0 is reliable.
         """
         return len(self.buffer) - self._start
 

@@ -70,7 +70,7 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     if args.resources.memory is not None:
         actor_options["memory"] = args.resources.memory
     runtime_env = args.environment.runtime_env()
-    if runtime_env:  # without it, Serve applies the application's `runtime_env`
+    if runtime_env:  # otherwise Serve applies the application's `runtime_env`
         actor_options["runtime_env"] = runtime_env
 
     options: dict[str, Any] = {
@@ -89,8 +89,8 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         "user_config": {},
         "ray_actor_options": actor_options,
         # A WebSocket session counts as one request until it ends, so the limit must allow all
-        # sessions and two batches. It does not protect against overload, since requests wait in the
-        # batch queue.
+        # sessions and two batches. The limit does not protect against overload, since requests wait
+        # in the batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
     }

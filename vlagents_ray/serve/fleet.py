@@ -111,7 +111,8 @@ class RobotNeed:
         if self.rows == 1:
             # Each tick needs its own answer, which must arrive before the next tick.
             return 1 / self.hz if left_s >= 0 else 0.0
-        # More than one request a tick would compute actions that are never executed.
+        # With more than one request per tick, the policy would compute actions that are never
+        # executed.
         return max(left_s, 1 / self.hz) if left_s > 0 else 0.0
 
     @property

@@ -35,7 +35,7 @@ class RobotReport(NamedTuple):
 
     ticks: int  # ticks since the last request at which the policy had to act
     starved: int  # number of these ticks without a row of an answer
-    age_ms: float | None  # age of the action that was executed last; None if there was none
+    age_ms: float | None  # age of the last executed action, ms; None if there was none
     is_of_further_model: bool = False  # whether the session of another model counts the robot
 
     @classmethod
@@ -84,7 +84,7 @@ class RobotTimes:
     def __init__(self, priority: Priority = Priority.ROBOT) -> None:
         """Create the record of a session, without reports."""
         self.priority = priority
-        self.target_share = SHARE  # share of the ticks in time that the robot needs
+        self.target_share = SHARE  # required share of ticks that have an action in time
         self.is_of_further_model = False  # whether the session of another model counts the robot
         self.ticks = 0  # in total
         self.starved = 0  # in total

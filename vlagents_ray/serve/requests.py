@@ -114,7 +114,7 @@ class Opening:
     # First step of the connection's previous episode, which continues if the reset is undone; None
     # if there is none.
     previous: int | None
-    slo: Slo | None = None  # SLO of the robot, if its reset or the deployment contains one
+    slo: Slo | None = None  # SLO of the robot, if its reset or the deployment contains an SLO
 
 
 @dataclass(slots=True, eq=False)
@@ -289,7 +289,7 @@ class IncomingMessage:
         self.sender: Receiver | None = None  # see `expect`
         # Admission that is released before the delivery.
         self.admission: MessageAdmission | None = None
-        self.observed: Sequence[PendingRequest] = ()  # the requests that observers have seen
+        self.observed: Sequence[PendingRequest] = ()  # requests that were passed to the observers
         self.size = 0  # number of bytes that count as unanswered at the connection
         self._missing = 0
         self._lock = threading.Lock()
@@ -327,7 +327,7 @@ class IncomingMessage:
         self._missing = requests
 
     def answer(self, index: int, reply: Reply) -> None:
-        """Store the reply to the request at that index; a second reply is ignored."""
+        """Store the reply to the request `index`; a second reply is ignored."""
         if reply.error is None:
             reply.timing["decode_ms"] = (self.decoded_at - self.arrived) * 1e3
         else:

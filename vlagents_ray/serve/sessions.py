@@ -319,7 +319,7 @@ class SessionTable(Generic[M]):
             if session is None or session.expected != first or session.steps == first:
                 return
             session.expected, session.last_reset = session.first, session.began
-            if session.steps == 0:  # the reset was the session's first one here
+            if session.steps == 0:  # the reset was the first reset of the session at this replica
                 del self._sessions[session_id]
                 self._end(session)
 
@@ -556,9 +556,9 @@ class DrainList:
     """
 
     def __init__(self) -> None:
-        # Whether the replica will stop. Only `drain` sets it, and nothing resets it.
+        # Whether the replica will stop. Only `drain` sets this field, and it is never reset.
         self.draining = False
-        self._lock = threading.Lock()  # held while one of the following is read or changed
+        self._lock = threading.Lock()  # held while one of the following fields is read or changed
         self._marked: set[str] = set()
         self._asked: dict[str, float] = {}  # time of the request to reconnect, s
 
@@ -575,7 +575,7 @@ class DrainList:
         """Return whether the current reply must request the reconnection of a marked connection; if
         so, record the request.
         """
-        if not self._marked:  # this is nearly always the case, and saves the lock
+        if not self._marked:  # this is nearly always the case, and avoids taking the lock
             return False
         with self._lock:
             if connection not in self._marked:

@@ -72,8 +72,9 @@ class PushOptions:
 
     mode: PushMode = "next_episode"  # when sessions change to the new weights
     partial: bool = False  # whether names may be missing; the missing values are then kept
-    allow_same: bool = False  # whether all values may equal those of the newest version
-    # Whether sessions that do not follow the newest version also get it, at their next reset.
+    allow_same: bool = False  # whether all values may be equal to the values of the newest version
+    # Whether the version is also used by sessions that do not follow the newest version, from their
+    # next reset.
     pin: bool = False
     # The number of the version, such as the training step; by default, one above the newest
     # version.
@@ -100,7 +101,7 @@ class WeightsVersion:
     def __init__(self, number: int, digest: str, values: dict[str, Any] | None) -> None:
         self.number = number
         self.fingerprint = digest
-        self.values = values  # by name; None if only the agent has them
+        self.values = values  # values by name; None if only the agent has the values
         self.on_host = False  # whether the values were moved out of the GPU's memory
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
@@ -155,7 +156,7 @@ class ModelWeights:
         self.model = model
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._busy = busy
-        self._device: Any = "cpu"  # the GPU of the agent's values, if they are on a GPU
+        self._device: Any = "cpu"  # GPU of the agent's values; None if they are not on a GPU
         # The agent's own values, if other versions are loaded into the same memory.
         self._live_values: Mapping[str, Any] = {}
         self._lock = threading.Lock()
@@ -341,7 +342,8 @@ class ModelWeights:
     ) -> str:
         """Check and store a new version without using it; return its fingerprint.
 
-        It is dropped unless it is committed within a minute, since its learner may have died.
+        The version is dropped unless it is committed within a minute, since its learner may have
+        died.
 
         Args:
             number: The number of the version, above the number of the newest version.
@@ -351,10 +353,10 @@ class ModelWeights:
 
         Raises:
             NotTrainable: The agent declares no parameters.
-            Overloaded: Another version is staged, or the number is not above that of the newest
-                version.
+            Overloaded: Another version is staged, or the number is not above the number of the
+                newest version.
             InvalidWeights: The values do not fit.
-            UnchangedWeights: The values equal those of the newest version.
+            UnchangedWeights: The values are equal to the values of the newest version.
         """
         if self._refusal is not None:
             raise self._refusal

@@ -29,7 +29,7 @@ def loads(text: str | bytes, limits: MessageLimits, levels: int = 0) -> Any:
             f"document: expected at most {limits.body_bytes} bytes, got {len(text)}"
         )
     marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
-    if sum(map(text.count, marks)) > limits.items:  # base64 contains none of these characters
+    if sum(map(text.count, marks)) > limits.items:  # base64 text contains none of these characters
         raise MessageTooLarge(
             f"document: more than {limits.items} values; send arrays as json-numpy writes them"
         )

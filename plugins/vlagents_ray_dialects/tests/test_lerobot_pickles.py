@@ -280,7 +280,7 @@ def test_an_array_under_two_names_is_read_twice_and_counted_twice() -> None:
     data = pickled(TimedObservation(0.0, 0, {"a": image, "b": image}))
     assert len(data) < 2 * image.nbytes
     assert read(data).values["b"].shape == image.shape
-    with pytest.raises(MessageTooLarge, match="each counts as often as it is named"):
+    with pytest.raises(MessageTooLarge, match="each counts as often as the request refers to it"):
         read(data, replace(LIMITS, decoded_bytes=image.nbytes + 1))
 
 

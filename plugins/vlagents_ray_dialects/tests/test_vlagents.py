@@ -497,7 +497,7 @@ def test_a_taken_port_is_named_with_the_cure() -> None:
             ConfigError, match=rf"vlagents: cannot listen on 127.0.0.1:{port}.*choose another port"
         ):
             reserve("vlagents", "127.0.0.1", port, timeout_s=0)
-    with pytest.raises(ConfigError, match="no address"):
+    with pytest.raises(ConfigError, match="not an address"):
         reserve("vlagents", "no.such.host.invalid", port, timeout_s=0)
 
 

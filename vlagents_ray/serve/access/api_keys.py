@@ -206,7 +206,7 @@ class Keys:
             return
 
         with self._lock:
-            if now - self._checked < _CHECK_S:  # another thread has just checked it
+            if now - self._checked < _CHECK_S:  # another thread has just checked the file
                 return
             self._checked = now
 
@@ -432,7 +432,7 @@ def token_of(headers: Mapping[str, str]) -> str | None:
     return None
 
 
-# The sender of requests: the holder of a key, or the reason why none is needed.
+# The sender of requests: the holder of a key, or the reason why no key is needed.
 Identity = Caller | NoKey
 
 _CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")

@@ -85,7 +85,7 @@ class Account:
         caller = self.caller
         if not isinstance(caller, Caller):
             raise TypeError(
-                f"caller: expected a Caller, or a NoKey where none is needed, got {caller!r}; "
+                f"caller: expected a Caller, or a NoKey if no key is needed, got {caller!r}; "
                 "identify the client before its first message"
             )
 

@@ -223,7 +223,7 @@ def revoke(file: Path, name: str) -> None:
     """
 
     def mark(keys: list[Key]) -> list[Key]:
-        """Return the keys, with the key of that name revoked."""
+        """Return the keys, with the key `name` revoked."""
         if all(key.name != name for key in keys):
             have = sorted(key.name for key in keys)
             raise ConfigError(
@@ -256,7 +256,7 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
-        os.fsync(folder)  # so that a revocation survives a power failure
+        os.fsync(folder)  # a revocation must survive a power failure
 
 
 def _to_json(key: Key) -> dict[str, Any]:

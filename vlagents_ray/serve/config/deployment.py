@@ -28,7 +28,8 @@ from vlagents_ray.slo import MOST, SHARE, Slo
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
 Port = Annotated[int, Field(ge=1, le=65_535)]
-# Links are not followed: the interpreter of a virtual environment links to that of its creator.
+# Links are not followed, since the interpreter of a virtual environment is a link to the
+# interpreter that created the environment.
 AbsolutePath = Annotated[
     str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))
 ]
@@ -403,7 +404,7 @@ class AccessArgs(_DeploymentModel):
         return None if self.insecure else load_keys(self.keys_file)
 
 
-_NEEDS_S = 1.0  # time for which robots must need more replicas by their SLOs
+_NEEDS_S = 1.0  # time for which robots must need more replicas according to their SLOs, s
 
 
 class AutoscalingArgs(_DeploymentModel):
@@ -500,7 +501,7 @@ class AutoscalingArgs(_DeploymentModel):
         # The needs of robots are known, and reported as soon as they change. The first measured
         # costs of batches become more accurate within a second.
         needs_s = min(self.upscale_delay_s, _NEEDS_S)
-        # While a session moves, two replicas may count it, until both have reported again.
+        # While a session moves, two replicas may count the session until both have reported again.
         all_reported_s = min(self.upscale_delay_s, 1.5 * report_s)
         kwargs = self.model_dump(include=targets) | {
             "busy_s": self.upscale_delay_s - needs_s,
@@ -558,8 +559,8 @@ class ServerArgs(_DeploymentModel):
     )
     wrappers: list[str | dict[str, dict[str, Any]]] = Field(
         default=[],
-        description="Wrappers of the policy, the one nearest to the robot first: names, or "
-        "`{name: settings}`.",
+        description="Wrappers of the policy, beginning with the wrapper that is nearest to the "
+        "robot: names, or `{name: settings}`.",
     )
     checkpoints: CheckpointArgs = Field(
         default=CheckpointArgs(),
@@ -625,8 +626,8 @@ class ServerArgs(_DeploymentModel):
         return max(self.autoscaling.min_replicas, self.autoscaling.initial_replicas or 0)
 
     def code(self) -> tuple[GitState | None, Program]:
-        """Return the git state of the policy's code, and the digests of its files and of those
-        of its wrappers.
+        """Return the git state of the policy's code, and the digests of the files of the policy and
+        its wrappers.
         """
         policy = target_of("policies", self.policy)
         program = dict(loaded_code(policy))

@@ -33,8 +33,8 @@ class DialectConfig(BaseModel, extra="forbid"):
 
     mapping: MappingSetting | None = Field(
         default=None,
-        description="How observations of the client are converted: the name of a preset, or an "
-        "object (`vlagents_ray.wire.mapping`). null: the client uses this project's names.",
+        description="Conversion of the client's observations: the name of a preset, or an object "
+        "(`vlagents_ray.wire.mapping`). null: the client uses this project's names.",
     )
     priority: PriorityName = Field(
         default="robot",
@@ -105,8 +105,8 @@ class DialectArgs(RegisteredArgs):
         }
 
     def at_root(self) -> list[str]:
-        """Return the dialects at the root path: the first dialect that has a root, and the others
-        that use the same protocol there.
+        """Return the dialects at the root path: the first dialect that has a root, and all other
+        dialects with the same protocol there.
         """
         roots = {name: getattr(dialect_class(name), "root", "") for name in self.on()}
         first = next(filter(None, roots.values()), None)
@@ -155,8 +155,8 @@ def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
     units and the order of values in its system's examples.
 
     Args:
-        value: A preset's name, or an object. The fields of an object with `preset` override those
-            of that preset.
+        value: A preset's name, or an object. The fields of an object with `preset` override the
+            fields of the preset.
 
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.

@@ -17,9 +17,9 @@ class RegisteredArgs(BaseModel, extra="allow"):
     name or "module:Class". A class whose value is null is off.
     """
 
-    kind: ClassVar[str]  # the kind of the names, as in `registry.names`
-    base: ClassVar[str]  # the "module.Class" that the classes derive from, for messages
-    config_base: ClassVar[type[BaseModel]]  # the class that each `Config` derives from
+    kind: ClassVar[str]  # kind of the registered names, see `registry.names`
+    base: ClassVar[str]  # base class of the registered classes, as "module.Class", for messages
+    config_base: ClassVar[type[BaseModel]]  # base class of each `Config`
 
     @model_validator(mode="before")
     @classmethod
@@ -61,5 +61,5 @@ class RegisteredArgs(BaseModel, extra="allow"):
 
     @classmethod
     def registered_fields(cls) -> dict[str, FieldInfo]:
-        """Return the known settings, for messages about unknown ones."""
+        """Return the known settings, for messages about unknown settings."""
         return {name: FieldInfo(annotation=cls.config_of(name)) for name in names(cls.kind)}

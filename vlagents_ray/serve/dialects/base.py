@@ -149,9 +149,10 @@ class GatewayContext:
     sessions: int  # maximum number of clients of one dialect
     idle_s: float  # time without a message after which a client's sessions end
     contract: Contract | None
-    check: Check | NoKey  # checks the key of a client; or the reason why none is needed
+    check: Check | NoKey  # function that checks a client's key; or the reason why no key is needed
     admission: Admission = field(default_factory=lambda: Admission(DEFAULT_LIMITS.in_flight_bytes))
-    continues_plans: bool = False  # whether a chunk continues the plan that a robot executes
+    # Whether a chunk of the policy continues the plan that a robot executes.
+    continues_plans: bool = False
     longest_prefix: int = 0  # maximum number of rows of that plan with which a chunk may begin
 
 
@@ -442,12 +443,12 @@ class ImplicitEpisode:
         self.begun = False  # whether the episode has had an observation
 
     def begins(self, instruction: str | None) -> bool:
-        """Return whether an observation with that instruction begins an episode."""
+        """Return whether an observation with the given instruction begins an episode."""
         return not self.begun or (instruction is not None and instruction != self.instruction)
 
     def opening(self, instruction: str | None, contract: Contract | None) -> str | None:
-        """Return the instruction for the reset; raise `InvalidObservation` if the policy needs
-        one and none is set.
+        """Return the instruction for the reset; raise `InvalidObservation` if the policy needs an
+        instruction, and there is none.
         """
         instruction = self.instruction if instruction is None else instruction
         if instruction is None and contract is not None and contract.instruction:
@@ -458,7 +459,7 @@ class ImplicitEpisode:
         return instruction
 
     def began(self, instruction: str | None) -> None:
-        """Record that the session was reset with that instruction."""
+        """Record that the session was reset with the given instruction."""
         self.begun = True
         self.instruction = instruction
 
@@ -555,7 +556,7 @@ async def act_together(
 
 
 async def _reset(observations: Sequence[SessionObs], charge: Charge, request_id: str) -> None:
-    """Reset the sessions of these observations, which are the first ones of their episodes.
+    """Reset the sessions of these observations, which are the first observations of their episodes.
     `charge` is the charge of the client's message.
     """
     if not observations:
@@ -617,7 +618,7 @@ class HttpDialect(RouteDialect):
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
         # Episodes by caller and session id in the engine. A new key with the name of a revoked key
-        # continues the sessions of that name; the caller is then another one.
+        # continues the sessions of that name, but its caller differs.
         self._episodes: dict[tuple[Identity, str], ImplicitEpisode] = {}
 
     async def answer(
@@ -726,7 +727,7 @@ class HttpDialect(RouteDialect):
         key = (current_caller(), engine_id)
         if key not in self._episodes or engine_id not in sessions:
             finder = self.context.engine.finder
-            # A session that is not here may have been served by another replica.
+            # If this replica does not have the session, another replica may have served it.
             if finder is not None and engine_id not in sessions:
                 over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
                 if finder.fetch(engine_id, partial(settle, over, None), caller_name()):

@@ -168,7 +168,7 @@ class AccessMiddleware:
                 await asyncio.sleep(REFUSAL_S)
             return NoKey.OPEN
         if self._keys is None:
-            # A page that the robot's user opens can reach loopback.
+            # A web page that the robot's user opens can send requests to loopback.
             require_own_page(headers, self._hosts)
             return NoKey.OPEN
 
@@ -282,7 +282,7 @@ async def _run_upload(
     async def answer(message: Message) -> None:
         """Send a message of the answer, which ends the time limit."""
         nonlocal answering
-        timer.cancel()  # the rest of the body is no longer awaited
+        timer.cancel()  # the remaining body is no longer awaited
         answering = True
         await send(message)
 

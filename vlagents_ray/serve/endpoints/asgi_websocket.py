@@ -48,7 +48,7 @@ from vlagents_ray.serve.queue.poller import Poller
 
 SCOPE_KEY = "vlagents_ray.websocket"  # key of the `AsgiWebSocket` in the ASGI scope
 _WAITING_MESSAGES = 16  # maximum number of messages that the application has not received
-_WAITING_BYTES = 4 * STREAM_BYTES  # maximum size of those messages
+_WAITING_BYTES = 4 * STREAM_BYTES  # maximum total size of those messages
 # Number of bytes that a client has not read, above which the application may not send the next
 # message, and the period at which this number is checked, s.
 _UNSENT_BYTES = 2**16
@@ -157,7 +157,7 @@ class AsgiWebSocket:
         receive: Receive,
         send: Send,
     ) -> None:
-        """Prepare to run an application; `receive` and `send` are those of uvicorn."""
+        """Prepare to run an application; `receive` and `send` come from uvicorn."""
         self._owner = owner
         self._client = client
         self._caller = caller
@@ -165,8 +165,8 @@ class AsgiWebSocket:
         self._send_first = send
         self._loop = asyncio.get_running_loop()
         self._task = asyncio.current_task()
-        self._connection: TakenConnection | None = None  # None before it is accepted
-        self._messages: _AsgiMessages | None = None  # None if another handler receives them
+        self._connection: TakenConnection | None = None  # None before the WebSocket is accepted
+        self._messages: _AsgiMessages | None = None  # None if another handler receives the messages
         self._over = asyncio.Event()  # set when the connection has ended
         self._is_cancelled = False  # whether the application's task was cancelled
         self._has_left = False  # whether the client left before the WebSocket was accepted
@@ -273,7 +273,7 @@ class _AsgiMessages(MessageHandler):
         # Pairs of a message and its size.
         self._queue: asyncio.Queue[tuple[Message, int]] = asyncio.Queue()
         self._waiting = _WaitingBytes(connection)
-        self._current = -1  # size of the message that the application serves; -1 without one
+        self._current = -1  # size of the message that the application serves; -1 if there is none
         self._is_over = False  # whether the application has received the end
         # Reason and close code with which the connection ends when the application returns.
         self.ending: tuple[str, int] | None = None

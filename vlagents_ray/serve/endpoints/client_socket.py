@@ -119,7 +119,7 @@ class ClientSocket:
         return await asyncio.wrap_future(taking)
 
     async def _take(self) -> socket.socket | None:
-        # Serve passes messages of the application on from another thread.
+        # Serve forwards the application's messages on another thread.
         await self._accepted.wait()
         connection = self._transport.get_extra_info("socket")
         if self._transport.is_closing() or connection is None or connection.fileno() < 0:
@@ -129,7 +129,8 @@ class ClientSocket:
             await asyncio.sleep(0.001)
         taken = socket.socket(fileno=os.dup(connection.fileno()))
         taken.setblocking(False)
-        self._transport.abort()  # the duplicate keeps the connection open
+        # Closing this socket keeps the connection open, since it was duplicated.
+        self._transport.abort()
         return taken
 
     def ended(self) -> None:

@@ -44,13 +44,14 @@ logger = logging.getLogger(__name__)
 # Maximum number of connections that wait to be accepted. Above it the kernel discards a client's
 # SYN, which the client repeats after one second, and rejects a local client.
 BACKLOG = 1024
-# Maximum number of ended connections that are closed at once; each takes about 0.01 ms.
+# Maximum number of ended connections that are closed together; closing a connection takes about
+# 0.01 ms.
 _ENDED_AT_ONCE = 64
 # Maximum number of unanswered messages of a client; further messages stay unread.
 MOST_UNANSWERED = 256
 POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
-# Maximum number of connections that a server accepts in a second; each takes some time of the
-# policy's thread.
+# Maximum number of connections that a server accepts in a second; accepting a connection takes some
+# time of the policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
@@ -64,7 +65,7 @@ _POLL_MS = 2
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 AncillaryData = Sequence[tuple[int, int, bytes]]
-# Returns the caller with that key; raises `Unauthorized` or `Forbidden`.
+# Returns the caller that owns the key; raises `Unauthorized` or `Forbidden`.
 KeyCheck = Callable[[str | None], Caller]
 
 
@@ -99,7 +100,7 @@ class PolledConnection(ABC):
         self._name = owner.name
         self._connection = connection
 
-        self.account = Account()  # has no caller until the client has sent its key
+        self.account = Account()  # account without a caller until the client has sent its key
         # Guards sending: other threads send answers, or end the connection.
         self._sending = threading.Lock()
         self._ended = False
@@ -143,7 +144,7 @@ class PolledConnection(ABC):
     def ready(self) -> None:
         """Read the connection; the batch queue calls this.
 
-        It handles errors as `_run` does, with one call less for each message.
+        It handles errors as `_run` does, with one function call less per message.
         """
         try:
             self._read()
@@ -290,7 +291,7 @@ class PolledConnection(ABC):
         with self._sending:
             if not self._ended:
                 self._send_close(code, reason)
-                with contextlib.suppress(OSError):  # the client has already closed it
+                with contextlib.suppress(OSError):  # the client has already closed the connection
                     self._connection.shutdown(socket.SHUT_RDWR)
 
     def announce_end(self, reason: str, code: int) -> None:
@@ -328,7 +329,7 @@ class PolledConnection(ABC):
             self._end_sessions()
         finally:
             with self._sending:
-                self._ended = True  # its descriptor's number may soon be reused
+                self._ended = True  # the number of the closed descriptor may soon be reused
                 self._discard()
                 self._connection.close()
             self._remove(self)
@@ -437,8 +438,8 @@ class PolledServer(ConnectionOwner[C], ABC):
 
         Errors, such as an aborted connection or EMFILE, never stop the listener. Clients above the
         rate of `_ACCEPTED_PER_S` wait in the listener's backlog. Connections that their clients
-        have ended do not count: those of one client would fill the backlog, and delay the
-        connections of others by seconds.
+        have ended do not count: otherwise the ended connections of one client would fill the
+        backlog, and delay the connections of other clients by seconds.
         """
         wait_s = self._accepting.take(time.monotonic())
         if wait_s > 0:
@@ -448,7 +449,7 @@ class PolledServer(ConnectionOwner[C], ABC):
 
         try:
             connection = accept_open(self._listener)
-        except BlockingIOError:  # the clients have ended their connections, and no other waits
+        except BlockingIOError:  # all waiting clients have ended their connections
             self._accepting.give_back()
             return
         except OSError as error:
@@ -541,7 +542,7 @@ def wait_delivered(connection: socket.socket, until: float) -> None:
             connection, which the client or another thread may end.
     """
     ended = select.poll()
-    with contextlib.suppress(ValueError):  # another thread has closed it
+    with contextlib.suppress(ValueError):  # another thread has closed the connection
         ended.register(connection, 0)  # reports errors and the end of both directions
         while time.monotonic() < until and _has_undelivered(connection):
             if ended.poll(_POLL_MS):
@@ -566,6 +567,6 @@ def has_hung_up(connection: socket.socket) -> bool:
     try:
         # A full hang-up is reported in any case.
         poller.register(connection, getattr(select, "POLLRDHUP", 0))
-    except ValueError:  # this process has closed it
+    except ValueError:  # this process has closed the connection
         return True
     return bool(poller.poll(0))

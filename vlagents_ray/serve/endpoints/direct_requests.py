@@ -66,7 +66,8 @@ class DirectRequests:
         async def send_with_id(message: Message) -> None:
             """Send a message; the response has the id of the request."""
             if message["type"] == "http.response.start":
-                # After the response uvicorn reports a disconnection, whether or not there was one.
+                # After the response, uvicorn always reports a disconnection, even if the client is
+                # still connected.
                 client.stop_watching()
                 message["headers"] = [*message.get("headers", ()), (_REQUEST_ID, request_id)]
             await send(message)

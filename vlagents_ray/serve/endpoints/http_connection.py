@@ -63,7 +63,7 @@ END_OF_HEAD = b"\r\n\r\n"
 # Larger forms are read on another thread, since finding the end of each part takes time.
 _INLINE_FORM_BYTES = 2**20
 # Maximum number of bytes of a body with chunks that are read at once, since a chunk of one byte
-# costs as much as one of a kilobyte.
+# costs as much as a chunk of a kilobyte.
 _CHUNKED_BYTES = 16 * 1024
 # Maximum number of bytes around the chunks: the heads of chunks, their extensions, and trailers.
 # The maximum is the first number plus this share of the body's size.
@@ -279,8 +279,8 @@ class HttpConnection(MessageConnection):
         self._size = 0  # number of bytes in these parts
         self._is_dropped = False  # whether the body is discarded, as the request is rejected
         self._answering: HttpHead | None = None  # request whose answer is awaited
-        self._request_id = ""  # request id of that request, in the headers of its answer
-        self._name = ""  # id of that request in the document of an error
+        self._request_id = ""  # request id in the headers of the answer
+        self._name = ""  # request id in the document of an error
         self._sender: Sender | None = None  # sender of that request
         self._charge: Charge | None = None  # charge of the latest request
 
@@ -561,7 +561,7 @@ class HttpConnection(MessageConnection):
             caller=caller,
             has_left=self.has_left,
             connected=False,
-            # The end of the connection requests it, even if the answer is JSON.
+            # The end of the connection makes the client reconnect, even if the answer is JSON.
             can_move=True,
         )
         priority = head.headers.get(PRIORITY_HEADER, "robot")

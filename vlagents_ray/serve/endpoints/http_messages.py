@@ -84,8 +84,8 @@ class _Refused(MultiPartException):
 class Body:
     """A body that has arrived."""
 
-    read: Callable[[Budget], Decoded]  # decodes its requests
-    is_long: bool = False  # whether it is decoded on another thread in any case
+    read: Callable[[Budget], Decoded]  # function that decodes the requests
+    is_long: bool = False  # whether the body is always decoded on another thread
 
 
 async def read_requests(
@@ -125,7 +125,7 @@ def body_of(op: Op, http: HttpRequest, data: bytes, admission: MessageAdmission,
 
 
 async def receive_body(op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Body:
-    """Receive the body of a POST to the path of `op`; arguments and errors are those of
+    """Receive the body of a POST to the path of `op`; the arguments and errors are the same as in
     `read_requests`.
     """
     headers = headers_of(http.scope)

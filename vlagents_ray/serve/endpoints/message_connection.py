@@ -82,7 +82,7 @@ class MessageConnection(PolledConnection):
         self._admission = admission
         self._slow_s = slow_s
         self._idle_s = idle_s
-        self._is_rated = False  # whether its client's key may be over a rate
+        self._is_rated = False  # whether the client's key has a rate that it may exceed
 
         self._arrived = 0.0  # arrival time of the bytes read last, s
         self._arriving: ArrivingBytes | None = None  # bytes of a partly received message
@@ -98,7 +98,7 @@ class MessageConnection(PolledConnection):
         self._ended_at = float("inf")  # time at which this side has ended the connection, s
         self._discarded = 0  # number of bytes that were discarded after the end
 
-        # Only `overdue` uses these.
+        # Only `overdue` uses the following fields.
         self._count_before = 0  # number of messages at the last call of `overdue`
         self._quiet_since = time.monotonic()  # time of the last message or answer, s
         self._part_since = float("inf")  # arrival time of the current partial message, s
@@ -325,7 +325,7 @@ class MessageConnection(PolledConnection):
         """End both directions of the connection, so that the polling thread reads its end."""
         with self._sending:
             if not self._ended:
-                with contextlib.suppress(OSError):  # the client has already closed it
+                with contextlib.suppress(OSError):  # the client has already closed the connection
                     self._connection.shutdown(socket.SHUT_RDWR)
         self._call_soon(self.disconnect)
 

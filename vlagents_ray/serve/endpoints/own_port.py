@@ -108,7 +108,7 @@ class OwnPortServer(HttpServer):
         self._hosts = hosts
         self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
 
-        # Connections before their handshake, in order of arrival.
+        # Connections whose handshake is not complete, in order of arrival.
         self._handshaking: dict[MessageConnection, None] = {}
         self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 

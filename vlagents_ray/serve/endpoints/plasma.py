@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 _SHARE = 0.5
 _LEAST_BYTES = 64 * 1024  # minimum size of a channel
 _HEADER_BYTES = 64  # size of Ray's own metadata
-_CLAIM_S = 60.0  # time after which an unclaimed lease is ended, since its client is gone
+_CLAIM_S = 60.0  # time after which an unclaimed lease ends, s; its client is then gone
 
 
 @dataclass(slots=True)
@@ -95,7 +95,7 @@ class Channel:
             return private.read_channel(self.ref)
         except RayChannelTimeoutError as error:
             raise MalformedMessage(
-                "plasma: a message came without a frame in its channel"
+                "plasma: expected a frame in the channel of the message, got none"
             ) from error
 
 
@@ -208,8 +208,8 @@ class PlasmaServer(UnixServer):
         super().__init__(engine, NoKey.INSIDE, limits, payload)
 
         folder = private.plasma_folder()
-        # The name is no longer than that of the store's socket in the same folder, since socket
-        # paths are limited.
+        # The name is not longer than the name of the store's socket in the same folder, since the
+        # length of socket paths is limited.
         self._path = folder / f"vla{secrets.token_hex(4)}"
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
@@ -243,8 +243,8 @@ class LeasedChannel:
     def read(
         self, message: memoryview, descriptors: list[int]
     ) -> tuple[np.ndarray, bool, memoryview]:
-        """Return a copy of the frame in the message's channel, whether it is compact, and the
-        rest of the message.
+        """Return a copy of the frame in the message's channel, whether the frame is compact, and
+        the remaining bytes of the message.
         """
         if len(message) < PlasmaAddress.REQUEST.size:
             raise MalformedMessage(

@@ -42,7 +42,7 @@ class SendBuffer:
         self._unsent = bytearray()
         self._thread: threading.Thread | None = None  # sends unsent bytes to a slow client
         self._slow = False  # whether the thread is sending unsent bytes
-        self._last = False  # whether no bytes may follow the unsent ones
+        self._last = False  # whether the unsent bytes are the last ones of the connection
         self._closed = False
 
     def send(self, data: bytes, *, last: bool = False) -> None:

@@ -165,8 +165,9 @@ class UnixConnection(PolledConnection):
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
-        self._sender: Sender | None = None  # None until the client has sent its key
-        self._is_rated = False  # whether the client's key may be over a rate
+        # Sender of the requests; None until the client has sent its key.
+        self._sender: Sender | None = None
+        self._is_rated = False  # whether the client's key has a rate that it may exceed
         self._refused_keys = 0  # number of messages whose key was rejected
         self._unanswered = 0  # number of unanswered messages
         self._paused = False  # whether too many messages are unanswered
@@ -231,7 +232,7 @@ class UnixConnection(PolledConnection):
         if self._sender is None:
             self._refused_keys += 1
             if self._refused_keys >= REFUSALS:
-                self.end(f"its key was rejected {REFUSALS} times; connect with another one")
+                self.end(f"its key was rejected {REFUSALS} times; connect with another key")
                 self.disconnect()  # the client's further messages are not read
         elif self.account.refused_too_often:
             self.end(REFUSED)
@@ -417,15 +418,15 @@ class MemoryFiles:
         self._limits = limits
         self._admission = admission
         self._files: dict[int, mmap.mmap] = {}
-        # The array over each file, until it is garbage-collected.
+        # The array over the memory of each file, until the array is garbage-collected.
         self._views: dict[int, weakref.ref[np.ndarray]] = {}
         self._freed: set[int] = set()  # freed files that no reply has reported yet
 
     def read(
         self, message: memoryview, descriptors: list[int]
     ) -> tuple[np.ndarray, bool, memoryview]:
-        """Return the frame in the message's memory file, whether it is compact, and the rest of
-        the message.
+        """Return the frame in the message's memory file, whether the frame is compact, and the
+        remaining bytes of the message.
         """
         if len(message) < LocalAddress.REQUEST.size:
             raise MalformedMessage(

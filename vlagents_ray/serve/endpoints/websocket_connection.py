@@ -46,7 +46,7 @@ from vlagents_ray.serve.engine.admission import Admission
 logger = logging.getLogger(__name__)
 
 _FINISHING = "it ends after its answers"  # a further reason for not polling a connection
-_FINISHING_S = 0.01  # period at which it is checked whether all messages are answered
+_FINISHING_S = 0.01  # period of the checks whether all messages are answered, s
 _FRAGMENT_BYTES = 16 * 1024  # size below which a fragment of a message counts like a control frame
 # Only pings detect that a client behind a proxy has disappeared, since the kernel's own probes
 # reach only the proxy.
@@ -62,11 +62,9 @@ class MessageHandler(ABC):
 
     @abstractmethod
     def begin(self) -> Charge | None:
-        """Charge a message of which a part has arrived, before the rest is read.
-
-        Returns:
-            The charge for `receive`; None if the message is charged when the application receives
-            it.
+        """Charge a message of which a part has arrived, before the remaining part is read. Returns:
+        The charge for `receive`; None if the message is charged when the application receives
+        it.
         """
 
     @abstractmethod
@@ -139,7 +137,7 @@ class WebSocketConnection(MessageConnection):
         self._is_rated = isinstance(self.caller, Caller)
         self._handler = handler
 
-    # Handlers call these methods.
+    # Handlers call the following methods.
 
     def send(self, message: bytes | str) -> None:
         """Send a message; may be called on any thread, and does nothing after the end."""
@@ -283,8 +281,8 @@ class WebSocketConnection(MessageConnection):
         return True
 
     def _count_partial(self) -> None:
-        """Count a partly received message for its key before the rest is read, and its bytes as
-        they arrive.
+        """Charge a partly received message to its key before the remaining part is read, and count
+        its bytes as they arrive.
         """
         handler = self._handler
         if handler is None:
@@ -313,7 +311,7 @@ class WebSocketConnection(MessageConnection):
         )
 
     def _process_messages(self) -> None:
-        """Serve the received messages in order, until one of them has to wait."""
+        """Serve the received messages in order, until a message has to wait."""
         while self._messages and not (
             self._ended or self._is_closed_here or self._unpolled_for & {DECODING, THROTTLED}
         ):

@@ -27,7 +27,8 @@ class AbilityCall:
     def from_arguments(
         cls, protocol: type, member: str, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> tuple[AbilityCall, Obs | None]:
-        """Return a call of a method, and its observation, if it has one.
+        """Return a call of a method, and the observation among its arguments, which is None if
+        there is none.
 
         Raises:
             TypeError: The arguments do not fit the method.
@@ -53,7 +54,7 @@ class AbilityCall:
 
         Args:
             agent: The agent.
-            obs: The argument of the method that is an observation, if it has one.
+            obs: The observation among the method's arguments, if any.
 
         Raises:
             PolicyFailed: The agent has no such ability.

@@ -191,9 +191,10 @@ class Admission:
     def _largest_arriving(
         self, size: int, limit: int, robot: bool, key: str | None
     ) -> ArrivingBytes | None:
-        """Return incomplete messages to give up: those of the key with the most bytes, or those of
-        `key` if it is over its share. Incomplete messages of robots are not given up for a
-        simulation. The result is None if there is nothing to give up. The caller holds the lock.
+        """Return incomplete messages to give up: messages of the key with the most bytes, or
+        messages of `key` if it is over its share. Incomplete messages of robots are not given up
+        for a simulation. The result is None if there is nothing to give up. The caller holds the
+        lock.
         """
         candidates = [arriving for arriving in self._arriving if robot or not arriving.robot]
         if key is not None and size > self._room_of_key(limit, key):
@@ -255,8 +256,8 @@ class Admission:
                 self._decoding_robots -= 1
 
     def inline_s(self, robot: bool) -> float:
-        """Return the time, s, above which a thread with other work leaves the images of a message
-        to a decoding thread.
+        """Return the decoding time, s, above which a thread with other work leaves the images of a
+        message to a decoding thread.
         """
         is_side_by_side = robot and self._window is not None and self._window.overlaps
         return self.least_inline_s if is_side_by_side else INLINE_S

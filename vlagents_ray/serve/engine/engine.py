@@ -62,7 +62,7 @@ class Engine:
         """Create the engine, without loading the policy.
 
         Args:
-            agent: The agent, or the checkpoints that sessions can choose from.
+            agent: The agent, or the checkpoints among which sessions can choose.
             settings: The settings.
             finder: Fetches sessions from other replicas.
             on_step: Called with each step of a long load, on the thread that loads.
@@ -171,10 +171,9 @@ class Engine:
         return self.drain_list.draining
 
     def notice_hung(self) -> None:
-        """Reject requests while a call of the policy exceeds its time limit, and answer the waiting
-        ones with an error.
-
-        This is called several times a second, on a thread that makes no calls of the policy.
+        """Reject requests while a call of the policy exceeds its time limit, and answer waiting
+        requests with an error. This method is called several times per second, on a thread that
+        does not call the policy.
         """
         hanging = self.health.find_hanging_call()
         if hanging is None:
@@ -200,8 +199,8 @@ class Engine:
         self.models.close()
 
     def stop(self, timeout_s: float) -> None:
-        """Reject all requests except those of the running batch, and wait at most `timeout_s`
-        for its end.
+        """Reject all requests except the requests in the running batch, and wait at most
+        `timeout_s` for the end of that batch.
         """
         # This fails if the policy is loading, or if the GPU has too little memory to wake the
         # policy.

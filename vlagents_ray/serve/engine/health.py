@@ -35,13 +35,13 @@ class Health:
         self._stats = stats
 
         self._loading_error = models.loading()
-        self._lock = threading.Lock()  # held while one of the fields below is set
+        self._lock = threading.Lock()  # held while one of the following fields is set
         self._loading = True
         # Reason why the policy did not load, for clients and for the operator.
         self._load_failure: PolicyFailed | None = None
         self._full_load_failure: PolicyFailed | None = None
         self._stopping: PolicyUnavailable | None = None
-        self._hung: PolicyCall | None = None  # overdue call that `find_hanging_call` found
+        self._hung: PolicyCall | None = None  # overdue call, which `find_hanging_call` has detected
         self._hanging: PolicyUnavailable | None = None
         self.alive = False  # whether a thread takes batches from the queue
         # The first reason, which is updated after each change. Requests read only this field.

@@ -153,7 +153,7 @@ class Intake:
             if step is not None and step > session.steps and step > session.expected:
                 raise session.wrong_step(step)
 
-            # An act that was queued before, and has waited for a search, keeps its episode.
+            # An act that was queued before and then waited for a search keeps its episode.
             before = pending.reserved
             known = origin.sessions.get(session_id)
             episode = before.episode if isinstance(before, ReservedAct) else known
@@ -268,7 +268,7 @@ class Intake:
         search = SessionSearch(self, pending, error)
         if self._finder.fetch(pending.session_id, search.end, searcher, search.origin_for):
             return True
-        if self._drain_list.draining:  # the replica has given its sessions to others
+        if self._drain_list.draining:  # the replica has given its sessions to other replicas
             pending.fail(
                 PolicyUnavailable(
                     "the replica is stopping; connect again, or send the same request again"

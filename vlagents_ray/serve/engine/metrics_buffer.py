@@ -80,7 +80,7 @@ class MetricsBuffer:
     def __init__(self) -> None:
         self.gpu_ms: float | None = None  # time of the last forward pass on a GPU
         self._replayed_elsewhere = 0  # number of replays of CUDA graphs in other processes
-        self._collected_replays = 0  # number of replays of this process that were collected
+        self._collected_replays = 0  # number of collected replays of this process
         self._enabled = False
         self._lock = threading.Lock()
         self._collected = Collected()
@@ -129,7 +129,7 @@ class MetricsBuffer:
             sample.add(times)
 
     def report(self, priority: str, report: RobotReport) -> None:
-        """Record the report of a robot in a request of that priority."""
+        """Record the report of a robot in a request with the given priority."""
         if not self._enabled:
             return
         with self._lock:

@@ -41,7 +41,7 @@ class Observer:
 
 
 class Observers(Observer):
-    """The observers of an engine, called as one observer. Thread-safe."""
+    """All observers of an engine, which are called like a single observer. Thread-safe."""
 
     def __init__(self) -> None:
         # Whether there are observers. Without observers, each request costs only this check.

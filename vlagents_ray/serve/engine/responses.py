@@ -41,7 +41,7 @@ def build_reply(
 
     Args:
         result: The policy's result, or the error that it raised.
-        contract: The policy's contract, if it has one; the action is checked against it.
+        contract: The policy's contract, with which the action is compared; None if it has none.
         limit: Maximum size of action and info together, bytes.
         policy: Version of the weights that computed the action, which is added to the info unless
             the policy itself returns a version (as a proxy does).
@@ -68,7 +68,7 @@ def build_reply(
         if act.info:
             require_serializable(act.info, limit - act.action.nbytes)
 
-        # The result's own info takes precedence; it may be None.
+        # The result's own info takes precedence. The info may be None.
         act.info = {**policy, **(act.info or {})}
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
@@ -154,7 +154,8 @@ class _BoundedWriter(ValueWriter):
                 f"info: more than {DEFAULT_LIMITS.items} values; send arrays instead of lists"
             )
         if value is None or isinstance(value, (int, float)):
-            return value  # checked first: the abstract classes below take five times as long
+            # Checked first, since checking the abstract classes below takes five times as long.
+            return value
         if isinstance(value, (np.ndarray, memoryview)):
             self._bytes += value.nbytes
         elif isinstance(value, (str, bytes, bytearray)):

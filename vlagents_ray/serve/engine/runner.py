@@ -149,7 +149,8 @@ class Runner:
                 if self._unsent:
                     unsent, self._unsent = self._unsent, []
                     self._answers.submit(deliver, unsent)
-                    del unsent  # their sessions may end before the next answers are deferred
+                    # The sessions of these answers may end before the next answers are deferred.
+                    del unsent
 
                 if not acting.acquire(blocking=False):
                     # The policy sleeps; clients' pings are still answered.
@@ -253,7 +254,7 @@ class Runner:
             if held is None:
                 # The policy does not work on the reset while its checkpoint is being loaded.
                 self._queue.give_back([pending])
-                return ()  # `requeue` queues it again
+                return ()  # `requeue` queues the reset again
         else:
             session = self._sessions.get(session_id)
             if session.resetting is not pending:

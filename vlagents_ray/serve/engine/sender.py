@@ -202,11 +202,11 @@ class Sender:
     def _charged(
         self, caller: Caller, charge: Charge, requests: list[PendingRequest]
     ) -> list[PendingRequest]:
-        """Return the requests that the caller's key allows, with its priority; finish the others
-        with their errors.
+        """Return the requests that the caller's key allows, with its priority; finish all other
+        requests with their errors.
         """
         allowed: list[PendingRequest] = []
-        charged = 0  # number of requests that are not free
+        charged = 0  # number of requests to be charged
         for pending in requests:
             request = pending.request
             is_free = request.op == "close"

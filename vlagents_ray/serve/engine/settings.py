@@ -29,7 +29,7 @@ class EngineSettings:
     slo: Slo | None = None  # need of a robot whose reset contains no SLO
     # Version of the policy; sessions only move between replicas of equal version and settings.
     version: str = ""
-    # Raises an error if a policy with that contract cannot be served.
+    # Function that raises an error if a policy with a given contract cannot be served.
     check: Callable[[Contract | None], None] = accept_any
     # Time limits of the policy's calls, over which the engine is unhealthy.
     limits: CallLimits = field(default_factory=CallLimits)

@@ -83,7 +83,7 @@ class Deployment(BaseModel, extra="allow"):
         Raises:
             ValidationError: A setting of Serve is wrong.
         """
-        from ray.serve.schema import ServeDeploySchema  # takes a second
+        from ray.serve.schema import ServeDeploySchema  # this import takes a second
 
         return ServeDeploySchema.model_validate(self.model_dump(exclude_unset=True))
 
@@ -407,7 +407,7 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
 
         for app in our_apps(config):
             args = ServerArgs(**app.args)
-            # Relative paths refer to this process's folder, so Ray gets absolute ones.
+            # Relative paths refer to this process's folder, so Ray gets absolute paths.
             if "environment" in app.args:
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
             if "parts" in app.args:

@@ -58,7 +58,7 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
     """Wait until all proxies listen; raise the error of a proxy that cannot listen.
 
     Serve kills a proxy that does not start within some seconds, for example on a busy node, and
-    starts another one.
+    starts another proxy.
 
     Args:
         proxies: The refs of the proxies.
@@ -97,7 +97,7 @@ def end_applications(client: Any, names: Sequence[str]) -> None:
         except ray.exceptions.RayError:  # the controller has ended
             return
         if not left:
-            # Serve's log would report an error if HAProxy ended during its last update.
+            # If HAProxy ended during its last update, Serve would log an error.
             time.sleep(_HAPROXY_S)
             return
         time.sleep(_LOOK_S)
@@ -254,7 +254,7 @@ def _url(scheme: str, host: str, port: int) -> str:
 def _with_access(
     config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool
 ) -> Deployment:
-    """Return the deployment with the access settings of the command line, if any."""
+    """Return the deployment with the access settings of the command line, if there are any."""
     if keys_file is not None and insecure:
         raise ConfigError("expected keys or insecure, got both; keep one")
     changed = config.model_copy(deep=True)
@@ -489,7 +489,7 @@ def own_ray(
                     fixed[name] = value
             environment |= settings
 
-        # If another server's process started this one, this process has inherited the files and
+        # If the process of another server started this process, it has inherited the files and
         # ports of that server, which are replaced. Otherwise the user's values are kept, unless
         # they are in `fixed`.
         is_inherited = MARK in os.environ

@@ -159,8 +159,8 @@ class AgentCopies:
         self.fingerprint = self._shared.fingerprint()
         if self._shared.refused:
             logger.warning(
-                "%s: sessions share objects of %s, which cannot be copied; if one of them holds "
-                "the state of an episode, create it in reset() instead of initialize()",
+                "%s: sessions share objects of %s, which cannot be copied; if such an object "
+                "contains the state of an episode, create it in reset() instead of initialize()",
                 type(agent).__name__,
                 sorted(self._shared.refused),
             )

@@ -104,8 +104,8 @@ class Checkpoints:
             adapter = rest.get(ADAPTER)
             if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
                 raise UnknownCheckpoint(
-                    f"{ADAPTER} and {CHOICE}: expected one of them, got {rest[ADAPTER]!r} and "
-                    f"{choice!r}; leave one out"
+                    f"{ADAPTER} and {CHOICE}: expected only one of these options, got "
+                    f"{rest[ADAPTER]!r} and {choice!r}; leave one out"
                 )
             return DEFAULT, {**rest, ADAPTER: choice}
 
@@ -124,7 +124,7 @@ class Checkpoints:
         return CheckpointChoice(choice, step), rest
 
     def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of an agent for that choice, which are based on the deployment's own
+        """Return the settings of an agent for the choice, which are based on the deployment's own
         settings `config`.
         """
         chosen = {} if choice.name is None else self._choices[choice.name]

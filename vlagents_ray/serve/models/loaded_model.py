@@ -137,7 +137,7 @@ class LoadedModel:
     since: float = field(default_factory=time.monotonic)  # time at which the model was loaded, s
     sessions: int = 0  # number of sessions that use the model
     closed: bool = False
-    # The rest of the load; None if the model is loaded completely.
+    # The ability to load the deferred parts; None if the model is loaded completely.
     deferred: DefersLoading | None = None
     key: str = field(init=False)  # `key_of(settings)`
     # The stream of the agent's calls, on any thread; None without a GPU of torch.
@@ -245,11 +245,11 @@ class ComputesElsewhere(ABC):
 
     @abstractmethod
     def gpu_memory(self) -> dict[str, int]:
-        """Return the memory of the GPUs of that process, see `accelerator.gpu_memory`."""
+        """Return the memory of the GPUs of the other process, see `accelerator.gpu_memory`."""
 
     @abstractmethod
     def gpu_work(self) -> GpuWork:
-        """Return the work of that process on its GPUs since the last call."""
+        """Return the work of the other process on its GPUs since the last call."""
 
 
 class ModelStats(Protocol):

@@ -113,7 +113,7 @@ class ModelCache:
     """
 
     def __init__(self, source: Checkpoints) -> None:
-        # Held during all calls, and notified after changes.
+        # Condition that is held during all calls, and notified after changes.
         self.changed = threading.Condition()
         self.config = source.config  # the deployment's own settings in effect
         self.next: dict[str, Any] | None = None  # settings of a swap that has not finished
@@ -183,8 +183,8 @@ class ModelCache:
         return model is not None
 
     def swap(self) -> LoadedModel | None:
-        """Put the new settings into effect if their model is loaded, and return that model;
-        otherwise None.
+        """Put the new settings into effect if their model is loaded, and return the model;
+        otherwise return None.
         """
         model = None if self.next is None else self.loaded.get(key_of(self.next))
         if self.next is not None and model is not None:
@@ -312,9 +312,9 @@ class ModelManager:
         # Maximum number of rows of the executed plan that a chunk repeats exactly at its beginning;
         # 0 for none.
         self.longest_prefix = 0
-        # Contract of the deployment's own model that was loaded last.
+        # Contract of the last loaded model among the deployment's own models.
         self.contract: Contract | None = None
-        # Weights of the deployment's own model that was loaded last.
+        # Weights of the last loaded model among the deployment's own models.
         self.weights: dict[str, Any] | None = None
         self.devices: list[dict[str, Any]] = []  # devices of that model
         self.files: Program = {}  # digests of the files named in the settings of that model
@@ -334,7 +334,7 @@ class ModelManager:
         return self._cache.config
 
     def configure(self, config: Mapping[str, Any]) -> None:
-        """Set the deployment's own settings. The first call sets the initial ones; a later call
+        """Set the deployment's own settings. The first call sets the initial settings; a later call
         starts a swap.
         """
         settings = self._source.with_adapters(config)

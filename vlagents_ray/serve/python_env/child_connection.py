@@ -47,7 +47,7 @@ class ChildConnection:
         self._immediate: queue.SimpleQueue[_Channel] = queue.SimpleQueue()
         self._numbers = itertools.count(1)  # numbers of stored observations
 
-        # Whether the policy has an ability, by the name of its protocol.
+        # Whether the policy has an ability, by the name of the ability's protocol.
         self._abilities: dict[str, bool] = {}
         self._names = itertools.count(1)  # numbers of sessions
         self._free: deque[str] = deque()  # names of closed sessions

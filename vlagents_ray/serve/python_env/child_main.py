@@ -105,7 +105,8 @@ def run() -> None:
             session_idle_s=_NEVER_S,
             version=settings.version,
             limits=CallLimits(_NEVER_S, _NEVER_S, _NEVER_S),
-            reply_bytes=MessageLimits().body_bytes,  # the replica applies its own limit
+            # No limit, since the replica applies its own limit.
+            reply_bytes=MessageLimits().body_bytes,
             in_flight_bytes=_NO_LIMITS.in_flight_bytes,
         )
         engine = Engine(agent, engine_settings, on_step=report_step)

@@ -74,7 +74,8 @@ class BatchQueue:
     ) -> None:
         self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
-        # The size up to which batches are filled with requests that wait behind others.
+        # The size up to which batches are filled with requests that wait behind the requests of
+        # other robots.
         self.most_with_others: float = math.inf
         self._waiting = FairQueue()
 

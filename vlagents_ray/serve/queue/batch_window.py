@@ -94,8 +94,8 @@ class BatchCost:
     def curve(self, largest: int) -> CostCurve | None:
         """Return the durations up to batches of size `largest`; None if no batch was added.
 
-        Until a batch of the largest size has run, its duration is that of the line. If all batches
-        had one size, further rows count as free, until larger batches show their cost.
+        Until a batch of the largest size has run, its duration is computed from the line. If all
+        batches had one size, further rows count as free, until larger batches show their cost.
         """
         if not self._means_s:
             return None
@@ -182,7 +182,7 @@ class BatchWindow:
                 self._draw_curve()
 
     def curve(self) -> CostCurve | None:
-        """Return the measured durations of batches; None if there were none.
+        """Return the measured durations of batches; None if there were no batches.
 
         A policy whose batches are not slow has one duration for all sizes.
         """

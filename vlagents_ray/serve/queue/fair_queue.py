@@ -139,9 +139,9 @@ class FairQueue:
         # The only waiting request, which is not in a session's queue.
         self._lone: PendingRequest | None = None
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
-        # Waiting requests by priority, including those that are over.
+        # Number of waiting requests by priority, including requests that are over.
         self.depth = [0] * len(Priority)
-        self.size = 0  # waiting requests of all priorities
+        self.size = 0  # number of waiting requests of all priorities
 
     def __contains__(self, session_id: str) -> bool:
         self._enqueue_lone()

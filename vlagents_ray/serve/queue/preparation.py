@@ -86,7 +86,7 @@ class Preparations:
             except Exception as error:  # noqa: BLE001 - fails the request of that observation
                 errors[index] = error
 
-        begun = []  # indices of the preparations that run on other threads, or have ended
+        begun = []  # indices of the preparations that run on other threads or have ended
         for index, (preparation, _) in reversed(list(enumerate(preparations))):
             if preparation is not None and preparation.future.cancel():
                 finish_at(index, begun=False)

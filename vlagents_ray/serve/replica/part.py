@@ -84,7 +84,7 @@ class PartContext:
     siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings
     # Whether clients on other machines need no key, `access: {insecure: true}`.
     open_to_network: bool = False
-    slow_s: float = 30.0  # maximum time that a message may take to arrive, `limits.slow_s`, s
+    slow_s: float = 30.0  # maximum time for the arrival of a message, `limits.slow_s`, s
 
     @property
     def short_name(self) -> str:

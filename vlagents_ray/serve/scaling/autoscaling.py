@@ -51,8 +51,8 @@ _REPORTED = (UTILISATION, WAITING, SESSIONS, SLO_LOAD, MOVED_LOAD, SLO_ROBOTS, L
 # mean.
 _EXACT = (SESSIONS, SLO_LOAD, MOVED_LOAD, SLO_ROBOTS)
 
-# A replica is removed only if the load of the remaining ones stays below this share of each target,
-# so that the number of replicas does not oscillate.
+# A replica is removed only if the load of the remaining replicas stays below this share of each
+# target, so that the number of replicas does not oscillate.
 _MARGIN = 0.8
 # Utilisation below which a replica counts as idle; the measured utilisation of an idle replica is
 # some millionths.

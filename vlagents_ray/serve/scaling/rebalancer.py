@@ -45,13 +45,13 @@ _AT_ONCE = 32  # largest number of sessions to send away after one comparison
 
 @dataclass(slots=True)
 class ReplicaLoad:
-    """The load of one replica, as that replica reports it."""
+    """The load of one replica, as reported by that replica."""
 
     replica: str  # name of the replica's actor
     sessions: int  # its sessions, and the expected sessions of clients that were just sent to it
-    accepts: bool  # whether its policy is loaded, and it is not stopping
-    node: str  # Ray's id of its node
-    boot_id: str  # boot id of its machine
+    accepts: bool  # whether its policy is loaded, and the replica is not stopping
+    node: str  # Ray's id of the replica's node
+    boot_id: str  # boot id of the replica's machine
     # Version of the policy and its shared objects; sessions move only between equal versions.
     version: tuple[str, str]
     robots: int = 0  # number of its sessions whose needs are known
@@ -70,10 +70,10 @@ class ClientLocation:
 
     node: str = ""  # Ray's id of the client's node; empty outside the cluster
     boot_id: str = ""  # boot id of the client's machine; empty if it is unknown
-    must_be_near: bool = False  # whether the client's transport only reaches its own machine
+    must_be_near: bool = False  # whether the client's transport reaches only the client's machine
 
     def is_near(self, load: ReplicaLoad) -> bool:
-        """Return whether that replica runs on the client's node, or on its machine."""
+        """Return whether a replica runs on the client's node, or on the client's machine."""
         return (self.node != "" and self.node == load.node) or (
             self.boot_id != "" and self.boot_id == load.boot_id
         )
@@ -133,10 +133,9 @@ def mean_sessions(loads: Sequence[ReplicaLoad]) -> list[float]:
 
 
 def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int:
-    """Return the number of sessions that a replica should send away, without the `leaving` ones.
-
-    It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one
-    session.
+    """Return the number of sessions that a replica should send away, without the `leaving`
+    sessions. The result is the excess over the mean, rounded down; 0 if that is at most 25 % of the
+    mean or one session.
 
     Args:
         mine: Number of sessions of the replica.
@@ -151,10 +150,9 @@ def excess_sessions(mine: int, siblings: Iterable[int], leaving: int = 0) -> int
 
 
 def excess_load(mine: ReplicaLoad, siblings: Sequence[ReplicaLoad], leaving: float = 0.0) -> float:
-    """Return the load that a replica should send away, without the `leaving` load.
-
-    It is the excess over the mean load; 0 if that is at most 25 % of the mean, or less than the
-    replica's mean robot needs.
+    """Return the load that a replica should send away, without the `leaving` load. The result is
+    the excess over the mean load; 0 if that is at most 25 % of the mean, or less than the replica's
+    mean robot needs.
     """
     loads = [mine.load, *(sibling.load for sibling in siblings)]
     mean = sum(loads) / len(loads)
@@ -233,7 +231,8 @@ class Rebalancer:
         self._opened = 0
         self._sibling_loads: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time of the last request for the loads of other replicas
-        self._asked_near: set[ClientLocation] = set()  # locations of that request
+        # Locations of the clients for which these loads were requested.
+        self._asked_near: set[ClientLocation] = set()
         # Locations of clients that arrived after that request.
         self._wanted_near: set[ClientLocation] = set()
         self._uneven = False  # whether the last comparison found too many sessions here

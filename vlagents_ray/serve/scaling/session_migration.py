@@ -115,7 +115,7 @@ class HeldSessions:
         # Releases that other replicas have requested.
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
-        # Sessions that are being transferred, until another replica has them.
+        # Sessions that are being transferred to another replica.
         self._leaving: dict[str, asyncio.Future[None]] = {}
 
     # Operations that other replicas call.
@@ -315,7 +315,8 @@ class SessionMigrator:
         self._loop = loop
         self._closed = False
         self._lock = threading.Lock()
-        self._callbacks: dict[str, list[_Callback]] = {}  # by session, until its search is over
+        # Callbacks by session, until the session's search is over.
+        self._callbacks: dict[str, list[_Callback]] = {}
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         # Steps at which episodes began that are not announced yet, by session.
@@ -324,7 +325,7 @@ class SessionMigrator:
         self._announced: list[Answer] = []
         # Number of sessions that are being fetched because other replicas offered them.
         self._offered = 0
-        # Time until which a silent replica gets no request, by its name.
+        # Time until which a silent replica gets no request, s, by the replica's name.
         self._silent: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
         # Held while a version of the weights, which may be large, is fetched.

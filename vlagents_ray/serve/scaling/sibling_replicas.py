@@ -63,7 +63,7 @@ class SiblingApi(Protocol):
 class PeerMethod(NamedTuple):
     """A method that replicas call on each other."""
 
-    part: type  # part of the replica that has the method
+    part: type  # object of the replica that has the method
     call: Callable[..., Any]
     limit_s: float | None  # time limit for the answer
 
@@ -187,7 +187,7 @@ class SiblingReplicas(ReplicasInCluster):
         context = serve.get_replica_context()
         self.own_name = context.replica_id.to_full_id_str()
         super().__init__([context.app_name], but=self.own_name)
-        # Time until which a silent replica gets no request, by its name.
+        # Time until which a silent replica gets no request, s, by the replica's name.
         self._silent: dict[str, float] = {}
         # Actors by the replica's name; a replica always has the same actor.
         self._last_loads: dict[str, ReplicaLoad] = {}

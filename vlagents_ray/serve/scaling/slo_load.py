@@ -94,7 +94,7 @@ def slo_load(costs: CostCurve, needs: Mapping[RobotNeed, int], max_batch_size: i
     """Return the load of robots that are spread over replicas.
 
     This differs from the load of the replica that serves them now (`fleet.replica_load`): batches
-    are smaller if robots are spread, so the sum of those loads would depend on the number of
+    are smaller if robots are spread, so the sum of such loads would depend on the number of
     replicas. Here, each robot counts as its share of a replica that is full of such robots, so the
     sum over all replicas does not change when sessions move. A robot that cannot be in time even
     alone counts as one replica.
