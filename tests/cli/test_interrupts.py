@@ -17,14 +17,25 @@ from ray_processes import START_S
 
 END_S = 120.0  # end of a command that has been interrupted
 EPISODES, HANGS_AFTER = 4, 2
+# The variable with the number of the signal that a thread of the command gets, if set.
+OTHER_THREAD = "TESTED_OTHER_THREAD"
 MODULE = f"""
-import pathlib, threading
+import os, pathlib, signal, threading, time
 import numpy as np
 from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
 
 
+def deliver(number):
+    # This thread cannot run the handler.
+    time.sleep(0.05)
+    signal.pthread_kill(threading.get_ident(), number)
+
+
 def hang():
     pathlib.Path("hangs").touch()
+    if "{OTHER_THREAD}" in os.environ:
+        number = int(os.environ.pop("{OTHER_THREAD}"))
+        threading.Thread(target=deliver, args=[number]).start()
     while True:
         try:
             threading.Event().wait()
@@ -74,6 +85,11 @@ class Acting(Policy):
 
 class Close(Policy):
     hangs_in = "close"
+
+
+class ActingAndClose(Acting):
+    def close(self):
+        hang()
 """
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 WITHOUT_RAY = [
@@ -81,6 +97,7 @@ WITHOUT_RAY = [
     ("Reset", HANGS_AFTER),
     ("Acting", HANGS_AFTER),
     ("Close", EPISODES),
+    ("ActingAndClose", HANGS_AFTER),
 ]
 CASES = [(policy, "0", finished, number) for policy, finished in WITHOUT_RAY for number in SIGNALS]
 WITH_RAY = pytest.param(
@@ -88,14 +105,22 @@ WITH_RAY = pytest.param(
 )
 
 
-def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple[int, str]:
+def interrupted(
+    words: list[str], number: signal.Signals, folder: Path, *, on_another_thread: bool = False
+) -> tuple[int, str]:
     """Run a command until its file `hangs` exists, send it one signal; returns its status and
     what it printed.
+
+    The kernel chooses the thread that gets a signal, mostly the main one. If the signal is to
+    arrive `on_another_thread`, the command sends it.
     """
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+    if on_another_thread:
+        environment[OTHER_THREAD] = str(int(number))
     command = subprocess.Popen(
         [sys.executable, "-m", "vlagents_ray", *words],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
+        env=environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -104,31 +129,55 @@ def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple
     with command:
         try:
             wait_for(lambda: (folder / "hangs").exists() or command.poll() is not None, START_S)
-            command.send_signal(number)
+            if not on_another_thread:
+                command.send_signal(number)
             printed, _ = command.communicate(timeout=END_S)
         finally:
             command.kill()
     return command.returncode, printed
 
 
-@pytest.mark.parametrize(("policy", "workers", "finished", "number"), [*CASES, WITH_RAY])
-def test_one_signal_ends_an_evaluation_that_hangs(
-    policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
+def evaluate_interrupted(
+    policy: str,
+    workers: str,
+    finished: int,
+    number: signal.Signals,
+    folder: Path,
+    *,
+    on_another_thread: bool = False,
 ) -> None:
-    (tmp_path / "own.py").write_text(MODULE)
+    """Run an evaluation whose policy hangs, and check how it ends."""
+    (folder / "own.py").write_text(MODULE)
     options = (
         f"--episodes {EPISODES} --env-set max_steps=2 --video none --workers {workers} --out out"
     ).split()
     words = ["eval", "tabletop", "--policy", f"own:{policy}", *options]
-    status, printed = interrupted(words, number, tmp_path)
+    status, printed = interrupted(words, number, folder, on_another_thread=on_another_thread)
     assert status == 130, printed
     assert "Traceback" not in printed
     [error] = [line for line in printed.splitlines() if line.startswith("error ")]
     assert error == (
         f"error interrupted after {finished} of {EPISODES} episodes; continue with --resume --out out"
     )
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = json.loads((folder / "out" / "summary.json").read_text())
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)
+
+
+@pytest.mark.parametrize(("policy", "workers", "finished", "number"), [*CASES, WITH_RAY])
+def test_one_signal_ends_an_evaluation_that_hangs(
+    policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
+) -> None:
+    evaluate_interrupted(policy, workers, finished, number, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("policy", "finished", "number"),
+    [("Initialize", 0, signal.SIGTERM), ("Close", EPISODES, signal.SIGINT)],
+)
+def test_a_signal_that_does_not_interrupt_the_main_thread_ends_an_evaluation_that_hangs(
+    policy: str, finished: int, number: signal.Signals, tmp_path: Path
+) -> None:
+    evaluate_interrupted(policy, "0", finished, number, tmp_path, on_another_thread=True)
 
 
 ARM = """
@@ -154,16 +203,24 @@ class Observing:
     def stop(self):
         print("the arm stops", flush=True)
 """
+ARMS = {"Starting": False, "Observing": True}  # whether the arm is stopped
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize(("arm", "stops"), [("Starting", False), ("Observing", True)])
+CHECKS = [
+    *((arm, stops, number, False) for arm, stops in ARMS.items() for number in SIGNALS),
+    ("Starting", False, signal.SIGTERM, True),
+    ("Observing", True, signal.SIGINT, True),
+]
+
+
+@pytest.mark.parametrize(("arm", "stops", "number", "on_another_thread"), CHECKS)
 def test_one_signal_ends_a_check_of_a_robot_that_hangs(
-    arm: str, stops: bool, number: signal.Signals, tmp_path: Path
+    arm: str, stops: bool, number: signal.Signals, on_another_thread: bool, tmp_path: Path
 ) -> None:
     (tmp_path / "own.py").write_text(MODULE)
     (tmp_path / "arm.py").write_text(ARM)
-    status, printed = interrupted(["robot", "check", f"arm:{arm}"], number, tmp_path)
+    words = ["robot", "check", f"arm:{arm}"]
+    status, printed = interrupted(words, number, tmp_path, on_another_thread=on_another_thread)
     assert status == 128 + number, printed
     assert "Traceback" not in printed
     assert ("the arm stops" in printed) == stops

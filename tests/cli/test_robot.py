@@ -31,6 +31,7 @@ from vlagents_ray.cli.robot import _restarting as restarting
 from vlagents_ray.cli.robot import main as drive
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot import Watchdog
+from vlagents_ray.robot.simulated import SimulatedRobot
 
 MAIN = "from vlagents_ray.cli import main; main()"
 REPEATS = 20  # the loop has ten ticks in that time
@@ -331,7 +332,7 @@ def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals
 import time
 import vlagents_ray.cli.robot as command
 
-def run(options):
+def run(options, end_signal):
     try:
         print("moving", flush=True)
         time.sleep(60)
@@ -379,6 +380,39 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     return serve
+
+
+class Interrupted:
+    """Python drops the exception of the signal's handler, which runs in this destructor."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+class Interrupting(SimulatedRobot):
+    """A robot whose driver is interrupted in a destructor."""
+
+    observed = 0
+
+    def observe(self) -> Obs:
+        self.observed += 1
+        if self.observed == 5:
+            Interrupted()
+        return super().observe()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("served")
+def test_a_signal_whose_exception_python_drops_ends_the_loop_before_its_next_tick(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vlagents_ray.cli.robot.SimulatedRobot", Interrupting)
+    begun = time.monotonic()
+    with pytest.raises(SystemExit) as ended:
+        drive(["http://nowhere", "--seconds", "60", "--hz", "10"])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert time.monotonic() - begun < 30
+    assert "ticks without an action of the policy" in capsys.readouterr().out
 
 
 SHORT = ["http://nowhere", "--seconds", "1"]

@@ -29,6 +29,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers import in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.ray_tools.signals import StopRequest
 
 Config = Callable[..., EvalConfig]
 
@@ -187,7 +188,7 @@ def test_failures_that_come_together_wait_for_a_signal_once(
     """A policy that is lost fails an episode of each environment at once, and all workers wait
     meanwhile.
     """
-    once, limits, wait = [True], [], threading.Event.wait
+    once, limits, wait = [True], [], StopRequest.wait
 
     class FailsOnce(InProcessWorkers):
         def free_slot(self) -> bool:
@@ -202,11 +203,11 @@ def test_failures_that_come_together_wait_for_a_signal_once(
                 )
             once[0] = once[0] and not reports
 
-    def waited(event: threading.Event, timeout: float | None = None) -> bool:
-        limits.append(timeout)
-        return wait(event, timeout)
+    def waited(stop: StopRequest, timeout_s: float) -> bool:
+        limits.append(timeout_s)
+        return wait(stop, timeout_s)
 
-    monkeypatch.setattr(threading.Event, "wait", waited)
+    monkeypatch.setattr(StopRequest, "wait", waited)
     monkeypatch.setattr(run, "SIGNAL_S", 0.0123)
     monkeypatch.setattr(in_process, "InProcessWorkers", FailsOnce)
     summary = evaluate(config(workers=0), agent_factory=ToZero)

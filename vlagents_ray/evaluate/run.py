@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -40,7 +39,7 @@ from vlagents_ray.evaluate.workers.rollout import (
     factory_programs,
 )
 from vlagents_ray.policies.base.program import Program
-from vlagents_ray.ray_tools.signals import stop_signals
+from vlagents_ray.ray_tools.signals import StopRequest, stop_signals
 
 log = logging.getLogger(__name__)
 POLL_S = 0.25  # longest time until a signal is handled, s
@@ -279,7 +278,7 @@ class _Run(Consumer):
             finally:
                 self._progress.end()
 
-    def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
+    def _poll_pool(self, pool: Workers, stop: StopRequest) -> None:
         if self._deadline.leaves_room:
             self._driver.hand_out(pool)
         late_s = SIGNAL_S

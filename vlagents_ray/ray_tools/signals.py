@@ -1,16 +1,200 @@
-"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and an event that requests a
+"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and a flag that requests a
 stop.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
 
-_interrupted = threading.Event()
+_FIRST_WAKE_S = 0.05  # time for the main thread to run a handler by itself
+_LONGEST_WAKE_S = 5.0  # native code may return early from a system call at each of these signals
+_RAISE_AGAIN_S = 5.0  # time for a call to end after an interrupt, with its own clean-up
+_POLL_S = 0.02  # period of `StopRequest.wait`
+# The signals whose handlers end a command or restart a robot.
+_DELIVERED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+_WAKE = signal.SIGURG  # ignored by default
+
+
+class StopRequest:
+    """Whether a signal has requested a stop.
+
+    A signal handler may set it at any time. It must not set a `threading.Event`: the main thread,
+    which it interrupts, may hold the event's lock, and would wait for itself for ever.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def is_set(self) -> bool:
+        """Return whether a stop has been requested."""
+        return self._is_set
+
+    def set(self) -> None:
+        """Request the stop."""
+        self._is_set = True
+
+    def clear(self) -> None:
+        """Withdraw the request."""
+        self._is_set = False
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the request, but at most `timeout_s`; return whether there is one."""
+        end = time.monotonic() + timeout_s
+        while not self._is_set:
+            left_s = end - time.monotonic()
+            if left_s <= 0:
+                return False
+            time.sleep(min(_POLL_S, left_s))
+        return True
+
+
+class _RaisingCall:
+    """A call of the main thread that a signal ends; see `raised_at_once`."""
+
+    def __init__(self) -> None:
+        self.raise_at: float | None = None  # on the clock `time.monotonic`
+
+    def raise_if_due(self) -> None:
+        """Raise `KeyboardInterrupt` if the call continues after the interrupt for too long."""
+        now = time.monotonic()
+        if self.raise_at is not None and now >= self.raise_at:
+            self.raise_at = now + _RAISE_AGAIN_S
+            raise KeyboardInterrupt
+
+
+class _Waker:
+    """Interrupts blocking calls of the main thread until it has run the handlers of a signal.
+
+    Python only runs a handler between two instructions of the main thread. A signal that arrives
+    after the last instruction before a system call, or that the kernel delivers to another thread,
+    does not interrupt the system call: a thread that waits for a lock would wait for ever. This
+    thread sends another signal, whose handler does nothing, until the main thread runs handlers.
+    """
+
+    def __init__(self) -> None:
+        self._main = threading.get_ident()
+        self._woken = 0  # how often the main thread has run `_on_wake`
+        self._ended = threading.Event()
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._writer, False)
+        self._thread = threading.Thread(target=self._watch, name="signals", daemon=True)
+
+    @classmethod
+    @contextlib.contextmanager
+    def running(cls) -> Iterator[None]:
+        """Run the thread within the context, unless it runs already, or this program uses the
+        wakeup file descriptor or the signal for something else.
+        """
+        if _process.waker is not None or signal.getsignal(_WAKE) is not signal.SIG_DFL:
+            yield
+            return
+
+        waker = cls()
+        before = signal.set_wakeup_fd(waker._writer, warn_on_full_buffer=False)
+        if before != -1:  # an event loop handles the signals
+            signal.set_wakeup_fd(before)
+            waker._close_pipe()
+            yield
+            return
+
+        _process.waker = waker
+        signal.signal(_WAKE, waker._on_wake)
+        waker._thread.start()
+        try:
+            yield
+        finally:
+            _process.waker = None
+            replaced = signal.set_wakeup_fd(-1)
+            if replaced not in (-1, waker._writer):
+                signal.set_wakeup_fd(replaced)
+            signal.signal(_WAKE, signal.SIG_DFL)
+            waker._ended.set()
+            waker.look()
+            waker._thread.join()
+            waker._close_pipe()
+
+    def look(self) -> None:
+        """Let the thread look at the running call."""
+        with contextlib.suppress(BlockingIOError):  # it will look in any case
+            os.write(self._writer, bytes([signal.SIGINT]))
+
+    def _close_pipe(self) -> None:
+        os.close(self._writer)
+        os.close(self._reader)
+
+    def _on_wake(self, _number: int, _frame: FrameType | None) -> None:
+        self._woken += 1
+        if _process.call is not None:
+            _process.call.raise_if_due()
+
+    def _watch(self) -> None:
+        """Wake the main thread after each signal, and when an interrupt is to be raised again."""
+        poll = select.poll()
+        poll.register(self._reader, select.POLLIN)
+        while not self._ended.is_set():
+            call = _process.call
+            raise_at = None if call is None else call.raise_at
+            wait_ms = None
+            if raise_at is not None:
+                wait_ms = max(0.0, raise_at - time.monotonic()) * 1000
+            if poll.poll(wait_ms):
+                numbers = os.read(self._reader, 4096)
+                if not any(number in _DELIVERED for number in numbers):
+                    continue
+            self._wake()
+
+    def _wake(self) -> None:
+        """Interrupt the main thread until it has run its handlers."""
+        woken = self._woken
+        delay_s = _FIRST_WAKE_S
+        while not self._ended.wait(delay_s) and self._woken == woken:
+            signal.pthread_kill(self._main, _WAKE)
+            delay_s = min(2 * delay_s, _LONGEST_WAKE_S)
+
+
+class _Process:
+    """The contexts that the main thread has entered."""
+
+    def __init__(self) -> None:
+        self.interrupted = StopRequest()  # within `interrupts`
+        self.stop: StopRequest | None = None  # of the innermost `stop_signals`
+        self.call: _RaisingCall | None = None
+        self.waker: _Waker | None = None
+
+
+_process = _Process()
+
+
+def _forget_waker() -> None:
+    """In a child process: its signals must not wake the main thread of its parent."""
+    if _process.waker is not None:
+        _process.waker = None
+        signal.set_wakeup_fd(-1)
+
+
+os.register_at_fork(after_in_child=_forget_waker)
+
+
+@contextlib.contextmanager
+def delivered() -> Iterator[None]:
+    """Run the handlers of SIGINT, SIGTERM, SIGHUP and SIGUSR1 soon after these signals within the
+    context, whatever the main thread waits for.
+
+    Native code that does not return to Python still delays them. Outside the main thread, where
+    Python runs no handlers, this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with _Waker.running():
+        yield
 
 
 @contextlib.contextmanager
@@ -26,30 +210,31 @@ def interrupts() -> Iterator[None]:
         return
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        _interrupted.set()
+        _process.interrupted.set()
         signal.default_int_handler(number, frame)
 
-    before = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        _interrupted.clear()
+    with delivered():
+        before = {
+            number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            _process.interrupted.clear()
 
 
 def is_interrupted() -> bool:
     """Return whether Ctrl-C or SIGTERM has arrived within `interrupts`."""
-    return _interrupted.is_set()
+    return _process.interrupted.is_set()
 
 
 def raise_dropped_interrupt() -> None:
     """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was
     dropped.
     """
-    if _interrupted.is_set():
+    if _process.interrupted.is_set():
         raise KeyboardInterrupt
 
 
@@ -73,14 +258,14 @@ def own_sigterm() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set; a second signal raises `KeyboardInterrupt`.
+def stop_signals() -> Iterator[StopRequest]:
+    """Yield a flag that Ctrl-C and SIGTERM set; a second signal raises `KeyboardInterrupt`.
 
     A handler that only sets a flag cannot interrupt a transaction. Outside the main thread, where
-    Python delivers no signals, the event is never set.
+    Python delivers no signals, the flag is never set.
     """
     raise_dropped_interrupt()
-    stop = threading.Event()
+    stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
@@ -90,38 +275,62 @@ def stop_signals() -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         stop.set()
 
-    before = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with delivered():
+        outer, _process.stop = _process.stop, stop
+        before = {
+            number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        try:
+            yield stop
+        finally:
+            _process.stop = outer
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def is_stopping() -> bool:
+    """Return whether a signal has requested a stop within the running `stop_signals`."""
+    return _process.stop is not None and _process.stop.is_set()
 
 
 @contextlib.contextmanager
-def raised_at_once() -> Iterator[None]:
+def raised_at_once(stopping_s: float = 0.0) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in this thread on a signal within the context, after its handler
     has run.
 
-    Code that looks at the event of `stop_signals` does so between two calls. A call that lasts
+    Code that looks at the flag of `stop_signals` does so between two calls. A call that lasts
     needs this, unless it writes results. A signal without a handler keeps its default action.
+    If the call catches the exception and continues, the exception is raised again.
+
+    Args:
+        stopping_s: How long the call may last if `stop_signals` has received a signal before it,
+            s. By default, `KeyboardInterrupt` is raised in place of the call.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    call = _RaisingCall()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         handlers[signal.Signals(number)](number, frame)
+        call.raise_at = time.monotonic() + _RAISE_AGAIN_S
         raise KeyboardInterrupt
 
-    for number in handlers:
-        signal.signal(number, on_signal)
+    outer, _process.call = _process.call, call
     try:
+        for number in handlers:
+            signal.signal(number, on_signal)
+        # A signal that arrived before these handlers has only set the flag.
+        if is_stopping():
+            if not stopping_s:
+                raise KeyboardInterrupt
+            call.raise_at = time.monotonic() + stopping_s
+            if _process.waker is not None:
+                _process.waker.look()
         yield
     finally:
+        _process.call = outer
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -18,20 +18,21 @@ from vlagents_ray.evaluate.plan.resolved import VARIABLES, ResolvedPlan, TimeLim
 from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.session import variables
-from vlagents_ray.ray_tools.signals import raised_at_once
+from vlagents_ray.ray_tools.signals import is_stopping, raised_at_once
 
 log = logging.getLogger(__name__)
 
 
 _LOOK_S = 1.0  # the time between two looks at the phase
 _STACK_LINES = 6  # the innermost three calls
+_CLOSE_S = 5.0  # time to close the agent and the environment after a signal, s
 
 
 class InProcessWorkers(Workers):
     """One worker, which runs its episodes in `wait`.
 
     A call that hangs is reported, but no time limit can end it. A signal ends it, with
-    `KeyboardInterrupt`: the thread that runs the episodes is the one that would read the event
+    `KeyboardInterrupt`: the thread that runs the episodes is the one that would read the flag
     of `stop_signals`.
     """
 
@@ -46,8 +47,14 @@ class InProcessWorkers(Workers):
         self._variables = contextlib.ExitStack()
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-        self._variables.close()
+        try:
+            self.close()
+        except KeyboardInterrupt:
+            if not is_stopping():
+                raise
+            log.warning("the policy and the env were not closed: closing them took too long")
+        finally:
+            self._variables.close()
 
     def free_slot(self) -> bool:
         """Remove the worker if it is idle; return whether there is none."""
@@ -74,7 +81,8 @@ class InProcessWorkers(Workers):
                 continue
 
             hangs = _hangs_reported(self._rollout, self._plan.limits)
-            with raised_at_once(), _exits_raised(), hangs:
+            # Innermost, so that no signal interrupts the end of the other contexts.
+            with _exits_raised(), hangs, raised_at_once():
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].case.place
@@ -89,7 +97,7 @@ class InProcessWorkers(Workers):
         rollout = self._rollout
         self._rollout = Rollout(self._agent_factory, self._recorders)
         try:
-            with raised_at_once():
+            with raised_at_once(_CLOSE_S):
                 rollout.close()
         except VLAgentsError as error:
             log.warning("closing the env: %s", error)
