@@ -1,4 +1,4 @@
-"""The option that records the traces."""
+"""The pytest option that records the traces."""
 
 from __future__ import annotations
 

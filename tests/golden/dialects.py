@@ -1,5 +1,5 @@
-"""Scenarios of other systems' protocols: what their clients send, by the codecs that ask such
-servers ourselves.
+"""Scenarios of other systems' protocols. The requests are encoded by the codecs with which this
+package calls such servers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def without(theirs: dict[str, Any], key: str) -> dict[str, Any]:
 
 
 def maps() -> Iterator[Trace]:
-    """openpi's protocol and its relatives, whose servers speak first."""
+    """Yield scenarios of openpi's protocol and its relatives, whose servers send the first
+    message.
+    """
 
     def infer(**more: Any) -> bytes:
         return openpi.encode(LIBERO | {"endpoint": "infer"} | more)
@@ -70,7 +72,7 @@ def maps() -> Iterator[Trace]:
 
 
 def documents() -> Iterator[Trace]:
-    """OpenVLA's, over HTTP."""
+    """Yield scenarios of OpenVLA's protocol over HTTP."""
 
     def post(body: Any, session: str = "") -> tuple[bytes]:
         data = body if isinstance(body, bytes) else openvla.encode(body)
@@ -99,11 +101,11 @@ def documents() -> Iterator[Trace]:
 
 
 def benchmarks() -> Iterator[Trace]:
-    """vla-eval's."""
+    """Yield scenarios of vla-eval's protocol."""
 
     def message(kind: Any, seq: int, **payload: Any) -> bytes:
         message = vla_eval.VlaEvalMessage(kind, payload, seq)
-        return masked(vla_eval.encode(message))  # without the time
+        return masked(vla_eval.encode(message))  # masks the time in the message
 
     def seen(seq: int, task: str = "pick", **images: Any) -> bytes:
         return message(
@@ -132,7 +134,7 @@ def benchmarks() -> Iterator[Trace]:
 
 
 def gateways() -> Iterator[Trace]:
-    """Those with a port of their own, which are clients of the replica."""
+    """Yield scenarios of dialects with a separate port, which are clients of the replica."""
 
     def batch(number: int = 1, text: str = "pick", key: str = "task") -> dict[str, Any]:
         one = {"video": {"ego": PIXELS}, "state": {"arm": JOINTS}, "language": {"task": text}}
@@ -172,8 +174,8 @@ def gateways() -> Iterator[Trace]:
         dialects={"gr00t": {}},
     )
 
-    # LeRobot's clients send pickles, which nothing here writes: its requests stay those of the
-    # file.
+    # LeRobot's clients send pickles, which this package cannot write. So the requests remain those
+    # in the file.
     yield from (one.sent() for one in read("gateways") if one.name.startswith("lerobot"))
 
     def ask(method: str, *args: str) -> bytes:

@@ -1,8 +1,8 @@
-"""The line at which the recorded policy fails, which errors name; alone, so that it stays there."""
+"""The line at which the recorded policy fails: errors contain its number, which must not change."""
 
 from typing import NoReturn
 
 
 def fail() -> NoReturn:
-    """Raise what no client may see."""
+    """Raise an error whose text no client may receive."""
     raise RuntimeError("a secret")

@@ -1,5 +1,5 @@
-"""Connections to the endpoints, which carry bytes as they are: no encoder, no decoder and no
-client of this package.
+"""Connections to the endpoints, which carry bytes unchanged: they use no encoder, decoder or client
+of this package.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.golden.masks import masked, masked_local, masked_rpyc, masked_websock
 
 ANSWER_S = 20.0
 Got = tuple[str, bytes]
-"""What came, in a word, and its bytes, masked."""
+"""A word for the kind of the received message, and its masked bytes."""
 
 _HANDSHAKE = (
     "GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -40,7 +40,9 @@ _LENGTH = re.compile(rb"\r\ncontent-length: (\d+)\r\n", re.IGNORECASE)
 
 
 class Line(Protocol):
-    """One connection of a client. `more` is what travels outside of a message."""
+    """One connection of a client. `more` is the data outside of a message, such as a memory
+    file.
+    """
 
     def send(self, data: bytes, more: list[bytes]) -> None: ...
     def receive(self) -> Got: ...
@@ -49,18 +51,18 @@ class Line(Protocol):
 
 
 class TcpLine(ABC):
-    """A stream of bytes, with messages in it."""
+    """A stream of bytes that contains messages."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
         self._file = self._socket.makefile("rb")
-        self._message = b""  # what has been read of the current message
+        self._message = b""  # the bytes of the current message that have been read
 
     def send(self, data: bytes, more: list[bytes]) -> None:
         self._socket.sendall(data)
 
     def receive(self) -> Got:
-        """The next message; at the end of the connection, the part of it that came."""
+        """Return the next message, or the received part of it if the connection ends."""
         self._message = b""
         try:
             return self._next()
@@ -68,7 +70,9 @@ class TcpLine(ABC):
             return "end", masked(self._message)
 
     def finish(self) -> Got:
-        """Send no more, and wait for the end of the connection; what came until then."""
+        """Send no more, wait for the end of the connection, and return the bytes received until
+        then.
+        """
         with contextlib.suppress(OSError):  # the server may have closed the connection
             self._socket.shutdown(socket.SHUT_WR)
         return "end", masked(self._read_to_end())
@@ -103,7 +107,7 @@ class TcpLine(ABC):
 
 
 class HttpLine(TcpLine):
-    """Requests of HTTP."""
+    """HTTP requests."""
 
     def _next(self) -> Got:
         return "response", masked(self._read_response())
@@ -120,12 +124,12 @@ class OwnHttpLine(HttpLine):
         super().send(re.sub(rb"^(\w+) /v1(?=/)", rb"\1 " + self._path, data, count=1), more)
 
     def _next(self) -> Got:
-        # At the server's port, the code before the application adds the id of the request.
+        # At the server's port, the code in front of the application adds the id of the request.
         return "response", _REQUEST_ID.sub(b"", masked(self._read_response()))
 
 
 class RpycLine(TcpLine):
-    """Messages of RPyC: a length, whether they are compressed, a body, and a byte at the end."""
+    """Messages of RPyC: a length, a flag for compression, a body, and a final byte."""
 
     def _next(self) -> Got:
         head = self._read(5)
@@ -133,9 +137,7 @@ class RpycLine(TcpLine):
 
 
 class WebSocketLine(TcpLine):
-    """Frames of a WebSocket; `more` is the first byte, if the message is no binary one in one
-    frame.
-    """
+    """Frames of a WebSocket. `more` is the first byte of a message that is not one binary frame."""
 
     def __init__(self, port: int, path: str) -> None:
         super().__init__(port)
@@ -156,9 +158,8 @@ class WebSocketLine(TcpLine):
 
 
 class WholeWebSocketLine(TcpLine):
-    """A WebSocket with its handshake and the heads of its frames.
-
-    The client sends all bytes itself; `{path}` in them is where the server expects its handshake.
+    """A WebSocket with its handshake and the heads of its frames. The client sends all bytes
+    itself; `{path}` in them is replaced by the path at which the server expects the handshake.
     """
 
     def __init__(self, port: int, path: str) -> None:
@@ -183,7 +184,9 @@ class WholeWebSocketLine(TcpLine):
 
 
 class ZmtpLine(TcpLine):
-    """A connection of ZeroMQ: its greeting, its commands, and its messages with all their frames."""
+    """A connection of ZeroMQ: its greeting, its commands, and its messages with all their
+    frames.
+    """
 
     _GREETING_BYTES = 64
     _MORE, _LONG = 1, 2  # flags of a frame
@@ -207,14 +210,16 @@ class ZmtpLine(TcpLine):
 
 
 class StrangerLine(TcpLine):
-    """A connection without a whole message of its protocol, which the server ends."""
+    """A connection that never sends a complete message of its protocol, and that the server
+    ends.
+    """
 
     def _next(self) -> Got:
         return "end", self._read_to_end()
 
 
 class UnixLine:
-    """Messages of a Unix socket, whose requests lie in memory: that of memory files, or what
+    """Messages over a Unix socket whose requests are in memory: in memory files, or in memory that
     `store` keeps.
     """
 
@@ -225,7 +230,7 @@ class UnixLine:
         self._socket.connect(address)
 
     def send(self, data: bytes, more: list[bytes]) -> None:
-        """`more`: what lies in memory, if the message names any."""
+        """Send a message. `more` is the content of the memory that the message names, if any."""
         if not more:
             self._socket.send(data)
         elif self._store is not None:
@@ -249,7 +254,9 @@ class UnixLine:
         return "control", masked_local(data)
 
     def finish(self) -> Got:
-        """Send no more, and wait for the end of the connection; what came until then."""
+        """Send no more, wait for the end of the connection, and return the bytes received until
+        then.
+        """
         with contextlib.suppress(OSError):  # the server may have closed the connection
             self._socket.shutdown(socket.SHUT_WR)
         rest = b""
@@ -262,7 +269,7 @@ class UnixLine:
 
 
 class CallLine:
-    """Calls of a function, one at a time, that returns the answer."""
+    """Calls of a function that returns the answer, one at a time."""
 
     def __init__(self, call: Callable[[bytes, list[bytes]], Got]) -> None:
         self._call = call
@@ -276,7 +283,7 @@ class CallLine:
         return self._calls.pop(0).result(ANSWER_S)
 
     def finish(self) -> Got:
-        """A call has no more than its answer."""
+        """Return nothing, since a call has only its answer."""
         return "end", b""
 
     def close(self) -> None:
@@ -302,7 +309,7 @@ class ZmqLine:
         return "message", masked(self._socket.recv())
 
     def finish(self) -> Got:
-        """ZeroMQ's library shows messages alone."""
+        """Return nothing, since ZeroMQ's library shows only messages."""
         return "end", b""
 
     def close(self) -> None:
@@ -311,8 +318,8 @@ class ZmqLine:
 
 
 class GrpcLine(CallLine):
-    """Calls of gRPC's methods: the data are a method's path, `more` its message, or those of a
-    stream.
+    """Calls of gRPC methods. The data are a method's path; `more` is its message, or the messages
+    of a stream.
     """
 
     def __init__(self, port: int) -> None:
@@ -341,12 +348,11 @@ class GrpcLine(CallLine):
 
 
 def remote_messages() -> dict[str, bytes]:
-    """What LeRobot's `RemoteClient` sent to the deployment of `dialect_situations`, by what it was
-    for.
+    """Return the messages that LeRobot's `RemoteClient` sent to the deployment of
+    `dialect_situations`, by purpose.
 
-    It was recorded at LeRobot's commits a8401e9b, and 91f903c8 for what is of version 1. Ids of 32
-    times the digit 1 and 2 stand for those of the instance and the session, which the server draws
-    at random.
+    They were recorded at LeRobot's commits a8401e9b, and 91f903c8 for version 1. Ids of 32 digits 1
+    or 2 stand for the ids of the instance and the session, which the server draws at random.
     """
     file = Path(__file__).with_name("lerobot_remote_client.json")
     sent: dict[str, str] = json.loads(file.read_text())
@@ -356,8 +362,9 @@ def remote_messages() -> dict[str, bytes]:
 class RemoteInferenceLine:
     """Messages of LeRobot's remote inference over Zenoh, as `remote_messages` returns them.
 
-    The data are the end of a message's key, such as `control`, and `more` is the message. What a
-    client sends before it, to connect and to begin a session, is sent without being recorded.
+    The data are the end of a message's key, such as `control`, and `more` is the message. The
+    earlier messages, with which a client connects and begins a session, are sent without being
+    recorded.
     """
 
     INSTANCE, SESSION = b"1" * 32, b"2" * 32
@@ -368,9 +375,9 @@ class RemoteInferenceLine:
 
         self._zenoh = zenoh
         self._session = open_zenoh(port)
-        self._declared: list[Any] = []  # Zenoh takes back what nothing refers to
+        self._declared: list[Any] = []  # Zenoh undeclares objects without a reference
         self._answers: queue.Queue[bytes] = queue.Queue()
-        self._lost = threading.Event()  # whether the server is gone
+        self._lost = threading.Event()  # set when the server has left
         self._ids = {self.INSTANCE: b"", self.SESSION: b""}
 
     def send(self, data: bytes, more: list[bytes]) -> None:
@@ -390,7 +397,7 @@ class RemoteInferenceLine:
         return "message", masked(self._answers.get(timeout=ANSWER_S))
 
     def finish(self) -> Got:
-        """The server says that it is gone, and sends no more."""
+        """Return when the server announces that it leaves and sends no more."""
         assert self._lost.wait(ANSWER_S)
         return "end", b""
 
@@ -407,7 +414,9 @@ class RemoteInferenceLine:
         return "/".join([*parts, end])
 
     def _connect(self, *, begins: bool) -> None:
-        """Ask what the deployment is, and begin a session if `begins`, unless that was done."""
+        """Query the deployment's description, and begin a session if `begins`, unless both have
+        been done.
+        """
         sent = remote_messages()
         if not self._ids[self.INSTANCE]:
             self._query("describe", sent["describe"])
@@ -416,7 +425,7 @@ class RemoteInferenceLine:
             self._query("control", sent["reset aligned"])
 
     def _addressed(self, message: bytes) -> bytes:
-        """A message with the ids of the server."""
+        """Return a message with the ids of the server."""
         for stand_in, actual in self._ids.items():
             message = message.replace(stand_in, actual or stand_in)
         return message
@@ -443,7 +452,7 @@ class RemoteInferenceLine:
         return answer
 
     def _learn(self, answer: dict[str, Any]) -> None:
-        """Keep the ids of an answer, and declare what a client does with them."""
+        """Store the ids of an answer, and declare the objects that a client needs for them."""
         if answer["message_type"] == "descriptor":
             self._ids[self.INSTANCE] = answer["instance_id"].encode()
             subscriber = self._session.liveliness().declare_subscriber(
@@ -470,5 +479,5 @@ class RemoteInferenceLine:
     def _await(matches: Callable[[], bool], key: str) -> None:
         deadline = time.monotonic() + ANSWER_S
         while not matches():
-            assert time.monotonic() < deadline, f"nobody is at {key}"
+            assert time.monotonic() < deadline, f"no server at {key}"
             time.sleep(0.005)

@@ -1,8 +1,9 @@
-"""Bytes of the wire: without what varies by nature, as text for a file, and in lines for a reader.
+"""Functions for recorded bytes: zero the values that differ in each run, write bytes as text for a
+file, and show them in lines for a reader.
 
-A message is masked by taking it apart, replacing values, and putting it together again. One that
-does not come out as it was, before any value is replaced, is not what its format says: it stays as
-it is, and so differs from its trace.
+A message is masked by decoding it, replacing values, and encoding it again. If encoding without a
+replacement does not reproduce the message, the message does not conform to its format. Then it
+stays unmasked, and so differs from its trace.
 """
 
 from __future__ import annotations
@@ -15,23 +16,27 @@ from typing import Any
 
 import msgpack
 
-_REPLY = struct.Struct("<QHh")  # of shared memory: files that are free again, flags, core
+# head of a reply over shared memory: free memory files, flags, CPU core
+_REPLY = struct.Struct("<QHh")
 # id, step, flags, dimensions, H, D, batch size, five times in ms.
 _ANSWER = struct.Struct("<40sqBB2xIIIddddd")
-_COMPACT = 2  # of the flags
+_COMPACT = 2  # one of the flags
 _FRAME = struct.Struct("<4sI")
-# Of a session or a request, drawn at random; or the prefix of a request's that a gateway counts.
+# The random id of a session or a request, or the prefix of a request's id to which a gateway adds a
+# count.
 _ID = re.compile(rb"(?<![0-9a-f])([0-9a-f]{32}(?![0-9a-f])|[0-9a-f]{16}(?=-[0-9a-f]))")
 _FRAME_MS = re.compile(rb'("\w+_ms":)-?\d+\.\d{4}(?=[,}])')
 _JSON_MS = re.compile(rb'("(?:\w+_ms|created)": ?)-?\d+(\.\d+)?(e-\d+)?(?=[,}])')
 _RPYC_JSON = re.compile(rb"\x0f(.{4})(\{.*\})(?=\n$)", re.DOTALL)
-# Of uvicorn and websockets.
+# Headers of uvicorn and websockets.
 _SERVERS_OWN = re.compile(rb"^(date|server): .*\r\n", re.IGNORECASE | re.MULTILINE)
 _LENGTH = re.compile(rb"(?<=\r\ncontent-length: )\d+", re.IGNORECASE)
 
 
 def masked(data: bytes) -> bytes:
-    """A message of an unknown format, with zeros for ids, times and what else varies."""
+    """Return a message of an unknown format with zeros for ids, times and other values that
+    vary.
+    """
     for begin, mask in ((b"VLA\x01", _frame), (b"HTTP/1.1 ", _http)):
         if data.startswith(begin):
             return mask(data)
@@ -41,9 +46,10 @@ def masked(data: bytes) -> bytes:
 
 
 def masked_local(data: bytes) -> bytes:
-    """A message of the server on a Unix socket, or its head and the memory file that came with it.
+    """Return a masked message of the server on a Unix socket, or its head and the memory file that
+    came with it.
 
-    Which of the client's memory files are free again varies, too: it is up to Python's garbage
+    The list of the client's free memory files also varies, since it depends on Python's garbage
     collector.
     """
     flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
@@ -60,7 +66,9 @@ def _without_times(answers: bytes) -> bytes:
 
 
 def masked_rpyc(data: bytes) -> bytes:
-    """A message of RPyC: its length, and that of the JSON in it, are those of what is left."""
+    """Return a masked message of RPyC. Its length and the length of its JSON are adjusted to the
+    masked content.
+    """
     if int.from_bytes(data[:4], "big") != len(data) - 6:
         return data
     if (found := _RPYC_JSON.search(data)) and int.from_bytes(found[1], "big") == len(found[2]):
@@ -70,7 +78,7 @@ def masked_rpyc(data: bytes) -> bytes:
 
 
 def masked_websocket(frame: bytes) -> bytes:
-    """A frame of a server: the length in its head is that of what is left."""
+    """Return a masked frame of a server, with the length of the masked content in its head."""
     head_bytes = 2 + {126: 2, 127: 8}.get(frame[1], 0)
     body = frame[head_bytes:]
     if frame[1:head_bytes] != _websocket_size(body):
@@ -88,7 +96,9 @@ def _websocket_size(body: bytes) -> bytes:
 
 
 def masked_zmtp(body: bytes) -> bytes:
-    """The body of a frame of ZeroMQ, which stays as long as it was: floats have one length."""
+    """Return the masked body of a frame of ZeroMQ. Its length does not change, since all floats
+    have the same length.
+    """
     body_masked = masked(body)
     return body_masked if len(body_masked) == len(body) else body
 
@@ -105,7 +115,9 @@ def _frame(data: bytes) -> bytes:
 
 
 def _taken_apart(data: bytes) -> tuple[bytes | None, list[bytes]]:
-    """The header's JSON and the blobs of a frame; None if it is no frame, or has anything else."""
+    """Return the header's JSON and the blobs of a frame; None if the data is no frame, or contains
+    anything else.
+    """
     try:
         _, length = _FRAME.unpack_from(data)
         at = _FRAME.size + length
@@ -135,7 +147,7 @@ def _http(data: bytes) -> bytes:
 
 
 def _unpacked(data: bytes) -> Any:
-    """The map or the list in msgpack; None if it is none."""
+    """Return the map or list in msgpack; None if the data is neither."""
     try:
         value = msgpack.unpackb(data, strict_map_key=False)
     except (ValueError, msgpack.exceptions.UnpackException):
@@ -158,8 +170,8 @@ def _zeroed(value: Any, key: Any = "") -> Any:
 
 
 def as_text(data: bytes) -> str:
-    """Bytes for a file: printable ASCII as it is, the others in hexadecimal within «», `07*192`
-    for many alike.
+    """Return bytes as text for a file: printable ASCII as it is, other bytes in hexadecimal within
+    «», and `07*192` for repeated bytes.
     """
     return re.sub(rb"[ -~]{4,}|(?:(?![ -~]{4})[\s\S])+", _run, data).decode() or "«»"
 
@@ -174,7 +186,7 @@ def _run(found: re.Match[bytes]) -> bytes:
 
 
 def from_text(text: str) -> bytes:
-    """The inverse of `as_text`."""
+    """Return the bytes of a text that `as_text` wrote."""
     data = b""
     for place, part in enumerate(re.split("[«»]", text)):
         for piece in part.split("|") if place % 2 else ():
@@ -185,5 +197,5 @@ def from_text(text: str) -> bytes:
 
 
 def described(data: bytes) -> list[str]:
-    """A message for a reader, about one field a line."""
+    """Return the lines of a message for a reader, about one field per line."""
     return re.sub(r',(?=")|(?<=.)(?=«)|«0d0a»', r"\g<0>\n", as_text(data)).split("\n")

@@ -45,17 +45,17 @@ def act(obs: Obs = SEEN, request_id: str = "a-1", **more: Any) -> Request:
 
 
 def seen(**changes: Any) -> Request:
-    """An act with another observation."""
+    """Return an act with a changed observation."""
     return act(replace(SEEN, **changes))
 
 
 def asked(what: str, **more: Any) -> Request:
-    """An act of which something else is asked."""
+    """Return an act whose observation requests something special from the policy."""
     return act(replace(SEEN, info={"asked": what}), **more)
 
 
 def node(op: str = "act", blobs: tuple[bytes, ...] = (), leave_out: str = "", **more: Any) -> bytes:
-    """A frame with one request, as JSON says it."""
+    """Return a frame with one request in JSON, with the given fields changed."""
     header = {
         "op": op,
         "obs": {"cameras": {}, "gripper": None, "state": {}, "info": {}},
@@ -66,7 +66,7 @@ def node(op: str = "act", blobs: tuple[bytes, ...] = (), leave_out: str = "", **
 
 
 def image(file: bytes) -> bytes:
-    """An act with a file of an image."""
+    """Return an act with an image file."""
     obs = {
         "cameras": {"front": {"$": ["img", 0]}},
         "gripper": 0.5,
@@ -77,7 +77,7 @@ def image(file: bytes) -> bytes:
 
 
 def episodes() -> Iterator[Trace]:
-    """What a session gets."""
+    """Yield scenarios of normal episodes."""
     begin, first, second = asks(reset()), "s-1", "s-2"
     say = {
         "nothing": None,
@@ -153,7 +153,7 @@ def episodes() -> Iterator[Trace]:
     )
     yield from scenario(
         "a replica that drains",
-        # After an answer of a replica that drains, its own port ends a connection of HTTP.
+        # At a replica's own port, an HTTP connection ends after an answer of a draining replica.
         [endpoint for endpoint in TOGETHER if endpoint != HTTP[1]],
         begin,
         asks(act()),
@@ -171,7 +171,8 @@ def episodes() -> Iterator[Trace]:
         replicas=2,
     )
     held = [begin, asks(reset(), who="b"), Send("a", asked("wait")), server("is acting")]
-    held.append(Send("b", act(deadline_ms=0.001)))  # over before any server gets to it
+    # the deadline has passed before any server reads the request
+    held.append(Send("b", act(deadline_ms=0.001)))
     name, later = "a deadline that is over", asks(act(deadline_ms=1e6), who="b")
     yield from scenario(name, TOGETHER[2:4], *held, gets("b"), server("acts on"), gets("a"), later)
     yield from scenario(
@@ -197,7 +198,9 @@ def episodes() -> Iterator[Trace]:
 
 
 def refusals() -> Iterator[Trace]:
-    """Requests that are refused, and change nothing: an act before and one after them."""
+    """Yield scenarios of requests that are rejected without any effect: an act follows before and
+    after them.
+    """
     begin, end = asks(reset()), asks(act())
     cameras = [
         {},
@@ -276,7 +279,7 @@ def refusals() -> Iterator[Trace]:
 
 
 def streams() -> Iterator[Trace]:
-    """What only WebSockets have."""
+    """Yield scenarios that only WebSockets have."""
     begin, opened, end = asks(reset()), Step("a", "opens"), asks(act())
     yield from scenario("a handshake", STREAMS, opened, begin)
     yield from scenario("a handshake at another path", ("/v1/strea",), opened)
@@ -290,7 +293,7 @@ def streams() -> Iterator[Trace]:
 
 
 def control_messages() -> Iterator[Trace]:
-    """What only the Unix sockets of shared memory and plasma have."""
+    """Yield scenarios that only the Unix sockets of shared memory and plasma have."""
     begin, end, head = asks(reset()), asks(act()), LocalAddress.REQUEST.pack
     message, memory = next(scenario("", LOCAL[:1], Send("a", act()))).steps[0].data
     again = (head(1, LocalAddress.COMPACT, len(memory)) + message[16:],)
@@ -307,7 +310,7 @@ def control_messages() -> Iterator[Trace]:
 
 
 def of_http() -> Iterator[Trace]:
-    """What only HTTP has: documents, forms, headers and other paths."""
+    """Yield scenarios that only HTTP has: documents, forms, headers and other paths."""
     observed, file, frame = (
         {"gripper": 0.5, "state": {"joints": [0.25, -0.5]}},
         png(PIXELS),

@@ -1,4 +1,6 @@
-"""The files of recorded bytes: what is played for each, and how it is written again."""
+"""The files of recorded bytes: the scenarios of each file, and the code that records the file
+again.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ FILES: dict[str, Callable[[], Iterator[Trace]]] = {
 
 
 def record(names: Sequence[str]) -> None:
-    """Write files again.
+    """Record files again.
 
     Args:
         names: The files, such as "traces/http" or "endpoints/own_port"; `ALL` stands for all.
@@ -54,9 +56,7 @@ def record(names: Sequence[str]) -> None:
 
 
 def _record_traces(file: str, folder: Path) -> None:
-    """Write a file of traces again; endpoints at which a scenario's bytes are the same have one
-    trace.
-    """
+    """Record a file of traces. Endpoints at which a scenario has the same bytes share one trace."""
     traces: list[Trace] = []
     for scenario in FILES[file]():
         played = scenario.played(scenario.endpoints[0], folder)

@@ -1,7 +1,7 @@
 """A server without Ray: one replica, or two that know each other, with all of its endpoints and
 dialects.
 
-Only this module knows how a replica is built: traces hold the bytes of a rebuilt one as well.
+Only this module builds a replica, so the traces also apply to another implementation of it.
 """
 
 from __future__ import annotations
@@ -71,38 +71,38 @@ STRICT = Contract(
     chunk=2,
     history=3,
 )
-# For dialects, each of which has names of its own.
+# For dialects, each of which has different names.
 OPEN = Contract(instruction=True, action=STRICT.action, chunk=2)
-# For documents of JSON, which have no images.
+# For JSON documents, which have no images.
 STATE_ONLY = replace(STRICT, cameras={})
 CONTRACTS = {"strict": STRICT, "open": OPEN, "state only": STATE_ONLY}
-KEY = "vlr_robot"  # of the only client that a server with keys admits
-_DRAWN_AT = 10**15  # ns, of the wall clock that the first step of an episode is drawn from
+KEY = "vlr_robot"  # the key of the only client that a server with keys accepts
+_DRAWN_AT = 10**15  # wall clock in ns, from which the first step of an episode is derived
 _GATEWAYS = {
     "gr00t": ZmqLine,
     "lerobot": GrpcLine,
     "lerobot_remote": RemoteInferenceLine,
     "vlagents": RpycLine,
 }
-# The end of an endpoint's name if a connection records the handshake and the heads of frames too.
+# The end of an endpoint's name, if a connection also records the handshake and the heads of frames.
 EACH_BYTE = ", each byte"
 _EACH_BYTE_OF_GATEWAY = {"gr00t": ZmtpLine}
 OWN_HTTP = "own port, http"
-STRANGER = "stranger"  # the name of a line that sends no whole message begins with it
+STRANGER = "stranger"  # prefix of the names of lines that send no complete message
 
 
 class Gate:
-    """Holds the policy within an act."""
+    """Blocks the policy within an act."""
 
     def __init__(self) -> None:
         self.acting, self.opened = threading.Event(), threading.Event()
 
 
 class Policy(Agent):
-    """Acts by what it saw: two rows of a pixel, the sum of the state, the gripper, the length of
-    the instruction, the
-    acts so far, the pixels of the last three observations together, and the row. `info` or the
-    instruction asks for something else."""
+    """A policy that returns two rows of a pixel, the sum of the state, the gripper, the length of
+    the instruction, the number of acts, the summed pixels of the last three observations, and the
+    row. `info` or the instruction can request something else.
+    """
 
     def __init__(self, contract: Contract, gate: Gate, checkpoint: str) -> None:
         self._contract, self.gate, self.checkpoint = contract, gate, checkpoint
@@ -131,7 +131,7 @@ class Policy(Agent):
         asked = obs.info.get("asked", self.instruction)
         if asked == "wait":
             self.gate.acting.set()
-            assert self.gate.opened.wait(20), "the policy was not let on"
+            assert self.gate.opened.wait(20), "the gate of the policy was not opened"
         if asked == "fail":
             fail()
         self.observe(obs)
@@ -160,15 +160,13 @@ def _pixel(obs: Obs) -> float:
 
 
 def _wall_clock() -> int:
-    """The time at which each step is drawn, ns."""
+    """Return the time from which each step is derived, in ns."""
     return _DRAWN_AT
 
 
 class Server:
-    """What a scenario talks to.
-
-    Its settings are `sessions`, `ready`, `replicas`, `keys`, the `rate` of its key, the name of a
-    `contract`, and `dialects` by name.
+    """The server of a scenario. Its settings are `sessions`, `ready`, `replicas`, `keys`, the
+    `rate` of its key, the name of a `contract`, and `dialects` by name.
     """
 
     def __init__(
@@ -185,14 +183,15 @@ class Server:
             keys.add(KEY.removeprefix("vlr_"), **limits)
             self._keys = keys.keys
         self._shutdown = Shutdown()
-        self._websockets = 0  # open ones, of HTTP
+        self._websockets = 0  # number of open WebSockets at the HTTP port
         self._gate = Gate()
         self._own: Any = None
 
-        # What ends when the server stops, the last first; at the latest with the scenario.
+        # Resources that are closed when the server stops, in reverse order, or at the end of the
+        # scenario.
         self._running = contextlib.ExitStack()
         stack.callback(self._running.close)
-        self._running.callback(lambda: self._own and self._own.close())  # after the engine
+        self._running.callback(lambda: self._own and self._own.close())  # closed after the engine
 
         session_limit = settings.get("sessions", 100)
         self._offered = partial(
@@ -212,7 +211,7 @@ class Server:
             engine_settings = EngineSettings(session_limit=session_limit)
             self.engines = [Engine(self._offered(), engine_settings, wall_clock=_wall_clock)]
             self._running.callback(self.engines[0].close)
-        self._ports: dict[int, int] = {}  # of HTTP, by replica
+        self._ports: dict[int, int] = {}  # HTTP ports by replica
         for name in gateway:
             self._open_gateway(name)
         stack.callback(self._gate.opened.set)
@@ -223,8 +222,8 @@ class Server:
         return self._keys
 
     def line(self, endpoint: str, name: str) -> Line:
-        """A new connection to the replica that the name's last digit counts from 0, or to the
-        first.
+        """Return a new connection to the replica whose number, counted from 0, is the last digit of
+        the name, or to the first replica.
         """
         number = int(name[-1]) if name[-1].isdigit() else 0
         each_byte = endpoint.endswith(EACH_BYTE)
@@ -251,12 +250,12 @@ class Server:
         return WholeWebSocketLine(port, path) if each_byte else WebSocketLine(port, path)
 
     def do(self, what: str) -> None:
-        """Something that happens to the server."""
+        """Apply an event to the server."""
         happens = {
             "drains": self.engines[0].drain_list.drain,
             "stops": self._stop,
             "is acting": lambda: (
-                self._gate.acting.wait(20) or pytest.fail("the policy was not asked")
+                self._gate.acting.wait(20) or pytest.fail("the policy was not called")
             ),
             "acts on": self._gate.opened.set,
             "has no session": lambda: wait_for(lambda: not len(self.engines[0].sessions)),
@@ -265,7 +264,7 @@ class Server:
         happens[what]()
 
     def _stop(self) -> None:
-        """Stop as a replica does: its WebSockets end first, then the engine, then the endpoints."""
+        """Stop like a replica: its WebSockets end first, then the engine, then the endpoints."""
         self._shutdown.begin()
         wait_for(lambda: not self._websockets)
         self._running.close()
@@ -313,7 +312,7 @@ class Server:
         return run
 
     def _open_own(self, endpoint: str) -> Any:
-        """The server of the endpoint, which listens."""
+        """Return the server of the endpoint, which is listening."""
         if self._own is None:
             engine, check_key = self.engines[0], self._check()
             if endpoint == "own port":

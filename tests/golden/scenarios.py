@@ -1,4 +1,4 @@
-"""How scenarios are written down, and what a client of each endpoint makes of them."""
+"""The notation of scenarios, and their encoding by the clients of each endpoint."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ FRAMES = (*STREAMS, "handle")
 LOCAL = ("shared memory", "plasma")
 HTTP = ("http", "own port, http")
 EVERYWHERE = (*FRAMES, *HTTP, *LOCAL)
-TOGETHER = EVERYWHERE[:-1]  # plasma reads what shared memory does
+TOGETHER = EVERYWHERE[:-1]  # plasma receives the same frames as shared memory
 
 ScenarioMessage = Request | list[Request] | bytes | tuple[bytes, ...]
-"""A request, or several; a frame that no encoder writes; or all that goes out, and what travels
-outside of it.
+"""One or several requests; or a frame that no encoder writes; or all bytes to send, with the data
+outside of the message.
 """
 
 
@@ -34,7 +34,7 @@ Steps = Send | Step | list["Steps"]
 
 
 def asks(*messages: ScenarioMessage, who: str = "a") -> list[Steps]:
-    """Messages, and the answer to each before the next."""
+    """Send messages, and receive the answer to each before the next."""
     return [step for one in messages for step in (Send(who, one), gets(who))]
 
 
@@ -47,7 +47,7 @@ def server(what: str) -> Step:
 
 
 def scenario(name: str, at: Sequence[str], *steps: Steps, **settings: Any) -> Iterator[Trace]:
-    """What is sent at each of the endpoints, without the answers."""
+    """Yield the messages for each of the endpoints, without answers."""
     for endpoint in at:
         encoders: dict[str, Callable[[ScenarioMessage], tuple[bytes, ...]]] = {}
         found = []
@@ -70,7 +70,7 @@ def _flat(steps: list[Steps]) -> Iterator[Send | Step]:
 def http(
     method: str, path: str, body: bytes = b"", kind: str = "", session: str = "", **headers: str
 ) -> bytes:
-    """A request of HTTP."""
+    """Return an HTTP request."""
     named = {"host": "robot", "x-session-id": session, "x-request-id": "h-1", "content-type": kind}
     named |= {"content-length": str(len(body))} if body or method == "POST" else {}
     named |= {key.replace("_", "-"): value for key, value in headers.items()}
@@ -84,7 +84,7 @@ def http(
 
 
 def _encoder(endpoint: str, who: str) -> Callable[[ScenarioMessage], tuple[bytes, ...]]:
-    """What a client makes of messages, as the transports of `vlagents_ray.client` do."""
+    """Return the function that encodes messages like the transports of `vlagents_ray.client`."""
     writer, sent = ShmWriter(), iter(range(1000))
 
     def encode(message: ScenarioMessage) -> tuple[bytes, ...]:

@@ -1,5 +1,5 @@
-"""Our encoders write what they wrote when the traces were recorded, and the server answers what
-it answered.
+"""The encoders write the same bytes as in the recorded traces, and the server gives the recorded
+answers.
 """
 
 from __future__ import annotations

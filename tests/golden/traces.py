@@ -1,4 +1,6 @@
-"""Traces: what a scenario sends and gets, in a file; played again, they say what has changed."""
+"""Traces: the recorded messages and answers of a scenario, in a file. Running a trace again shows
+what has changed.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,12 @@ class Step:
     """One step of a scenario.
 
     Args:
-        who: A line's name; or "server", to which something happens.
+        who: The name of a line; or "server" for an event at the server.
         what: "sends", "gets", "opens" (and gets the answer to the handshake), "finishes" (sends no
-            more, and gets all until the end), or "leaves"; of the server, `Server.do`.
-        data: What is sent or got: the message, and what travels outside of it; `kind` says how it
-            came.
+            more, and gets all bytes until the end), or "leaves"; for the server, an event of
+            `Server.do`.
+        data: The sent or received message, and the data outside of it. `kind` is the kind of a
+            received message.
     """
 
     who: str
@@ -37,14 +40,14 @@ class Step:
     data: tuple[bytes, ...] = ()
 
     def lines(self) -> list[str]:
-        """As a reader looks at it."""
+        """Return the lines of the step for a reader."""
         head = f"{self.who} {self.what} {self.kind}".strip()
         return [head, *(f"    {line}" for data in self.data for line in described(data))]
 
 
 @dataclass
 class Trace:
-    """A scenario at the endpoints at which the same bytes go both ways."""
+    """A scenario, and the endpoints at which its bytes are the same."""
 
     name: str
     endpoints: list[str]
@@ -52,20 +55,22 @@ class Trace:
     steps: list[Step] = field(default_factory=list)
 
     def sent(self) -> Trace:
-        """The same without the answers."""
+        """Return the trace without the answers."""
         return replace(
             self,
             steps=[one if one.what == "sends" else Step(one.who, one.what) for one in self.steps],
         )
 
     def played(self, endpoint: str, folder: Path) -> Trace:
-        """Send the same to a new server; returns what came of it."""
+        """Send the messages to a new server, and return the trace with its answers."""
         with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
             server = Server(stack, patch, folder, **self.settings)
             return self.played_at(server, endpoint, stack)
 
     def played_at(self, server: Server, endpoint: str, stack: contextlib.ExitStack) -> Trace:
-        """The same at a server whose connections stay open until `stack` is closed."""
+        """Send the messages to a server whose connections stay open until `stack` is closed, and
+        return the trace with its answers.
+        """
         lines: dict[str, Line] = {}
         stack.callback(lambda: [line.close() for line in lines.values()])
         steps = [_played(step, server, endpoint, lines) for step in self.steps]
@@ -94,7 +99,7 @@ def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -
 
 
 def differences(recorded: Trace, played: Trace) -> str:
-    """What a reader needs to see; empty if there is nothing."""
+    """Return the differences for a reader; empty if there are none."""
     found = ["another number of steps"] * (len(recorded.steps) != len(played.steps))
     for number, (before, now) in enumerate(zip(recorded.steps, played.steps, strict=False)):
         if before == now:
@@ -110,7 +115,7 @@ def differences(recorded: Trace, played: Trace) -> str:
 
 
 def read(name: str, folder: Path = TRACES) -> list[Trace]:
-    """The traces in a file: of each its name, a line with its endpoints and the server's
+    """Return the traces in a file. A trace has its name, a line with its endpoints and the server's
     settings, and its steps.
     """
     found: list[Trace] = []
@@ -127,7 +132,7 @@ def read(name: str, folder: Path = TRACES) -> list[Trace]:
 
 
 def write(name: str, traces: Sequence[Trace], folder: Path = TRACES) -> None:
-    """Write a file."""
+    """Write traces to a file."""
     lines = []
     for one in traces:
         lines += [f"== {one.name}", json.dumps([one.endpoints, one.settings])]

@@ -1,4 +1,4 @@
-"""Real servers on real Ray."""
+"""Fixtures and helpers for tests with real servers on a real Ray."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from vlagents_ray.serve.launch.server import Server
 
 SUPPORT = Path(__file__).parent.parent / "support"
 
-# Routes to a replica: the name of the transport, and whether its connection ends at the proxy, as
-# that of a client behind a firewall, or of one with TLS.
+# Routes to a replica: the name of the transport, and whether its connection ends at the proxy. A
+# client behind a firewall or with TLS uses the proxy.
 ROUTES: dict[str, tuple[TransportName, bool]] = {
     "shm": ("shm", False),
     "websocket": ("websocket", False),
@@ -34,19 +34,19 @@ ROUTES: dict[str, tuple[TransportName, bool]] = {
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Each test of this folder has a real server."""
+    """Mark each test of this folder as one with a real server."""
     item.add_marker("server")
 
 
 @pytest.fixture(scope="module")
 def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder where the replicas of `served_agents:Ledger` write down their acts."""
+    """Return the folder in which the replicas of `served_agents:Ledger` record their acts."""
     return tmp_path_factory.mktemp("ledger")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def importable_agents() -> Iterator[None]:
-    """`served_agents` for this process and for the workers that it starts."""
+    """Make `served_agents` importable in this process and in the workers that it starts."""
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = f"{SUPPORT}:{before}" if before else str(SUPPORT)
     sys.path.append(str(SUPPORT))
@@ -59,8 +59,8 @@ def importable_agents() -> Iterator[None]:
 
 @pytest.fixture
 def reach(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], TransportName]:
-    """A function that returns the transport of a route, and closes the replicas' own ports to this
-    process if the route goes through the proxy.
+    """Return a function that returns the transport of a route. If the route goes through the proxy,
+    the function disables the replicas' own ports in this process.
     """
 
     def transport_of(route: str) -> TransportName:
@@ -75,14 +75,14 @@ def reach(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], TransportName]:
 
 @pytest.fixture
 def ray_home() -> Iterator[Path]:
-    """A folder for the Ray of a command, of which nothing may run at the end."""
+    """Yield a folder for the Ray of a command; no process of this Ray may be left at the end."""
     with ray_folder() as folder:
         yield folder
         assert not processes(folder), "left running"
 
 
 def deploy(config: Deployment) -> None:
-    """Have Serve deploy the file, as `serve deploy` does with one that was changed."""
+    """Deploy the file with Serve, like `serve deploy` does with a changed file."""
     from ray.serve.context import _get_global_client
 
     client = _get_global_client()
@@ -91,7 +91,7 @@ def deploy(config: Deployment) -> None:
 
 
 def states(app: str) -> dict[str, int]:
-    """Replicas of an application's policy by what they do."""
+    """Return the number of replicas of an application's policy by state."""
     from ray import serve
 
     return dict(serve.status().applications[app].deployments["Policy"].replica_states)
@@ -99,8 +99,8 @@ def states(app: str) -> dict[str, int]:
 
 @contextmanager
 def serving(policy: str, **args: Any) -> Iterator[Server]:
-    """A server of one policy on the Ray that test files share: for files that take the fixture
-    `shared_ray`.
+    """Run a server with one policy on the Ray that test files share. The test file must use the
+    fixture `shared_ray`.
     """
     with shared_server(deployment(policy, **args)) as server:
         yield server

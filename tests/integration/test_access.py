@@ -1,4 +1,4 @@
-"""Keys, encryption and sockets of a real server that other machines may reach."""
+"""API keys, encryption and sockets of a real server that other machines can reach."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 
-EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - this test is about such a server
 TRANSPORTS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
 
 
@@ -73,28 +73,30 @@ TOO_MUCH = {
 
 @dataclass(frozen=True)
 class Listener:
-    """One socket that others can send to."""
+    """One socket to which other processes can send."""
 
     process: str
     kind: str  # "tcp", "udp", "unix"
-    host: str  # an address; of Unix sockets the path, or "@" and the name
+    host: str  # an address; for Unix sockets the path, or "@" and the name
     port: int = 0
 
     @property
     def is_local(self) -> bool:
-        """Can no other machine reach it?"""
+        """Return whether no other machine can reach the socket."""
         return self.kind == "unix" or self.host.removeprefix("::ffff:") in ("127.0.0.1", "::1")
 
 
 def listeners(root: psutil.Process) -> set[Listener]:
-    """Of the process that drives the server, and of all that it started."""
+    """Return the listening sockets of the server's driver process and of all its child
+    processes.
+    """
     found = set()
     for process in [root, *root.children(recursive=True)]:
         try:
             name = "driver" if process == root else name_of(process)
             sockets = process.net_connections("inet")
             unix = unix_sockets(process.pid)
-        except (psutil.NoSuchProcess, OSError):  # it has ended
+        except (psutil.NoSuchProcess, OSError):  # the process has ended
             continue
         for one in sockets:
             if one.status == psutil.CONN_LISTEN or (
@@ -107,11 +109,11 @@ def listeners(root: psutil.Process) -> set[Listener]:
 
 
 def name_of(process: psutil.Process) -> str:
-    """Of what runs, whatever it is started by."""
+    """Return the name of the program, whichever interpreter runs it."""
     said = words(process) or [process.name()]
     scripts = [Path(word).name for word in said if word.endswith(".py")]
     program = Path(said[0].split()[0]).name
-    # Ray's workers call themselves by what they do at the moment: "ray::Class.method".
+    # The titles of Ray's workers change with their current task: "ray::Class.method".
     return (
         scripts[0]
         if scripts
@@ -122,7 +124,7 @@ def name_of(process: psutil.Process) -> str:
 
 
 def unix_sockets(pid: int) -> set[str]:
-    """The Unix sockets of a process that have a name and wait for messages or connections."""
+    """Return the named Unix sockets on which a process waits for messages or connections."""
     inodes = set()
     for descriptor in Path(f"/proc/{pid}/fd").glob("*"):
         try:
@@ -156,10 +158,11 @@ class Served:
 
     @property
     def threaded_trust(self) -> ssl.SSLContext:
-        """For `websockets`' client, which reads and writes from two threads at once.
+        """Return a TLS context for the client of `websockets`, which reads and writes in two
+        threads at the same time.
 
-        With TLS 1.3, whose tickets come while the request is written, Python 3.11 then loses one
-        handshake in some 200 on a busy machine; with 1.2 none in 8,000.
+        With TLS 1.3, whose tickets arrive while the request is written, Python 3.11 loses about one
+        of 200 handshakes on a busy machine; with TLS 1.2 it loses none of 8,000.
         """
         trust = self.trust
         trust.maximum_version = ssl.TLSVersion.TLSv1_2
@@ -253,8 +256,8 @@ def test_whoever_is_in_the_cluster_finds_a_way_that_needs_no_key(served: Served)
 def test_a_key_is_nowhere_but_where_it_is_used(
     served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """After it was used by an evaluation, by clients of every kind, and to ask what the server
-    says of itself.
+    """An evaluation, clients of all transports, and a request for metadata have used the key
+    before.
     """
     key = served.tokens["arm"]
     monkeypatch.setenv(KEY_VARIABLE, key)
@@ -272,7 +275,7 @@ def test_a_key_is_nowhere_but_where_it_is_used(
             agent.reset(Obs(), "x")
             agent.act(Obs())
     session = Path(ray._private.worker.global_worker.node.get_session_dir_path())
-    # Where it would be.
+    # This log would contain the key.
     assert "SSL_CERT_FILE" in (session / "logs" / "runtime_env_agent.log").read_text()
     assert leaked(key, [session, Path(os.environ[MARK]), tmp_path]) == []
     _, metadata = served.status("/v1/metadata", {"x-api-key": key})
@@ -321,7 +324,9 @@ def test_the_shared_memory_endpoint_wants_a_key_before_anything_else(served: Ser
 
 
 def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
-    """That of Serve's HTTP, and its own for HTTP and WebSockets, whose path is in the metadata."""
+    """The replica has ports for Serve's HTTP, and its own port for HTTP and WebSockets, whose path
+    is in the metadata.
+    """
     ports = {
         one.port
         for one in listeners(psutil.Process())
@@ -341,7 +346,7 @@ def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
         pytest.raises(InvalidStatus) as refused,
         connect(f"ws://127.0.0.1:{stream['port']}{stream['path']}"),
     ):
-        pytest.fail("was let in")
+        pytest.fail("the client was accepted")
     assert refused.value.response.status_code == 401
 
 
@@ -359,7 +364,7 @@ def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(
 
 
 def test_an_old_way_to_encrypt_is_refused(served: Served) -> None:
-    """Without forward secrecy, or in blocks whose padding tells something."""
+    """Such ciphers lack forward secrecy, or use blocks whose padding leaks information."""
     parts = urlsplit(served.url)
     for ciphers, taken in (
         ("AES256-SHA:AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA", False),
@@ -389,16 +394,17 @@ def test_requests_that_never_end_are_cut_off(served: Served) -> None:
         assert not answer or b" 408 " in answer.partition(b"\r\n")[0]
 
 
-# Who may use which socket of a running server. "token": whoever has the cluster's token, which lies
-# in a file of the user who started it; "key": whoever has an API key; "user": processes of the user
-# who started it; "machine": any process of this machine, which can read numbers there, and set
-# nothing.
+# Who may use each socket of a running server. "token": processes with the cluster's token, which is
+# in a file of the user who started it; "key": clients with an API key; "user": processes of the
+# user who started the server; "machine": any process of this machine, which can read numbers there
+# but change nothing.
 REPLICA = "ray::ServeReplica:noop:Policy"
 WHO = [
     (r"haproxy", "tcp", "front", "key"),
-    # Serve's own port, which asks for a key; metrics; statistics.
+    # Serve's own port, which requires a key, and the ports of metrics and statistics.
     (r"haproxy", "tcp", "local", "machine"),
-    (r"haproxy", "udp", "any", "nobody"),  # its log goes out there; it does not read
+    # HAProxy sends its log from this socket, and never reads from it
+    (r"haproxy", "udp", "any", "nobody"),
     (r"haproxy", "unix", r".*/vlr-[^/]*/.*/admin.*", "user"),
     (r"ray::HAProxyManager", "unix", r".*/vlr-[^/]*/.*/metrics", "user"),
     (
@@ -410,10 +416,11 @@ WHO = [
     (r"gcs_server|raylet", "tcp", "local", "token"),
     (r"raylet", "unix", r".*/sockets/(raylet|plasma_store)", "user"),
     (r"ray::DashboardAgent|ray::RuntimeEnvAgent|agent\.py", "tcp", "local", "token"),
-    (REPLICA, "tcp", "local", "key"),  # and its worker's own, which wants the token
-    (REPLICA, "tcp", "any", "token"),  # calls between deployments: see below
+    # the port of Ray's worker is also here; it requires the token
+    (REPLICA, "tcp", "local", "key"),
+    (REPLICA, "tcp", "any", "token"),  # for calls between deployments, tested below
     (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),
-    # Claims of ports, of which others read the owner.
+    # Sockets that claim ports. Other processes read the owner's id.
     (r"driver", "unix", r"@vlagents-ray-port-[0-9]+", "machine"),
     (REPLICA, "unix", r".*/sockets/\.?vla[0-9a-f]{8}", "user"),
 ]
@@ -437,8 +444,8 @@ def who(one: Listener, front: int) -> str | None:
 
 
 def is_private(path: Path) -> bool:
-    """Does a folder that it is in keep other users out? Its own mode does not: they could put
-    another in its place.
+    """Return whether a parent folder keeps other users out. The folder's own mode would not
+    suffice, since they could replace the folder.
     """
     return any(not stat.S_IMODE(place.stat().st_mode) & 0o077 for place in path.parents)
 
@@ -448,9 +455,7 @@ def test_every_socket_of_a_running_server_is_known_and_closed_to_strangers(serve
     found: dict[Listener, str | None] = {}
 
     def all_known() -> bool:
-        """A process has its name, and has closed its sockets, a moment after it was started, or
-        ended.
-        """
+        """A process gets its name, and closes its sockets, shortly after its start or end."""
         found.clear()
         found.update({one: who(one, front) for one in listeners(psutil.Process())})
         return None not in found.values()
@@ -468,7 +473,9 @@ def test_every_socket_of_a_running_server_is_known_and_closed_to_strangers(serve
 
 
 def test_calls_between_deployments_want_the_clusters_token(served: Served) -> None:
-    """It is the only port of Ray's that other machines reach, and it runs what it is sent."""
+    """This port is the only one of Ray's ports that other machines can reach, and it executes the
+    calls that it receives.
+    """
     (port,) = {
         one.port
         for one in listeners(psutil.Process())

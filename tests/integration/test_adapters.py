@@ -1,5 +1,5 @@
-"""A server of two LoRA adapters over one base: sessions of both act in one pass, each as its
-fine-tune alone.
+"""A server with two LoRA adapters of one base. Sessions of both adapters act in one batch, with the
+same actions as each fine-tuned policy alone.
 """
 
 from __future__ import annotations

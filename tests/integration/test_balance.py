@@ -1,4 +1,6 @@
-"""Sessions spread over the replicas, as they come and when a replica joins them."""
+"""Sessions are distributed evenly among the replicas, both when they begin and when a replica
+joins.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,12 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
-# Of equal connections the oldest go first.
+# Number of sessions by transport. Among equal connections the oldest are moved first.
 HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "http": 2, "websocket": 6}
 
 
 def deployed(replicas: int) -> Deployment:
-    """As `serve deploy` with another `num_replicas` would have it."""
+    """Return the deployment, like `serve deploy` would see it with another `num_replicas`."""
     reacher = deployment("served_agents:Reacher").model_dump(exclude_unset=True)
     reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
     return Deployment(applications=reacher["applications"])
@@ -36,10 +38,10 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
-    """Pinned ones, on every such transport, exactly where they were; so do several of one
-    connection.
+    """Sessions that are pinned to a replica move on each such transport, and continue with the same
+    state. Several sessions of one connection move together.
 
-    Then the first to go end, and the rest is uneven again.
+    Then the sessions that moved first end, and the remaining ones are uneven again.
     """
     agents = {
         (way, i): RemoteAgent(url(server, way), transport=way)
@@ -55,7 +57,7 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
     moves: Counter[tuple[str, int]] = Counter()
 
     def act() -> dict[object, int]:
-        """Once in each session; returns where it was."""
+        """Act once in each session, and return each session's replica."""
         nonlocal together
         for key, agent in agents.items():
             counts[key] += 1
@@ -73,7 +75,7 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
             assert one.action.tolist() == [together, together, i]
             assert "resumed" not in one.info
             where.append(one.info["pid"])
-        assert len(set(where)) <= 1, "sessions of one connection were parted"
+        assert len(set(where)) <= 1, "sessions of one connection were separated"
         return dict(pids) | {f"env {i}": pid for i, pid in enumerate(where)}
 
     assert len(set(act().values())) == 1
@@ -85,8 +87,8 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
 
     def become_even() -> None:
         begun = time.monotonic()
-        wait_for(even, every_s=0.25)  # float32 holds the sums of no more acts than that
-        print(f"{len(pids) + len(envs)} sessions: even after {time.monotonic() - begun:.1f} s")
+        wait_for(even, every_s=0.25)  # the sums of more acts would not fit exactly into float32
+        print(f"{len(pids) + len(envs)} sessions were even after {time.monotonic() - begun:.1f} s")
 
     become_even()
     for env in envs:
@@ -102,14 +104,14 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
     while time.monotonic() < until:
         act()
         time.sleep(0.05)
-    assert sum((moves - settled).values()) <= 2, "sessions go to and fro"
+    assert sum((moves - settled).values()) <= 2, "sessions move back and forth"
     for agent in agents.values():
         agent.close()
 
 
 @pytest.mark.parametrize("way", ["shm", "handle", "websocket"])
 def test_new_sessions_spread_evenly(server: Server, way: TransportName) -> None:
-    """Sixteen that come at once; two replicas run since the test before."""
+    """Sixteen sessions begin at the same time; the previous test started two replicas."""
     agents = [RemoteAgent(url(server, way), transport=way) for _ in range(16)]
     for _ in range(4):
         with ThreadPoolExecutor(len(agents)) as pool:
@@ -121,7 +123,7 @@ def test_new_sessions_spread_evenly(server: Server, way: TransportName) -> None:
         print(f"{way}: {sorted(held.values())}")
         if len(held) == 2 and min(held.values()) >= 7:
             break
-        # A replica that did not tell its load within 0.3 s, on a busy machine, gets no session for
+        # On a busy machine, a replica that did not report its load within 0.3 s gets no session for
         # 3 s.
         time.sleep(4)
     else:

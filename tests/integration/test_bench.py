@@ -1,4 +1,4 @@
-"""`python -m benchmarks.NAME` as it is run, very small."""
+"""Very small runs of `python -m benchmarks.NAME`."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
 def test_throughput_comes_near_the_bare_policy_and_never_above_it(
     ray_home: Path, tmp_path: Path
 ) -> None:
-    """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it
-    sleeps, so that the
-    two cores of a busy machine do not matter."""
+    """Named by its class, `noop` is a policy of unknown speed, whose speed is measured without a
+    server. It sleeps, so that the load of two cores does not matter.
+    """
     file = tmp_path / "throughput.json"
     policy = [
         "--policy",
@@ -75,7 +75,7 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(
         "0.6",
     ]
     ratios = []
-    for _ in range(3):  # a machine that stands still for a second spoils a measurement of 0.6 s
+    for _ in range(3):  # a pause of the machine for a second would spoil a measurement of 0.6 s
         done = bench(
             ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--out", str(file)
         )
@@ -91,7 +91,9 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(
         if 0.6 < ratios[-1][0] <= 1.0 and all(0.3 < of_ideal <= 1.1 for of_ideal in ratios[-1][1:]):
             break
     else:
-        pytest.fail(f"bare, shm, handle, each of what is possible: {ratios}")
+        pytest.fail(
+            f"ratios of the measured to the possible rate, for bare, shm and handle: {ratios}"
+        )
     assert set(found["transports"]) == {"shm", "handle"}
     for row in found["transports"].values():
         assert [point["clients"] for point in row["curve"]] == [8]

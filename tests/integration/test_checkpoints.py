@@ -1,4 +1,6 @@
-"""Many checkpoints in one deployment, and another one without a restart, on real servers."""
+"""Many checkpoints in one deployment, and the swap of its default checkpoint without a restart, on
+real servers.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ POLICY = "served_agents:Stored"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Checkpoints 1 to 9, each a file with its number."""
+    """Return a folder with the checkpoints 1 to 9, each a file that contains its number."""
     folder = tmp_path_factory.mktemp("runs")
     for number in range(1, 10):
         (folder / f"{number}").write_text(str(number))
@@ -35,7 +37,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def deployed(folder: Path, **beside: Any) -> Deployment:
-    """As a file says it, with what may change while it runs beside `args`."""
+    """Return the deployment. `beside` are the settings next to `args`, which can change while it
+    runs.
+    """
     config = {"checkpoint": str(folder / "{step}"), "checkpoint_step": 1}
     checkpoints = {
         "choices": {"late": {"checkpoint": str(folder / "9")}},
@@ -52,7 +56,7 @@ def deployed(folder: Path, **beside: Any) -> Deployment:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, folder: Path) -> Iterator[Server]:
-    """Deployed by Serve, as its file has `deployments`: only so can it change without new
+    """Serve deploys the file, since it has `deployments`. Only then can it change without new
     replicas.
     """
     with shared_server(deployed(folder, num_replicas=1)) as server:
@@ -60,7 +64,7 @@ def server(shared_ray: None, folder: Path) -> Iterator[Server]:
 
 
 def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
-    """What `serve deploy` does with the changed file."""
+    """Deploy the changed file, like `serve deploy`."""
     deploy(deployed(folder, num_replicas=replicas, user_config=user_config))
 
 
@@ -70,13 +74,13 @@ def metadata(server: Server) -> dict[str, Any]:
 
 
 def own(server: Server, folder: Path) -> str:
-    """The deployment's own checkpoint."""
+    """Return the deployment's default checkpoint."""
     return str(metadata(server)["checkpoint"]).removeprefix(f"{folder}/")
 
 
 @pytest.fixture
 def fresh(server: Server, folder: Path) -> Server:
-    """As the file says at first, whatever the test before left."""
+    """Restore the deployment's initial settings after the previous test."""
     for marker in folder.glob("*.*"):
         marker.unlink()
     redeploy(folder)
@@ -85,14 +89,14 @@ def fresh(server: Server, folder: Path) -> Server:
 
 
 def told(agent: RemoteAgent) -> list[float]:
-    """The number that its checkpoint acts by, and of the act."""
+    """Return the number of the session's checkpoint, and the number of the act."""
     act = agent.act(Obs())
     return [float(act.action[0]), act.info["step"]]
 
 
 class Robot:
-    """Plays episodes of its own on a thread, and keeps what it got: (checkpoint of the reset,
-    act's number, step).
+    """A robot that runs episodes in a thread, and stores for each act (checkpoint of the reset,
+    number of the checkpoint, step).
     """
 
     def __init__(self, agent: RemoteAgent, episode: int = 20, **options: Any) -> None:
@@ -112,11 +116,11 @@ class Robot:
                     act = self._agent.act(Obs())
                     self.resumed += bool(act.info.get("resumed"))
                     self.rows.append((name, float(act.action[0]), act.info["step"]))
-        except BaseException as failure:  # noqa: BLE001 - told by `end`
+        except BaseException as failure:  # noqa: BLE001 - `end` raises it
             self.failure = failure
 
     def end(self) -> list[tuple[str, float, int]]:
-        """Stop after the episode; raises what went wrong."""
+        """Stop after the current episode, and raise the error that occurred, if any."""
         self._stop.set()
         self._thread.join(60)
         self._agent.close()
@@ -152,8 +156,8 @@ def test_metadata_says_what_may_be_chosen_and_what_is_loaded(fresh: Server, fold
 
 
 def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder: Path) -> None:
-    """Each step of each episode is answered by the checkpoint that its reset was told, and no
-    replica restarts.
+    """The checkpoint that each reset reported answers all steps of the episode, and no replica
+    restarts.
     """
     robots = [
         Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t))
@@ -210,10 +214,11 @@ def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(
 def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(
     fresh: Server, folder: Path
 ) -> None:
-    redeploy(folder, replicas=2, checkpoint_step=4, scale=10.0)  # any setting is swapped
+    # any setting of the policy can be swapped
+    redeploy(folder, replicas=2, checkpoint_step=4, scale=10.0)
 
     def numbers() -> dict[int, set[float]]:
-        """What each replica's sessions act by."""
+        """Return the numbers of the checkpoints that each replica's sessions use."""
         found: dict[int, set[float]] = {}
         for _ in range(8):
             with RemoteAgent("serve://Stored", transport="handle") as agent:
@@ -249,7 +254,8 @@ def test_an_evaluation_says_by_which_checkpoint(
         ({"checkpoint": "lat"}, UnknownCheckpoint),
     ):
         out = tmp_path / error.__name__
-        # No episode is lost to it, and none counts as a failure of the policy.
+        # The error stops the evaluation; it is not counted as a lost episode or as a failure of the
+        # policy.
         with pytest.raises(error):
             evaluate(flat_config(**settings, policy_options=option, out=out))
 

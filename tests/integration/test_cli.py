@@ -1,4 +1,4 @@
-"""`vlagents-ray eval` as users run it: serve, roll out, record, stop, go on."""
+"""`vlagents-ray eval` like users run it: serve, roll out, record, stop and continue."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def evaluate(ray_home: Path, *words: str, **options: Any) -> subprocess.Complete
 
 
 def rows(out: Path) -> list[tuple[Any, ...]]:
-    """What is recorded of each episode, apart from times."""
+    """Return the recorded values of each episode, without times."""
     if not (out / "results.db").exists():
         return []
     with closing(sqlite3.connect(out / "results.db")) as db:
@@ -104,7 +104,7 @@ BOTH = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none",
 
 @pytest.fixture(scope="module")
 def resumed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An evaluation that was begun without workers, and resumed with them."""
+    """Begin an evaluation without workers, and resume it with workers."""
     out = tmp_path_factory.mktemp("resumed") / "out"
     with ray_folder() as ray_home:
         for episodes, workers in (("2", "0"), ("4", "2")):
@@ -119,7 +119,9 @@ def resumed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_results_without_workers_are_those_with_them_which_resume_them(
     ray_home: Path, resumed: Path, tmp_path: Path
 ) -> None:
-    """The test above resumes without workers what was begun with them."""
+    """The fixture `resumed` began without workers and continued with them; this test does the
+    reverse.
+    """
     words = ["--episodes", "4", "--workers", "0", "--out", str(tmp_path / "whole")]
     done = evaluate(ray_home, *BOTH, *words)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -206,5 +208,5 @@ def test_parts_are_merged_exported_and_one_episode_is_played_again(
         app, ["replay", out, key, "--policy", "nope", "--out", str(tmp_path / "other")]
     )
     assert (other.exit_code, "'nope'" in other.stderr) == (2, True), (
-        "this one, and not the run's, is to be served"
+        "this server must be used, not the one of the run"
     )

@@ -1,5 +1,5 @@
-"""What dies beside a server or an evaluation: HAProxy comes back, and without Ray the command
-ends, all of it.
+"""Processes that die next to a server or an evaluation: HAProxy is restarted, and without Ray the
+command ends with all its processes.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from ray_processes import free_address, healthy
 from vlagents_ray import ConfigError
 from vlagents_ray.evaluate import Results
 
-MINE = "VLAGENTS_RAY_TEST_COMMAND"  # in the environment of all that the command starts
+# a variable in the environment of all processes that the command starts
+MINE = "VLAGENTS_RAY_TEST_COMMAND"
 
 
 @contextmanager
 def running(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A command of ours; whatever is left of it at the end is killed."""
+    """Run a command of this package, and kill its remaining processes at the end."""
     with log.open("w") as output:
         command = subprocess.Popen(
             [sys.executable, "-c", "from vlagents_ray.cli import main; main()", *words],
@@ -45,7 +46,7 @@ def running(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def processes(log: Path, program: str = "") -> list[int]:
-    """Those of the command, or those of them that run `program`."""
+    """Return the processes of the command, or only those that run `program`."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -61,16 +62,16 @@ def processes(log: Path, program: str = "") -> list[int]:
 
 
 def gone(log: Path, started: list[psutil.Process]) -> None:
-    """Nothing that the command started runs, soon after its end. A title may hide the
-    environment of one that does.
+    """Fail unless all processes that the command started end soon. A process title may hide the
+    environment of a process.
     """
     _, left = psutil.wait_procs(started, 30)
     if left or processes(log):
-        pytest.fail(f"still there: {left or processes(log)}\n{log.read_text()[-4000:]}")
+        pytest.fail(f"still running: {left or processes(log)}\n{log.read_text()[-4000:]}")
 
 
 def kill(log: Path, program: str) -> list[int]:
-    """Returns which processes were killed."""
+    """Kill the processes that run `program`, and return them."""
     victims = processes(log, program)
     assert victims, f"no {program} runs"
     for pid in victims:
@@ -89,10 +90,10 @@ def test_a_server_gets_haproxy_back_and_ends_without_ray_leaving_nothing(tmp_pat
             180,
         )
         assert server.poll() is None, log.read_text()
-        ended = kill(log, "haproxy")  # which lets clients in
+        ended = kill(log, "haproxy")  # HAProxy accepts the clients' connections
         killed = time.monotonic()
         wait_for(lambda: set(processes(log, "haproxy")) - set(ended) and healthy(address))
-        print(f"HAProxy: killed, and back after {time.monotonic() - killed:.1f} s")
+        print(f"HAProxy: killed, and restarted after {time.monotonic() - killed:.1f} s")
         started = psutil.Process(server.pid).children(recursive=True)
         kill(log, "raylet")
         killed = time.monotonic()
@@ -101,7 +102,7 @@ def test_a_server_gets_haproxy_back_and_ends_without_ray_leaving_nothing(tmp_pat
         gone(log, started)
         said = log.read_text()
         cause = "Ray's daemon on this machine, the raylet, has ended; start it again"
-        # Ray's own threads may log after it.
+        # Ray's own threads may log after this line.
         assert any(line.endswith(cause) for line in said.splitlines()), said
 
 
@@ -123,7 +124,7 @@ def test_an_evaluation_whose_head_dies_ends_and_can_be_resumed(tmp_path: Path) -
 
 
 def played(out: Path) -> int:
-    """Episodes with a result."""
-    with suppress(ConfigError):  # nothing is written yet
+    """Return the number of episodes with a result."""
+    with suppress(ConfigError):  # no results have been written yet
         return sum(len(case.episodes) for case in Results.load(out).cases)
     return 0

@@ -1,4 +1,4 @@
-"""API keys by the protocols of other systems."""
+"""API keys in the protocols of other systems."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from vlagents_ray.serve.ports import free_port
 def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(
     shared_ray: None, tmp_path: Path
 ) -> None:
-    """GR00T's protocol carries a key, vlagents' does not: it is served on purpose, or not at
-    all.
+    """GR00T's protocol contains a key. vlagents' protocol does not, so it is served only if the
+    deployment allows it explicitly.
     """
     file = tmp_path / "keys.json"
     key = new_key(file, "arm")
@@ -43,7 +43,8 @@ def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(
             drive(peers_python(), "openpi_keyed", f"{url}#{shown}", 1, 1)
             for shown in (key, "wrong", "")
         ]
-        assert [row[3:] for row in answers[0][0]] == [[3, 1], [3, 2]]  # "abc"; its first act
+        # the length of "abc", and the first acts
+        assert [row[3:] for row in answers[0][0]] == [[3, 1], [3, 2]]
         assert answers[1:] == [[401], [401]]
         with Client(robots) as robot:
             assert robot.act(document(8, "x")) == [8, 0.5, 0.25, 1, 1]

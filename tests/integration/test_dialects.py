@@ -1,4 +1,4 @@
-"""Other systems' own clients, as PyPI has them, against one batched replica: each gets its own
+"""Other systems' clients from PyPI against one replica with batches: each client gets its own
 answers.
 """
 
@@ -24,7 +24,7 @@ from vlagents_ray_dialects.messages import openpi as openpi_codec
 CALLS = 12
 DIALECTS = {
     "openpi": {"mapping": "openpi-libero"},
-    # Mirror's rows have 7 numbers.
+    # The policy's rows have 7 numbers.
     "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},
     "openvla": {},
     "vla_eval": {},
@@ -38,7 +38,7 @@ def python() -> Path:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Two applications of one deployment file: at the root, and under /pi."""
+    """Serve two applications of one deployment file: at the root, and under /pi."""
     args = {"policy": "served_agents:Mirror", "config": {"slow_s": 0.002}, "batch": {"max_size": 8}}
     names = {"root": ("/", DIALECTS), "pi": ("/pi", {"openpi": DIALECTS["openpi"]})}
     apps = [
@@ -67,7 +67,9 @@ def url_for(client: str, server: Server) -> str:
 
 
 def require_own_answers(said: list[list[Any]], client: str) -> None:
-    """Pixel, state, instruction are the sender's; its acts are counted from 1 in each episode."""
+    """Check that pixel, state and instruction are the sender's, and that acts are counted from 1 in
+    each episode.
+    """
     for one in said:
         acts = 0
         previous = None

@@ -1,4 +1,4 @@
-"""Policies whose packages contradict each other, in one deployment file on one cluster."""
+"""Policies with conflicting packages in one deployment file on one cluster."""
 
 from __future__ import annotations
 
@@ -29,20 +29,22 @@ from vlagents_ray.serve.python_env.create import make_environment
 pytestmark = pytest.mark.integration
 
 AGENT = "python_env_agents:Telling"
-INSTALLED = {"uv": ["six==1.16.0"], "env_vars": {"VARIABLE": "set"}}  # of an application
-VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # of numpy and six
+# settings of the application "installed"
+INSTALLED = {"uv": ["six==1.16.0"], "env_vars": {"VARIABLE": "set"}}
+# versions of numpy and six
+VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}
 
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """A cluster with four applications.
+    """A cluster with four applications, whose names are the names of their environments.
 
-    old and new run in replicas, apart in a child process without Ray, and what installed needs Ray
-    installs.
+    "old" and "new" run in replicas, "apart" runs in a child process without Ray, and Ray installs
+    the packages of "installed".
     """
 
     server: Server
-    notes: dict[str, Path]  # what each policy said at its resets
+    notes: dict[str, Path]  # files to which each policy writes its resets
 
     def said(self, app: str) -> list[dict[str, Any]]:
         return [json.loads(line) for line in self.notes[app].read_text().splitlines()]
@@ -95,7 +97,7 @@ def observation(value: float = 0.0, **info: Any) -> Obs:
 
 @ray.remote(num_cpus=0)
 class EnvActor:
-    """An env on the policy's node, in the driver's environment."""
+    """An environment on the policy's node, in the driver's Python environment."""
 
     def drive(self, app: str, transport: TransportName) -> dict[str, Any]:
         with RemoteAgent(f"serve://{app}", transport=transport) as agent:
@@ -110,7 +112,7 @@ def require_versions(app: str, told: dict[str, Any]) -> None:
     assert told["ray"] == (None if app == "apart" else ray.__version__)
     assert Path(told["prefix"]).name == ("virtualenv" if app == "installed" else app)
     assert told["variable"] == (None if app == "old" else "set")
-    assert told["gpus"] == ""  # which no replica asked for
+    assert told["gpus"] == ""  # no replica has requested a GPU
 
 
 @pytest.mark.parametrize("app", ["old", "new", "apart", "installed"])

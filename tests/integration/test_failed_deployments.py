@@ -1,4 +1,4 @@
-"""Policies that cannot be served say why."""
+"""Policies that cannot be served fail with the reason."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_policy_that_does_not_load_says_why(gateway: bool) -> None:
         pytest.raises(ConfigError, match="no checkpoint here"),
         serving("served_agents:Broken", dialects=dialects),
     ):
-        pytest.fail("served a policy that did not load")
+        pytest.fail("the server started although the policy did not load")
 
 
 def test_a_gateways_taken_port_is_named() -> None:
@@ -30,4 +30,4 @@ def test_a_gateways_taken_port_is_named() -> None:
             pytest.raises(ConfigError, match=f"vlagents: cannot listen on 127.0.0.1:{port}"),
             serving("noop", dialects={"vlagents": {"port": port}}),
         ):
-            pytest.fail("served without its gateway")
+            pytest.fail("the server started without its gateway")

@@ -1,9 +1,9 @@
 """Model families served from their deployment files, each in its own environment, all on one
 cluster.
 
-The environments are those of `make families`, the checkpoints tiny random ones of each family's own
-code. Families whose code is on no package index want their source (`OPENPI_SRC`, …) and their
-environment (`make families FAMILIES=openpi`) besides.
+`make families` creates the environments. Each family's own code creates tiny random checkpoints.
+Families whose code is on no package index also need their source (`OPENPI_SRC`, …) and their
+environment (`make families FAMILIES=openpi`).
 """
 
 from __future__ import annotations
@@ -32,21 +32,23 @@ pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
 TESTS = "plugins.vlagents_ray_models.tests.families"
-ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix  # with -NAME after it
+# prefix of the environments' folders, to which -NAME is added
+ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """A deployment file, and what of it has to change for a tiny checkpoint."""
+    """A deployment file, and its changes for a tiny checkpoint."""
 
-    file: str  # in deployments/
+    file: str  # name of the file in deployments/
     environment: str
     tests: str  # the folder in the families' tests whose tiny.py makes the checkpoint
     kind: tuple[str, ...] = ()
-    within: str = ""  # where in what tiny.py wrote
+    within: str = ""  # path of the checkpoint in the folder that tiny.py wrote
     config: dict[str, Any] = field(default_factory=dict)
-    env_vars: dict[str, str] = field(default_factory=dict)  # {} stands for what tiny.py wrote
-    source: str | None = None  # the variable with its checkout
+    # in the values, {} stands for the folder that tiny.py wrote
+    env_vars: dict[str, str] = field(default_factory=dict)
+    source: str | None = None  # the variable with the checkout of its source
     atol: float = 1e-4
 
 
@@ -92,7 +94,7 @@ FAMILIES = {
             "cameras": {"ego_view": "front"},
             "state": ["xyzrpy"],
         },
-        env_vars={"GR00T_SRC": "{}/src"},  # with a small backbone
+        env_vars={"GR00T_SRC": "{}/src"},  # a version with a small backbone
         source="GR00T_SRC",
     ),
     "diffusion_policy": Family(
@@ -115,7 +117,9 @@ def present() -> dict[str, Family]:
 
 
 def application(name: str, family: Family, home: Path) -> dict[str, Any]:
-    """The file's one application, with a tiny checkpoint and this run's environment in it."""
+    """Return the file's only application, with a tiny checkpoint and with this test run's
+    environment.
+    """
     python = python_of(family)
     assert python.is_file(), f"{python} is missing: make families FAMILIES={family.environment}"
     script = ROOT.joinpath(*TESTS.split("."), family.tests, "tiny.py")
@@ -181,7 +185,7 @@ def test_families_whose_packages_contradict_are_evaluated_side_by_side(
 ) -> None:
     told = [versions(family) for family in present().values()]
     assert len({found.get("transformers") for found in told}) > 1
-    if set(present()) & {"openvla", "octo"}:  # which are older than numpy 2
+    if set(present()) & {"openvla", "octo"}:  # these families need a numpy older than 2
         assert {found["numpy"].partition(".")[0] for found in told} == {"1", "2"}
     for name in present():
         config = flat_config(

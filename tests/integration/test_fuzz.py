@@ -1,7 +1,7 @@
-"""Messages that are nearly right, at every endpoint of a real server: none crashes it, hangs it or
-makes it grow.
+"""Nearly correct messages at every endpoint of a real server: none crashes it, blocks it or makes
+its memory grow.
 
-Some hundreds at each endpoint in CI; as many as wanted by hand:
+CI sends some hundred messages to each endpoint. More can be sent by hand:
 
     VLAGENTS_FUZZ_FRAMES=200000 pytest tests/integration/test_fuzz.py -s --timeout 3600
 """
@@ -42,7 +42,7 @@ from vlagents_ray_dialects.messages import xpolicylab as xpolicylab_codec
 
 FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "1400"))
 ANSWER_S = 60.0
-EVERY = 100  # messages; then a right one
+EVERY = 100  # messages between checks with a correct one
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
 OBS = Obs(
     {"front": PICTURE}, 0.5, {"joints": np.ones(3, np.float32)}, {"note": "x", "list": [1, 2.5]}
@@ -89,7 +89,7 @@ def server(shared_ray: None) -> Iterator[Server]:
         "openvla": {},
         "sglang": {},
         "vla_eval": {},
-        # Mirror's rows have 7 numbers.
+        # The policy's rows have 7 numbers.
         "xpolicylab": {
             "mapping": {
                 "preset": "xpolicylab",
@@ -112,17 +112,17 @@ def request(op: str) -> bytes:
 
 @dataclass
 class Target:
-    """An endpoint, right messages for it, and what the last of them is answered with."""
+    """An endpoint, correct messages for it, and the answer to the last of them."""
 
     name: str
-    path: str  # empty: the replica's own port for WebSockets
+    path: str  # if empty, the replica's own port for WebSockets
     seeds: list[bytes]
-    pixel: Callable[[bytes], float]  # in the answer to the last seed
-    content_type: str = ""  # content type of an HTTP body; empty: it is a WebSocket
-    greeting: bool = False  # the server speaks first
-    trees: list[dict[str, Any]] = field(default_factory=list)  # messages before they were encoded
+    pixel: Callable[[bytes], float]  # returns the pixel in the answer to the last seed
+    content_type: str = ""  # content type of an HTTP body; if empty, the endpoint is a WebSocket
+    greeting: bool = False  # whether the server sends the first message
+    trees: list[dict[str, Any]] = field(default_factory=list)  # messages before encoding
     encode: Callable[[Any], bytes] = openpi_codec.encode
-    fence: bytes = b""  # a message that is always answered, for where others may not be
+    fence: bytes = b""  # a message that is always answered, for protocols with unanswered messages
     seen: Counter[str] = field(default_factory=Counter)
 
 
@@ -256,8 +256,8 @@ TARGETS = [
 
 
 def attack(target: Target, server: Server, frames: int, seed: int) -> None:
-    """Send so many; raises if the server hangs, tells of an internal error, or then rejects what
-    is right.
+    """Send many messages. Raise an error if the server hangs, reports an internal error, or later
+    rejects a correct message.
     """
     choose = random.Random(seed)
     talk = over_http if target.content_type else over_websocket
@@ -268,7 +268,9 @@ def attack(target: Target, server: Server, frames: int, seed: int) -> None:
 
 
 def nearly_right(target: Target, choose: random.Random) -> bytes:
-    """Wrong in its bytes or, where there is a tree, half of the time in what they say."""
+    """Return a message with wrong bytes, or half of the time with wrong content if there is
+    a tree.
+    """
     if target.trees and choose.random() < 0.5:
         return target.encode(changed(choose, choose.choice(target.trees)))
     return mutated(choose, choose.choice(target.seeds))
@@ -310,7 +312,7 @@ def over_websocket(target: Target, server: Server, bad: list[bytes]) -> bytes:
                         socket.send(target.fence)
                     note(target, wait_for_answer(target, socket))
         except ConnectionClosedError as closed:
-            if closed.rcvd is None:  # the server broke off without a word
+            if closed.rcvd is None:  # the server ended the connection without a close frame
                 raise
             target.seen["closed"] += 1
     with opened(target, server) as socket:
@@ -323,8 +325,8 @@ def over_websocket(target: Target, server: Server, bad: list[bytes]) -> bytes:
 
 
 def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
-    """To the last message, or with a fence to all before it; an error in openpi's manner ends
-    the connection.
+    """Wait for the answer to the last message, or with a fence for the answers to all messages
+    before it. An error in openpi's form ends the connection.
     """
     while True:
         answer = socket.recv(timeout=ANSWER_S)

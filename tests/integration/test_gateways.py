@@ -1,6 +1,4 @@
-"""The real clients of vlagents, and GR00T's and LeRobot's, on one batched replica of a real
-server.
-"""
+"""Real clients of vlagents, GR00T and LeRobot on one replica with batches."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray_cluster.tune.line_process import LineProcess
 
-ANSWER_S = 120.0  # the client's imports included
+ANSWER_S = 120.0  # includes the imports of the client
 
 
 @dataclass
@@ -40,7 +38,7 @@ class Ports:
 
 @pytest.fixture(scope="module")
 def ports(shared_ray: None) -> Iterator[Ports]:
-    """One replica, and a gateway with all three dialects."""
+    """Serve one replica and a gateway with all three dialects, and yield the ports."""
     ports = Ports(free_port(), free_port(), free_port())
     dialects = {name: {"port": getattr(ports, name)} for name in ("vlagents", "gr00t", "lerobot")}
     with serving("served_agents:Witness", batch={"max_size": 8}, dialects=dialects) as server:
@@ -61,10 +59,10 @@ class Robot:
         return self.child.request(json.dumps(wish), ANSWER_S)
 
     def act(self, pixel: int, instruction: str = "abc", **more: Any) -> list:
-        """[action rows] of each call."""
+        """Return the action rows of each call."""
         answer = self.say(pixel=pixel, joints=0.5, gripper=0.25, instruction=instruction, **more)
         if isinstance(answer, dict):
-            raise RuntimeError(answer["error"])  # noqa: TRY004 - what the robot was told
+            raise RuntimeError(answer["error"])  # noqa: TRY004 - the robot's own error
         return [[step[1] for step in act] for act in answer]
 
 
@@ -78,13 +76,13 @@ def robots(port: int, *modes: str, version: Sequence[Path] = ()) -> Iterator[lis
 
 
 def at_once(*calls: Callable[[], object]) -> list[object]:
-    """What each of the calls returns, each made by a separate thread."""
+    """Run each call in a separate thread, and return their results."""
     results: dict[int, object] = {}
 
     def run(number: int) -> None:
         try:
             results[number] = calls[number]()
-        except Exception as error:  # noqa: BLE001 - compared by the test
+        except Exception as error:  # noqa: BLE001 - the test compares it
             results[number] = error
 
     threads = [threading.Thread(target=run, args=(number,)) for number in range(len(calls))]
@@ -97,7 +95,8 @@ def at_once(*calls: Callable[[], object]) -> list[object]:
 
 def close_to(rows: list, pixel: int, acts: int, text: int = 3) -> bool:
     want = [[pixel, 0.5, 0.25, text, acts], [pixel, 0.5, 0.25, text, acts + 1]]
-    return bool(np.allclose(rows, want, atol=[2, 1e-6, 1e-6, 0, 0]))  # JPEG moves a pixel a little
+    # JPEG changes a pixel slightly
+    return bool(np.allclose(rows, want, atol=[2, 1e-6, 1e-6, 0, 0]))
 
 
 def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
@@ -119,7 +118,9 @@ def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
 
 @pytest.mark.program("vlagents")
 def test_vlagents_0_3_raw_jpeg_and_shared_memory_at_once(ports: Ports) -> None:
-    """Every client gets its own answers, and one's end leaves the others' memory where it is."""
+    """Each client gets its own answers, and the end of one client does not affect the others'
+    memory.
+    """
     with robots(ports.vlagents, "raw", "jpeg", "shm", "shm") as fleet:
         assert (
             at_once(*(lambda r=robot: r.say(say="is_initialized") for robot in fleet)) == [True] * 4
@@ -189,7 +190,7 @@ def test_clients_of_lerobots_asynchronous_inference_at_once(ports: Ports) -> Non
 
 
 def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) -> None:
-    """The last test of the server: its replica is killed, and Serve replaces it."""
+    """This is the last test of the server, since it kills the replica, which Serve replaces."""
     with (
         robots(ports.vlagents, "shm") as [robot],
         PolicyClient(ports.gr00t) as client,

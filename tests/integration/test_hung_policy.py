@@ -1,5 +1,5 @@
-"""A policy that never returns from an act: its sessions go on elsewhere, the cause is told, and
-Serve replaces it.
+"""A policy that never returns from an act: its sessions continue elsewhere, the cause is reported,
+and Serve replaces the replica.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
-CALL_S, ACT_S = 5, 6  # a replica that stands still for 3 s is not a hung one
+CALL_S, ACT_S = 5, 6  # a replica that pauses for 3 s does not count as hung
 INSIDE: list[TransportName] = ["handle", "plasma"]
 OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
 
@@ -34,8 +34,8 @@ def server(shared_ray: None) -> Iterator[Server]:
     config = deployment("served_agents:Hanging", replicas=2, limits=limits).model_dump(
         exclude_unset=True
     )
-    # A hung replica never drains: Serve waits for that in vain, 20 s by our default; and it asks
-    # each replica three times how it is, every 5 s.
+    # A hung replica never drains. By this package's default, Serve would wait 20 s for it, and
+    # check each replica three times, every 5 s.
     config["applications"][0]["deployments"] = [
         {"name": "Policy", "graceful_shutdown_timeout_s": 2, "health_check_period_s": 1}
     ]
@@ -44,20 +44,20 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def hung_calls() -> list[tuple[str, float]]:
-    """What Prometheus would read of them: the op of each, and their number."""
+    """Return the metric of hung calls: the operation and the number of each."""
     return [
         (one.tags["op"], one.value) for one in scrape() if one.name == "vlagents_hung_calls_total"
     ]
 
 
 def logged() -> str:
-    """What the workers of this Ray have written."""
+    """Return the logs of this Ray's workers."""
     logs = Path(ray._private.worker._global_node.get_logs_dir_path())  # type: ignore[union-attr]
     return "".join(file.read_text(errors="replace") for file in logs.glob("worker-*.err"))
 
 
 def line_of(code: str) -> int:
-    """The number of the only line of the policies that holds it."""
+    """Return the number of the only line of the policies' file that contains `code`."""
     [number] = [
         n
         for n, line in enumerate(Path(served_agents.__file__).read_text().splitlines(), 1)
@@ -67,7 +67,7 @@ def line_of(code: str) -> int:
 
 
 def persist(agent: RemoteAgent, left: int) -> None:
-    """Act until another replica answers than that one."""
+    """Act until another replica than `left` answers."""
     while True:
         with suppress(DeadlineExceeded, PolicyUnavailable):
             if agent.act(Obs()).info["pid"] != left:
@@ -78,8 +78,8 @@ def persist(agent: RemoteAgent, left: int) -> None:
 def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(
     how: str, server: Server
 ) -> None:
-    """One that keeps the interpreter's lock ("lock") can say nothing itself: clients and Serve
-    notice its silence.
+    """A replica whose policy holds the GIL ("lock") cannot report anything itself: clients and
+    Serve notice its silence.
     """
     made = [RemoteAgent("serve://Hanging", transport=one, timeout_s=CALL_S) for one in INSIDE * 3]
     made += [RemoteAgent(server.url, transport=one, timeout_s=CALL_S) for one in OUTSIDE * 3]
@@ -103,7 +103,9 @@ def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(
     if how == "sleep":
         wait_for(lambda: hung_calls() == [("act", 1.0)])
         wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged())
-        assert "threading.Event().wait()" in logged(), "the log does not say where it hangs"
+        assert "threading.Event().wait()" in logged(), (
+            "the log lacks the line at which the policy hangs"
+        )
     else:
         place = f'served_agents.py", line {line_of("sleep(10_000)")} in act'
         wait_for(lambda: place in logged())

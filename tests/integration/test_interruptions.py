@@ -1,7 +1,7 @@
-"""The longest time without an action when a replica is killed or frozen, or HAProxy is killed.
+"""The longest time without an action after a replica is killed or frozen, or HAProxy is killed.
 
 Robots act at 20 Hz over all transports at once, at a replica's own port or through the proxy, with
-time limits far above these times: nothing here is recovered because a call has timed out.
+time limits far above these times: so no recovery here is caused by the time limit of a call.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
 REPLICAS = 2
-ROBOTS = 4  # robots of each route
+ROBOTS = 4  # number of robots on each route
 TIMEOUT_S = 60.0
 FROZEN_S = 12.0  # time after which a frozen replica continues
 FRAME = np.zeros((8, 8, 3), np.uint8)
@@ -41,15 +41,15 @@ ROUTES_AT_ONCE = {
     "proxied": [route for route, (_, is_proxied) in ROUTES.items() if is_proxied],
 }
 
-# The longest time without an action, s: about twice what two shared cores need. HAProxy is back
-# about 3 s after its end.
+# The longest time without an action, in s: about twice the time needed on two shared cores. HAProxy
+# restarts about 3 s after its end.
 NEEDS_HAPROXY = ("websocket-proxied", "http-proxied")
 PING_AFTER_S = 0.5
 
 
 def bound_s(route: str, fault: str) -> float:
-    """Return the longest time without an action after a fault, which is the same for all routes
-    that depend on the process that it hits.
+    """Return the longest allowed time without an action after a fault. It is the same for all
+    routes that depend on the affected process.
     """
     if fault == "freeze":  # the clients have left by then
         return 2.4 * (PING_AFTER_S + connection.FROZEN_S)
@@ -60,27 +60,28 @@ def bound_s(route: str, fault: str) -> float:
 
 @dataclass
 class Robot:
-    """A session that acts at 20 Hz, and notes each answer."""
+    """A session that acts at 20 Hz and records each answer."""
 
     route: str
     agent: RemoteAgent
     name: str
     pid: int = 0  # the process of its replica
     number: int = 0  # number of the latest observation
-    answered: list[float] = field(default_factory=list)  # time.monotonic(), s
-    # The observations on which a resumed session has acted: their first answers were lost.
+    answered: list[float] = field(default_factory=list)  # from time.monotonic(), in s
+    # The observations on which a resumed session acted again, because their first answers were
+    # lost.
     resumed: set[int] = field(default_factory=set)
     error: BaseException | None = None
 
     def begin(self) -> None:
-        """Begin the episode."""
+        """Begin an episode."""
         self.pid = self.agent.reset(self.observation(-1), self.name)["pid"]
 
     def observation(self, number: int) -> Obs:
         return Obs({"front": FRAME}, info={"episode": self.name, "number": number})
 
     def act_until(self, stop: threading.Event) -> None:
-        """Act until then."""
+        """Act until `stop` is set."""
         try:
             while not stop.wait(0.05):
                 info = self.agent.act(self.observation(self.number)).info
@@ -94,7 +95,9 @@ class Robot:
             self.error = error
 
     def longest_gap_s(self, since: float) -> float:
-        """Return the longest time between two answers after `since`, or around it."""
+        """Return the longest time between two answers after `since`, including the time around
+        `since`.
+        """
         before = [moment for moment in self.answered if moment <= since][-1:]
         after = [moment for moment in self.answered if moment > since]
         moments = [*before, *after]
@@ -110,7 +113,9 @@ def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
 
 
 def executed(ledger: Path, name: str) -> list[tuple[int, int, float]]:
-    """Which observations of a robot replicas acted on: number, process, time.monotonic()."""
+    """Return the observations of a robot on which replicas acted: number, process, and
+    time.monotonic().
+    """
     acts = []
     for file in ledger.iterdir():
         for line in file.read_text().splitlines():
@@ -122,7 +127,7 @@ def executed(ledger: Path, name: str) -> list[tuple[int, int, float]]:
 
 
 def haproxy_processes() -> list[int]:
-    """The HAProxy in front of this process's Ray."""
+    """Return the HAProxy processes of this process's Ray."""
     folder = Path(os.environ["RAY_SERVE_HAPROXY_CONFIG_FILE_LOC"]).parent
     found = []
     for process in psutil.process_iter(["cmdline"]):
@@ -134,16 +139,18 @@ def haproxy_processes() -> list[int]:
 
 
 def url_of(server: Server, transport: TransportName) -> str:
-    """Return the address for clients of a transport."""
+    """Return the clients' address for a transport."""
     return "serve://Ledger" if transport == "handle" else server.url
 
 
 @contextmanager
 def acting(server: Server, transports: Mapping[str, TransportName]) -> Iterator[list[Robot]]:
-    """Robots of each route that act, some of them at each replica."""
+    """Yield robots of each route that are acting; each replica has some of them."""
 
     def new_agent(route: str) -> RemoteAgent:
-        """A client; HAProxy chooses the replica of one over HTTP by a random id, which it keeps."""
+        """Return a new client. Over HTTP, HAProxy chooses the replica by the client's random id,
+        which the client keeps.
+        """
         transport = transports[route]
         return RemoteAgent(url_of(server, transport), transport=transport, timeout_s=TIMEOUT_S)
 
@@ -157,7 +164,8 @@ def acting(server: Server, transports: Mapping[str, TransportName]) -> Iterator[
     def are_spread() -> bool:
         for robot in robots:
             robot.agent.close()
-        # All replicas get as many sessions, those of a route by the order in which they begin.
+        # All replicas get the same number of sessions. The order in which the sessions of a route
+        # begin decides their replicas.
         for robot in random.sample(robots, len(robots)):
             robot.agent = new_agent(robot.route)
             robot.begin()
@@ -181,7 +189,7 @@ def acting(server: Server, transports: Mapping[str, TransportName]) -> Iterator[
 
 
 def have_acted_since(robots: list[Robot], moment: float) -> Callable[[], bool]:
-    """Whether each has acted on an observation that was made after that."""
+    """Return whether each robot has acted on an observation made after `moment`."""
 
     def has_acted(robot: Robot) -> bool:
         answers_since = sum(answered_at > moment for answered_at in robot.answered)
@@ -225,7 +233,7 @@ def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
         finally:
             with suppress(ProcessLookupError):
                 os.kill(hit, signal.SIGCONT)
-        time.sleep(2.0)  # the acts of a frozen replica are late now
+        time.sleep(2.0)  # the acts of the frozen replica are late now
 
     shown = ", ".join(f"{route} {gap_s:.1f} s" for route, gap_s in gaps_s.items())
     print(f"{fault}: {len(left)} robots hit, no action for: {shown}")
@@ -249,7 +257,9 @@ def test_robots_act_again_soon_and_no_act_is_doubled_or_late(
 def test_a_session_stays_at_a_replica_whose_policy_is_slow(
     server: Server, reach: Callable[[str], TransportName], route: str
 ) -> None:
-    """Its first slow act, after fast ones: something else in its process answers."""
+    """The first slow act follows fast ones. Another thread of the replica's process answers the
+    pings.
+    """
     transport = reach(route)
     wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
     url = url_of(server, transport)

@@ -1,4 +1,4 @@
-"""An evaluation's results depend on its plan, and on nothing of how it was run."""
+"""An evaluation's results depend only on its plan, not on the way it is run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plan(out: Path, url: str, **running: Any) -> EvalConfig:
 
 
 def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
-    """All of each episode but times and ways, by env and number."""
+    """Return all results of each episode except times and transports, by environment and number."""
     found = [one.result for case in Results.load(out).cases for one in case.episodes]
     assert len({(one.key.env, one.key.episode) for one in found}) == len(found) == 2 * EPISODES
     return {
@@ -58,8 +58,8 @@ def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
 
 
 class Disaster(Progress):
-    """Kills all workers after each eighth episode, and has the evaluation interrupted after so
-    many.
+    """Kills all workers after every eighth episode, and interrupts the evaluation after
+    `interrupted_after` episodes.
     """
 
     def __init__(self, interrupted_after: int | None = None) -> None:
@@ -81,13 +81,13 @@ class Disaster(Progress):
 def alone(
     shared_ray: None, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[tuple[str, int], tuple[Any, ...]]:
-    """By one worker, from one replica that batches nothing."""
+    """Return the outcomes with one worker and one replica without batching."""
     out = tmp_path_factory.mktemp("alone")
     with serving("served_agents:Hesitant", batch={"max_size": 1}) as server:
         evaluate(plan(out, server.url, workers=1))
     found = outcomes(out)
     assert {row[1] for row in found.values()} == {True, False}, (
-        "both outcomes occur, or the test shows nothing"
+        "both outcomes must occur for the test to be meaningful"
     )
     return found
 
@@ -96,7 +96,7 @@ def alone(
 def server(
     shared_ray: None, alone: dict[Any, Any], request: pytest.FixtureRequest
 ) -> Iterator[Server]:
-    """With so many replicas, for all tests that want as many."""
+    """Run a server with the requested number of replicas, for all tests with this number."""
     with serving("served_agents:Hesitant", batch={"max_size": 8}, replicas=request.param) as server:
         yield server
 

@@ -1,4 +1,4 @@
-"""Sessions come and go by the thousand, and nothing of them stays."""
+"""Thousands of sessions begin and end without leaving resources behind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from vlagents_ray.serve.launch.server import Server
 
 pytestmark = pytest.mark.integration
 
-# So many that a kilobyte or two of each shows; VLAGENTS_SESSIONS=N opens N by each transport
+# Numbers of sessions for which a leak of one or two kilobytes per session is visible.
+# VLAGENTS_SESSIONS=N opens N sessions with each transport.
 SESSIONS: dict[TransportName, int] = {
     "shm": 2400,
     "websocket": 600,
@@ -32,7 +33,7 @@ SESSIONS: dict[TransportName, int] = {
 }
 MIB = 2**20
 ROUNDS = 4
-# That may be left.
+# Resources that may remain.
 MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}
 
 
@@ -57,10 +58,11 @@ def open_and_close(server: Server, transport: TransportName) -> None:
         return held
 
     number = int(os.environ.get("VLAGENTS_SESSIONS", SESSIONS[transport]))
-    # Measuring the link takes the server's memory too, and the allocator settles.
+    # The measurement of the link also takes memory of the server, and the allocator needs time to
+    # settle.
     for _ in range(50):
         session("auto")
-    for _ in range(number // 10):  # pools fill
+    for _ in range(number // 10):  # the pools fill up
         session()
     before = session(count=True)
     gc.collect()
@@ -76,8 +78,8 @@ def open_and_close(server: Server, transport: TransportName) -> None:
     grown: dict[str, int] = {}
 
     def settled() -> bool:
-        """Whether what the last sessions held is given back; the server's threads do that in
-        their own time.
+        """Return whether the resources of the last sessions are released. The server's threads
+        release them with a delay.
         """
         now = session(count=True)
         grown.update({name: now[name] - before[name] for name in before})
@@ -91,9 +93,9 @@ def open_and_close(server: Server, transport: TransportName) -> None:
 
     with suppress(TimeoutError):
         wait_for(settled)
-    print(f"{transport}: {number} sessions: the growth {grown}; resident: {resident}")
+    print(f"{transport}: {number} sessions: growth {grown}; resident: {resident}")
     assert {name: grown[name] for name, limit in MOST.items() if grown[name] > limit} == {}
-    # What stays of each session grows in every round, an arena in one.
+    # A leak grows in every round, but an allocator's arena in only one.
     for sizes in zip(*resident, strict=True):
         assert min(b - a for a, b in itertools.pairwise(sizes)) < 4 * MIB / ROUNDS
         assert sizes[-1] - sizes[0] < 4 * 4 * MIB

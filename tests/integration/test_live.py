@@ -1,4 +1,4 @@
-"""The live page of a server with two replicas, through Ray Serve's own port."""
+"""The live page of a server with two replicas, through Ray Serve's port."""
 
 from __future__ import annotations
 

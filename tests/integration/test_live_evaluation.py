@@ -1,6 +1,7 @@
-"""`vlagents-ray eval` beside a page and a trainer that go on: `--live-at` and `--watch`.
+"""`vlagents-ray eval` with a live page, and with a trainer that is still running: `--live-at` and
+`--watch`.
 
-The page is there while the evaluation runs, with cases and sessions, and then gone.
+The page exists while the evaluation runs, with its cases and sessions, and disappears afterwards.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
 @contextmanager
 def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
-    """`eval` with these words and a page; it must end with status 0."""
+    """Run `eval` with these arguments and a page; it must end with status 0."""
     page = LivePage()
     with (
         log.open("w") as output,
@@ -44,7 +45,8 @@ def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
 
 
 def test_it_shows_cases_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
-    settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]  # the last episode waits for the test
+    # the last episode waits until the test opens the gate
+    settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]
     words = [word for setting in settings for word in ("--env-set", setting)]
     policy = [
         "--policy",
@@ -73,14 +75,14 @@ def test_it_shows_cases_sessions_and_failures_while_it_runs(ray_home: Path, tmp_
 
 
 def finished(out: Path) -> dict[str, int]:
-    """Episodes of each policy_id."""
+    """Return the number of finished episodes of each policy_id."""
     with suppress(ConfigError):
         return {case.policy_id: len(case.counted) for case in Results.load(out).cases}
     return {}
 
 
 def written(folder: Path, step: int, number: str, *, done: bool) -> None:
-    """A checkpoint as `served_agents.Stored` loads it."""
+    """Write a checkpoint for `served_agents.Stored`."""
     (folder / f"{step}").mkdir(exist_ok=True)
     (folder / f"{step}" / "number").write_text(number)
     if done:

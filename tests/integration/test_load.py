@@ -1,4 +1,6 @@
-"""Many clients at once: batches fill up, everybody gets an own answer, replicas follow the load."""
+"""Many clients at the same time: batches are full, each client gets its own answers, and the number
+of replicas follows the load.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ TRANSPORTS: list[TransportName] = ["shm", "websocket"]
 
 
 def play(url: str, transport: TransportName, client: int) -> list[int]:
-    """The sizes of the batches that one client's observations were in."""
+    """Return the sizes of the batches that contained one client's observations."""
     with RemoteAgent(url, transport=transport, connect_timeout_s=120) as agent:
         agent.reset(Obs({"front": np.zeros((8, 8, 3), np.uint8)}), f"client {client}")
         return [int(agent.act(Obs()).info["timing"]["batch_size"]) for _ in range(ACTS)]
@@ -36,8 +38,8 @@ def play(url: str, transport: TransportName, client: int) -> list[int]:
 
 @pytest.mark.slow
 def test_what_waits_while_a_batch_runs_is_the_next_batch(shared_ray: None) -> None:
-    """100 ms + 1 ms an observation, 24 clients. Serve's default of 5 requests at a time must not
-    cap the batch.
+    """A batch takes 100 ms plus 1 ms per observation, and there are 24 clients. Serve's default of
+    5 requests at a time must not limit the batch.
     """
     with serving(
         "noop", config={"base_ms": 100, "per_item_ms": 1}, batch={"max_size": 16}
@@ -53,7 +55,7 @@ def test_what_waits_while_a_batch_runs_is_the_next_batch(shared_ray: None) -> No
 
 
 def act_until(url: str, transport: TransportName, stop: threading.Event) -> int:
-    """Act until `stop`; returns how often. An error fails the test."""
+    """Act until `stop` is set, and return the number of acts. An error fails the test."""
     acts = 0
     with RemoteAgent(url, transport=transport, connect_timeout_s=120) as agent:
         agent.reset(Obs(), "load")
@@ -64,13 +66,13 @@ def act_until(url: str, transport: TransportName, stop: threading.Event) -> int:
 
 
 def replicas() -> int:
-    """Replicas that run."""
+    """Return the number of running replicas."""
     (app,) = serve.status().applications.values()
     return sum(d.replica_states.get("RUNNING", 0) for d in app.deployments.values())
 
 
 def gone() -> bool:
-    """Are even those that stop no more?"""
+    """Return whether all replicas have ended, including those that were stopping."""
     (app,) = serve.status().applications.values()
     return not any(
         number
@@ -82,7 +84,7 @@ def gone() -> bool:
 @pytest.mark.slow
 @pytest.mark.integration
 def test_a_burst_of_robots_is_in_time_again_after_the_start_of_a_replica(shared_ray: None) -> None:
-    """A replica is enough for ten of these robots, and 15 join the one that is there."""
+    """One replica serves ten of these robots; 15 more join the one that is already there."""
     scaling = {"max_replicas": 2, "downscale_delay_s": 5}
     plan = TracePlan(alone_s=5.0, burst_s=40.0, after_s=25.0, autoscaling=scaling)
     with shared_server(plan.served()) as server:
@@ -90,8 +92,8 @@ def test_a_burst_of_robots_is_in_time_again_after_the_start_of_a_replica(shared_
     assert (traced["failed"], traced["resumed"]) == ([], 0)
     most = [max(replicas) for _, *replicas in traced["replicas"]]
     assert max(most) == 2
-    assert traced["replicas"][-1][1:] == [1, 1], "the second one leaves after the burst"
-    # Reports, which come every 2 s and are confirmed once; and sessions, compared every 3 s.
+    assert traced["replicas"][-1][1:] == [1, 1], "the second replica stops after the burst"
+    # Load reports come every 2 s, and are confirmed once; sessions are compared every 3 s.
     assert traced["requested_s"] < 10
     assert traced["in_time_s"] < traced["running_s"] + 10
 

@@ -1,4 +1,4 @@
-"""What Prometheus would read of a server."""
+"""The metrics that Prometheus would read from a server."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def scraped() -> dict[str, float]:
-    """Our series of the server: name and tags, sorted, to value."""
+    """Return the server's metrics: name and sorted tags to value."""
     found = {}
     for one in scrape():
-        if one.tags["application"] != APP:  # which others served on this Ray before
+        if one.tags["application"] != APP:  # metrics of earlier tests on this Ray
             continue
         assert one.tags["policy"] == "noop"
         assert one.tags["deployment"] == "Policy"
@@ -76,8 +76,8 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         now: dict[str, float] = {}
 
         def complete() -> bool:
-            """All series together; each is exported by itself, and the load is that of the last
-            second.
+            """Return whether all metrics are present. Each is exported separately, and the load is
+            that of the last second.
             """
             now.clear()
             now.update(scraped())

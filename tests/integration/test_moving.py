@@ -1,4 +1,4 @@
-"""Sessions outlive their replica: moved when it stops, begun again when it is killed."""
+"""Sessions outlive their replica: they move when it stops, and begin again when it is killed."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from vlagents_ray.serve.launch.server import Server
 
 
 def deployed(replicas: int) -> Deployment:
-    """Two policies; `replicas` of the first, as `serve deploy` with another `num_replicas` would
-    have it.
+    """Return a deployment with two policies, the first with `replicas` replicas, as `serve deploy`
+    would see it with another `num_replicas`.
     """
     reacher = deployment("served_agents:Reacher", replicas=3).model_dump(exclude_unset=True)
     remembering = deployment("served_agents:Remembering", replicas=2).model_dump(exclude_unset=True)
@@ -46,8 +46,8 @@ def scale(replicas: int) -> None:
 
 
 def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
-    """Exactly where they were: three replicas become one under busy sessions and idle ones, on
-    every transport.
+    """Three replicas become one under busy and idle sessions, on every transport, and all sessions
+    keep their state.
     """
     scale(3)
     busy = {(t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3)}
@@ -59,7 +59,9 @@ def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
     pids: dict[tuple[str, int], int] = {}
 
     def spread() -> bool:
-        """On all replicas; one that does not tell its load at once gets no session meanwhile."""
+        """Return whether all replicas have sessions. A replica that does not report its load at
+        once gets no session for a while.
+        """
         for key, agent in agents.items():
             agent.close()
             pids[key] = agent.reset(obs(key[1]), f"{key}")["pid"]
@@ -93,7 +95,7 @@ def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
 
 
 def test_any_http_client_keeps_its_session_when_its_replica_stops(server: Server) -> None:
-    """Without a line about moving in the client: the session's id is enough."""
+    """The client needs no code for moves: the session's id is enough."""
     scale(3)
     names = [f"curl-{i}" for i in range(9)]
     image = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
@@ -114,7 +116,8 @@ def test_any_http_client_keeps_its_session_when_its_replica_stops(server: Server
     def replicas() -> int:
         return len({post("reset", name, {"instruction": name})["info"]["pid"] for name in names})
 
-    wait_for(lambda: replicas() > 1)  # the load balancer hears of new replicas a little later
+    # the load balancer is updated some time after a new replica has started
+    wait_for(lambda: replicas() > 1)
     for value in range(3):
         for name in names:
             assert post("act", name, {"info": {"value": value}})["action"][0] == value + 1

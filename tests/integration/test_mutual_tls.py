@@ -1,6 +1,4 @@
-"""Certificates of clients, and a cluster that Ray's own tools serve on; each wants a Ray of its
-own.
-"""
+"""Client certificates, and a cluster on which Ray's own tools serve. Each needs a separate Ray."""
 
 from __future__ import annotations
 
@@ -56,7 +54,7 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_wanted(tmp_path:
 
 
 def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None:
-    """As `serve deploy` of a file that says host 0.0.0.0 has it, where nobody else looks."""
+    """`serve deploy` of a file with host 0.0.0.0 performs no other check."""
     import ray
     from ray import serve
     from ray.serve._private.api import serve_start

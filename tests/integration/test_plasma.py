@@ -1,5 +1,5 @@
-"""Frames in plasma between env actors and a replica on their node: a real cluster with a small
-object store.
+"""Frames in plasma between environment actors and a replica on their node, on a real cluster with a
+small object store.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def obs():
 def test_a_ray_program_of_the_user_joins_the_server_and_its_actors_act_over_plasma(
     served: Server, tmp_path: Path
 ) -> None:
-    """Nothing but its own files, and no variable of the server's process."""
+    """The program has only its own files, and no variable of the server's process."""
     (tmp_path / "my_env.py").write_text(ENV_MODULE)
     script = tmp_path / "learner.py"
     script.write_text(LEARNER)
@@ -119,7 +119,7 @@ def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs
     )
     (tmp_path / "learner.py").write_text(UNCHANGED)
     [server] = [server for server in local_servers() if server.url == served.url]
-    # Others may run here, which "auto" may find first.
+    # Other clusters may run on this machine, which "auto" may find first.
     this = {"RAY_ADDRESS": server.ray_address, "RAY_AUTH_TOKEN_PATH": server.token_file}
     ran = of_the_user(
         tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line)
@@ -130,7 +130,7 @@ def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs
 def of_the_user(
     script: Path, *arguments: str, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run a script without a variable of the server's process."""
+    """Run a user's script without the variables of the server's process."""
     environment = {
         name: value for name, value in ENV.items() if not name.startswith("RAY_") and name != MARK
     }
@@ -154,7 +154,7 @@ def agent() -> Iterator[RemoteAgent]:
 
 @pytest.fixture
 def transport() -> Iterator[PlasmaTransport]:
-    """One that is closed even if its test fails."""
+    """Yield a transport that is closed even if its test fails."""
     with contextlib.closing(PlasmaTransport(APP)) as transport:
         yield transport
 
@@ -164,7 +164,7 @@ def frame(size: int = 8, pixel: int = 0, **info: Any) -> Obs:
 
 
 def objects() -> int:
-    """Objects in the node's store."""
+    """Return the number of objects in the node's store."""
     found = re.search(
         r"(\d+) objects",
         memory_summary(ray.get_runtime_context().gcs_address, stats_only=True).partition(
@@ -176,7 +176,7 @@ def objects() -> int:
 
 
 def held(agent: RemoteAgent) -> tuple[int, int]:
-    """Threads and descriptors of the replica."""
+    """Return the numbers of threads and descriptors of the replica."""
     info = agent.act(frame()).info
     return info["threads"], info["descriptors"]
 
@@ -216,7 +216,7 @@ def test_a_late_reply_is_discarded(transport: PlasmaTransport, tmp_path: Path) -
     assert transport.call([Request("reset", frame(), request_id="r")], 60)[0].error is None
     with pytest.raises(DeadlineExceeded):
         transport.call([Request("act", frame(pixel=1, gate=str(gate)), request_id="late")], 0.05)
-    with pytest.raises(DeadlineExceeded):  # its channel still holds the first
+    with pytest.raises(DeadlineExceeded):  # the channel still contains the first frame
         transport.call([Request("act", frame(pixel=2), request_id="too-soon")], 0.05)
     gate.touch()
     [reply] = transport.call([Request("act", frame(pixel=3), request_id="now")], 60)
@@ -233,11 +233,11 @@ def test_connections_leave_nothing(agent: RemoteAgent) -> None:
     before = objects(), held(agent)
     for _ in range(30):
         cycle()
-    # 30 would leave 30 or more. Two: what a process makes once, when it is first needed, such as
-    # the thread that listens while a batch of several sessions is slow.
+    # A leak would leave 30 or more. Two are resources that a process creates once when it first
+    # needs them, such as the thread that polls while a batch of several sessions is slow.
     wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
     wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
-    # Two at once, where one ended after the next began.
+    # Two channels exist at the same time if one client ends after the next has begun.
     wait_for(lambda: objects() <= before[0] + 1)
 
 
@@ -251,10 +251,10 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
             env.storm.remote()
             time.sleep(choose.uniform(0.05, 0.15))
         os.kill(pid, signal.SIGKILL)
-    # Six would leave six or more; Ray's own come and go.
+    # A leak would leave six or more. Ray's own threads and descriptors come and go.
     wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
     wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
-    # One is used again and again; of three killed in a storm hardly any is killed in the
+    # One channel is reused. Of three processes killed in a storm, hardly any is killed during the
     # microseconds of a write.
     wait_for(lambda: objects() <= before[0] + 2 + 2)
 
@@ -262,7 +262,7 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
 def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_else(
     agent: RemoteAgent,
 ) -> None:
-    env = EnvActor.remote(APP, size=600)  # for a size of channel that no other test uses
+    env = EnvActor.remote(APP, size=600)  # a channel size that no other test uses
     ray.get(env.open.remote())
     lost = ray.get(env.channel.remote())
     with pytest.raises(ray.exceptions.RayActorError):
@@ -320,24 +320,26 @@ def test_auto_goes_on_by_the_handle_where_the_store_has_no_room_for_a_channel(
     monkeypatch.setattr("vlagents_ray.client.transports.select.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(first), "x")
-        act = other.act(frame(3600, pixel=6))  # 39 MB, so a channel of 64 MB
+        act = other.act(frame(3600, pixel=6))  # 39 MB, so the channel has 64 MB
         assert other.transport == "handle"
         assert (act.action.tolist(), act.info["instruction"]) == ([6], "x")
         assert act.info.get("resumed", False) is (first == 8)
 
 
 def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
-    """The last test: it replaces the replica."""
+    """This is the last test, since it replaces the replica."""
     agent = RemoteAgent(f"serve://{APP}", transport="plasma", resume=False)
     pid = agent.reset(frame(), "before")["pid"]
     folder = Path(global_worker.node.plasma_store_socket_name).parent
     names, channel = set(folder.glob("vla*")), agent._connection.transport._channel.hex()
-    gc.disable()  # what the loss's traceback keeps would stay: nothing of the channel may be in it
+    # without garbage collection, a leftover traceback of the loss would keep its objects; the
+    # channel must not be among them
+    gc.disable()
     os.kill(pid, signal.SIGKILL)
     begun = time.monotonic()
     with pytest.raises(ConnectionLost):
         agent.act(frame())
-    assert time.monotonic() - begun < 25, "only after its time limit"
+    assert time.monotonic() - begun < 25, "the loss was noticed only after the time limit"
 
     def again() -> bool:
         try:
@@ -349,7 +351,7 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     assert agent.act(frame()).info["instruction"] == "after"
     left = set(folder.glob("vla*"))
     assert (len(names), len(left)) == (1, 1)
-    assert len(names - left) == 1  # that of the killed replica
+    assert len(names - left) == 1  # the socket of the killed replica
     wait_for(lambda: channel not in memory_summary(ray.get_runtime_context().gcs_address))
     gc.enable()
     agent.close()

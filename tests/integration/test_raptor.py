@@ -1,4 +1,4 @@
-"""examples/raptor on real servers: sessions whose state nothing else can replace."""
+"""examples/raptor on real servers: sessions whose state cannot be recomputed."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def client(server: Server, transport: TransportName, **options: Any) -> RemoteAg
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_each_transport_carries_the_reference(server: Server, transport: TransportName) -> None:
-    # tests/policies/test_raptor.py tests all of them in one process.
+    # tests/policies/test_raptor.py tests all sequences in one process.
     inputs, wanted = (rows[:150] for rows in reference())
     agents = [client(server, transport) for _ in range(2)]
     for agent in agents:
@@ -100,7 +100,9 @@ def test_served_flights_are_those_in_process_to_the_bit(server: Server) -> None:
 @pytest.mark.integration
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_killed_replica_costs_no_flight(server: Server, transport: TransportName) -> None:
-    """The client says that the session began again, and it acts as the reference does."""
+    """The client reports that the session began again, and its actions equal those of the
+    reference.
+    """
     scale(2)
     inputs, wanted = reference()
     with client(server, transport) as agent:

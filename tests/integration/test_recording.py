@@ -1,4 +1,4 @@
-"""What a server records of sessions of every transport, and what is left of it when a replica is
+"""Recordings of sessions over all transports, and the recordings that remain after a replica is
 killed.
 """
 
@@ -88,13 +88,11 @@ def test_a_killed_replica_loses_its_running_episodes_and_no_others(
     before = saved(folder)
     with RemoteAgent(server.url) as agent:
         play(agent, 1)
-        pid, _ = play(agent, 2)  # which completes the first
+        pid, _ = play(agent, 2)  # this completes the recording of the first session
         wait_for(lambda: saved(folder) == before + 1)
         os.kill(pid, signal.SIGKILL)
         until = time.monotonic() + 60
         while agent.act(seen(7)).info["pid"] == pid and time.monotonic() < until:
             time.sleep(0.1)
     wait_for(lambda: saved(folder) == before + 2, timeout_s=30)
-    assert len(list(folder.glob("*/meta/info.json"))) == 2, (
-        "the new replica has a dataset of its own"
-    )
+    assert len(list(folder.glob("*/meta/info.json"))) == 2, "the new replica has a separate dataset"

@@ -1,4 +1,4 @@
-"""Several replicas: a session stays on one, whichever transport carries it."""
+"""Several replicas: a session stays on one replica, on any transport."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def opened(agents: list[RemoteAgent]) -> list[int]:
-    """Reset each; returns the process id of each one's replica."""
+    """Reset each session, and return the process id of each session's replica."""
     return [agent.reset(obs(i), f"task {i}")["pid"] for i, agent in enumerate(agents)]
 
 
 def spread(agents: list[RemoteAgent], evenly: bool = False) -> list[int]:
-    """Reset each until they are on all three replicas, those that have replaced killed ones too;
-    returns as `opened`.
+    """Reset the sessions until all three replicas, including replacements of killed ones, have
+    some; return the same as `opened`.
 
-    Sessions that are spread `evenly` stay where they are: the replicas leave such a balance as it
-    is.
+    Sessions that are distributed `evenly` stay at their replicas, since the replicas do not change
+    such a balance.
     """
     pids: list[int] = []
 
@@ -62,7 +62,7 @@ def check(agents: list[RemoteAgent], pids: list[int], steps: int) -> None:
 
 
 def test_http_sessions_stay_on_their_replica(server: Server) -> None:
-    # Hashes of so many leave no replica out.
+    # With so many sessions, the hashes reach each replica.
     agents = [RemoteAgent(server.url, transport="http") for _ in range(30)]
     check(agents, spread(agents), 20)
     for agent in agents:

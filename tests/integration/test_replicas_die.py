@@ -1,5 +1,5 @@
-"""Replicas are killed and frozen at random under sessions of every transport, and each session's
-history is right.
+"""Replicas are killed and frozen at random under sessions of every transport, and the history of
+each session stays correct.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent, 
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
-# At the least; more, until sessions of every transport were hit. With VLAGENTS_KILLS=12
-# VLAGENTS_FREEZES=4 and nothing else on the machine, what is promised of times is looked at.
+# The least number of each fault; more follow until sessions of every transport were affected. With
+# VLAGENTS_KILLS=12 VLAGENTS_FREEZES=4 and an otherwise idle machine, the test also checks the
+# promised times.
 LEAST = {
     signal.SIGKILL: int(os.environ.get("VLAGENTS_KILLS", "1")),
     signal.SIGSTOP: int(os.environ.get("VLAGENTS_FREEZES", "1")),
 }
-# Serve itself notices a frozen replica after 65 s.
+# Serve itself notices a frozen replica only after 65 s.
 WAIT_S = 60 if "VLAGENTS_KILLS" in os.environ else 240
 TIMEOUT_S = float(os.environ.get("VLAGENTS_TIMEOUT_S", "2"))
 SEED = int(os.environ.get("VLAGENTS_SEED", "14"))
 TRANSPORTS: list[TransportName] = ["shm", "websocket", "http", "handle", "plasma"]
 SESSIONS, REPLICAS = 32, 3
-EPISODE = 50  # acts
+EPISODE = 50  # number of acts
 FRAME = np.zeros((8, 8, 3), np.uint8)
 
 
 @dataclass
 class Call:
-    """One act of a session, as its client saw it."""
+    """One act of a session, from the client's view."""
 
     episode: str
     number: int
@@ -54,7 +55,7 @@ class Call:
 
 @dataclass
 class Player:
-    """A session that acts until it is told to stop."""
+    """A session that acts until it is stopped."""
 
     agent: RemoteAgent
     name: str
@@ -98,7 +99,7 @@ class Player:
         return Obs({"front": FRAME}, info={"episode": episode, "number": number})
 
     def acted_since(self, moment: float) -> bool:
-        """Is there an answer to a call that began after that, or to one that it cut off?"""
+        """Return whether there is an answer to a call that ended after `moment`."""
         if self.broken is not None:
             raise self.broken
         return any(
@@ -165,7 +166,7 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(
             f"{took[fault][-1]:.2f} s"
         )
         if fault is signal.SIGSTOP:
-            time.sleep(2)  # what it held is too late now
+            time.sleep(2)  # the requests of the frozen replica are late now
             with suppress(ProcessLookupError):  # Serve may have replaced it
                 os.kill(pid, signal.SIGCONT)
     time.sleep(3)
@@ -182,16 +183,16 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(
 
 
 def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float]) -> None:
-    """What the clients saw and what the replicas did, held against each other.
+    """Compare the answers that clients received with the acts that replicas executed.
 
-    `frozen` are the times at which replicas were: each may have taken a batch just before, and
-    executes it when it continues.
+    `frozen` has the time at which each replica was frozen. The replica may have taken a batch just
+    before, and executes it when it continues.
     """
     begun: dict[tuple[str, int], list[tuple[float, int]]] = {}
     for file in ledger.iterdir():
         for line in file.read_text().splitlines():
             at, episode, seen, number = line.split()
-            assert episode == seen, "crossed, or of an older episode"
+            assert episode == seen, "mixed up with another session, or from an older episode"
             begun.setdefault((seen, int(number)), []).append((int(at) / 1e9, int(file.name)))
     outcomes: Counter[str] = Counter()
     for player in players:
@@ -200,11 +201,11 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
             executed = begun.pop((call.episode, call.number), [])
             here = f"{call} after {last}, executed {executed}"
             assert len({pid for _, pid in executed}) == len(executed), (
-                f"one replica executed it twice: {here}"
+                f"one replica executed an act twice: {here}"
             )
             late = [pid for at, pid in executed if at > call.ended]
             assert all(call.begun < frozen.get(pid, 0.0) for pid in late), (
-                f"executed after its caller had an answer: {here}"
+                f"executed after its client had an answer: {here}"
             )
             if call.info is None:
                 outcomes[type(call.error).__name__] += 1
@@ -213,17 +214,17 @@ def check_histories(players: list[Player], ledger: Path, frozen: dict[int, float
             assert (call.info["episode"], call.info["number"]) == (call.episode, call.number), (
                 f"another's: {here}"
             )
-            assert executed, f"answered, though nobody executed it: {here}"
+            assert executed, f"answered, but never executed: {here}"
             if "resumed" in call.info:
                 outcomes["resumed"] += 1
             else:
                 assert len(executed) == 1, f"doubled: {here}"
                 if last is not None and last.info is not None and last.episode == call.episode:
-                    # what failed in between may have been executed, where its caller does not know
+                    # failed calls in between may have been executed without an answer
                     assert (
                         1 <= call.info["acts"] - last.info["acts"] <= call.number - last.number
                     ), f"lost: {here}"
             last = call
     print(f"{len(players)} sessions: {dict(outcomes)}")
-    assert not begun, "executed, though nobody asked"
+    assert not begun, "executed without a request"
     assert outcomes["answered"] > 100 * len(players)

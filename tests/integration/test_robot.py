@@ -1,4 +1,4 @@
-"""A control loop against a slow server, which is also killed and restarted under it."""
+"""A control loop with a slow server, which is also killed and restarted while the loop runs."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 HZ = 50.0
 ROWS = 50
 PATIENCE_S = 300.0
-ATTEMPTS = 5  # attempts of what a machine that stands still for a second spoils
+# number of attempts at a measurement that a pause of the machine for a second can spoil
+ATTEMPTS = 5
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 
 class Counter:
-    """A robot that sees the number of the tick."""
+    """A robot whose observation is the number of the tick."""
 
     def __init__(self) -> None:
-        self.tick = -2  # the loop shows a reset what comes before its first tick
+        self.tick = -2  # the loop passes observations to the reset before its first tick
 
     def observe(self) -> Obs:
         self.tick += 1
@@ -52,12 +53,12 @@ class Counter:
 
 
 class Witness(Agent):
-    """Keeps what a player returned, and checks that nothing stale is among it."""
+    """Stores the actions that a player returned, and checks that no stale one is among them."""
 
     def __init__(self, player: ChunkPlayer, robot: Counter) -> None:
         self.player, self.robot = player, robot
         self.acts: list[Act] = []
-        self.executed = {0: 0}  # actions of the policy before each tick
+        self.executed = {0: 0}  # number of the policy's actions before each tick
         self.longest_s = 0.0
 
     @property
@@ -74,16 +75,19 @@ class Witness(Agent):
         executed = self.executed[self.robot.tick] = sum("safe" not in one.info for one in self.acts)
         self.acts.append(act)
         if "safe" in act.info:
-            assert act.action.tolist() == self.acts[-2].action.tolist()  # hold
+            # the robot holds its position
+            assert act.action.tolist() == self.acts[-2].action.tolist()
         else:
             asked, row = act.action.tolist()
             assert row == min(executed - self.executed[asked], ROWS - 1), (
-                "an action for another place"
+                "an action for another tick"
             )
         return act
 
     def good_since(self, tick: int) -> int:
-        """Actions of the policy made from what was seen after `tick`."""
+        """Return the number of the policy's actions that were computed from observations after
+        `tick`.
+        """
         return sum("safe" not in act.info and act.action[0] > tick for act in self.acts)
 
 
@@ -96,7 +100,7 @@ def address() -> str:
 def server(
     address: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[contextlib.ExitStack]:
-    """The context in which the server at `address` runs; closing it stops the server."""
+    """Return the context in which the server at `address` runs; closing it stops the server."""
     with contextlib.ExitStack() as running:
         running.enter_context(
             serving("served_agents:Ticking", tmp_path_factory.mktemp("log") / "log", address)
@@ -113,8 +117,8 @@ def witness(address: str, transport: TransportName) -> Iterator[Witness]:
 
 
 def empty_loop() -> dict[str, float]:
-    """The jitter of two seconds of a loop that does nothing, as the best that this machine can
-    do.
+    """Return the jitter of an empty loop of two seconds, as the best possible value on this
+    machine.
     """
     with undisturbed():
         pacer = Pacer(HZ)
@@ -172,9 +176,9 @@ def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_els
             options=LoopOptions(restart="auto"),
         )
         assert next(script, True), f"no resumption: {report}"
-    # Both times, the server was gone for longer than a chunk lasts.
+    # In both cases the server was down for longer than a chunk lasts.
     assert report.safe_ticks > 2 * ROWS
-    assert seen.longest_s < 5.0, "a tick waited for the server, whose restart takes longer"
+    assert seen.longest_s < 5.0, "a tick waited for the server's restart"
     assert barks
 
 
@@ -185,7 +189,9 @@ def _disasters(
     address: str,
     folder: Path,
 ) -> Iterator[bool]:
-    """What happens, tick by tick, each once the robot has been driven for a while."""
+    """Run the disasters one after the other, tick by tick, each after the policy has driven the
+    robot for a while.
+    """
     yield False
     while seen.good_since(0) < ROWS:
         yield False

@@ -1,4 +1,4 @@
-"""Sessions over every transport, on one replica and on several."""
+"""Sessions over all transports, on one replica and on several."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TRANSPORTS: list[TransportName] = ["shm", "plasma", "websocket", "http", "handle
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None) -> Iterator[Server]:
-    """One replica of a policy written as in the paper."""
+    """Serve one replica of a policy that is written like in the paper."""
     with serving("served_agents:Reacher", config={"scale": 2.0}, batch={"max_size": 8}) as server:
         yield server
 

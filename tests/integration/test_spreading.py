@@ -1,5 +1,5 @@
-"""Sessions spread over the replicas again when some have ended, or a replica has joined, by every
-route by which a client reaches a replica.
+"""Sessions are distributed again when some have ended, or when a replica has joined, on every route
+from a client to a replica.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from vlagents_ray.serve.launch.server import Server
 APP = "Located"
 SESSIONS = 12
 EVERY_S = 0.25
-SPREAD_S = 40.0  # comparisons are 3 s apart, and two in a row decide
+SPREAD_S = 40.0  # comparisons are 3 s apart, and a move needs two in a row
 
 
 def deployed(replicas: int) -> Deployment:
-    """Return the policy with that many replicas, as `serve deploy` has it after a change."""
+    """Return the policy with that many replicas, like `serve deploy` sees it after a change."""
     document = deployment(f"served_agents:{APP}").model_dump(exclude_unset=True)
     document["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
     return Deployment(applications=document["applications"])
@@ -49,7 +49,7 @@ def scale(replicas: int) -> None:
 
 
 class Client:
-    """A session of our client, which checks that no act is lost or repeated."""
+    """A session of this package's client, which checks that no act is lost or repeated."""
 
     def __init__(self, server: Server, transport: TransportName) -> None:
         url = f"serve://{APP}" if transport == "handle" else server.url
@@ -66,7 +66,7 @@ class Client:
 
 
 class JsonClient:
-    """A session of a client that knows HTTP and JSON alone."""
+    """A session of a client that supports only HTTP and JSON."""
 
     def __init__(self, server: Server, name: str, *, follows_links: bool) -> None:
         """Begin a session.
@@ -111,7 +111,7 @@ class JsonClient:
 
 
 def held(clients: Sequence[Client | JsonClient]) -> Counter[int]:
-    """Act once in each session; return the number of sessions by replica."""
+    """Act once in each session, and return the number of sessions by replica."""
     for client in clients:
         client.act()
     return Counter(client.replica for client in clients)
@@ -121,7 +121,7 @@ def held(clients: Sequence[Client | JsonClient]) -> Counter[int]:
 def test_a_replica_with_too_many_sessions_gives_some_away(
     server: Server, reach: Callable[[str], TransportName], route: str
 ) -> None:
-    """Sessions by HTTP stayed where they were."""
+    """In an earlier version, HTTP sessions stayed at their replica."""
     transport = reach(route)
     with ExitStack() as stack:
         clients = [Client(server, transport) for _ in range(SESSIONS)]
@@ -144,7 +144,9 @@ def test_a_replica_with_too_many_sessions_gives_some_away(
 
 
 def test_sessions_whose_answers_are_json_spread_when_a_replica_joins(server: Server) -> None:
-    """The proxy's hash gives the new replica its share, also of those that use own ports."""
+    """The proxy's hash gives the new replica its share of the sessions, including those that use
+    own ports.
+    """
     scale(1)
     clients = {
         follows_links: [

@@ -1,4 +1,4 @@
-"""Starting, loading, failing and stopping servers."""
+"""Servers that start, load, fail and stop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from vlagents_ray.serve.ports import free_port
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
-INTERRUPTED = 130  # before it serves; 0 from then on
+INTERRUPTED = 130  # exit status before the server serves; later it is 0
 
 
 def health(url: str) -> int | None:
@@ -49,7 +49,7 @@ def health(url: str) -> int | None:
 
 @contextmanager
 def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess.Popen[str]]:
-    """`vlagents-ray …` as a user runs it; every process it started must be gone afterwards."""
+    """Run `vlagents-ray …` like a user; each process that it started must have ended afterwards."""
     process = subprocess.Popen(
         [*COMMAND, *words],
         stdout=subprocess.PIPE,
@@ -78,7 +78,7 @@ def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess
 
 
 def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:
-    """openpi's client, for one, waits only while its connection is refused."""
+    """openpi's client, for example, waits only while its connection is refused."""
     gate, port = tmp_path / "gate", free_port()
     url = f"http://127.0.0.1:{port}"
     answers: list[Any] = []
@@ -102,13 +102,16 @@ def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_p
         thread.join(120)
         first, info = answers
         assert first == "refused"
-        assert info["weights"].startswith("sampled-sha256:")  # of the file that a setting names
+        # the digest of the file that a setting names
+        assert info["weights"].startswith("sampled-sha256:")
         assert health(url) == 200
 
 
 @dataclass(frozen=True)
 class Started:
-    """A server by command, of actions with so many numbers; of vlagents' robots, too, at a port."""
+    """A server started by command, whose actions have `action_dim` numbers. `robots` is its port
+    for vlagents' clients, if any.
+    """
 
     process: subprocess.Popen[str]
     url: str
@@ -118,14 +121,14 @@ class Started:
 
 @pytest.fixture(scope="module")
 def two_servers() -> Iterator[list[Started]]:
-    """Two on this machine, which serve."""
+    """Yield two running servers on this machine."""
     ports, robots = [free_port(), free_port()], free_port()
     options = [
         ["--set", "action_dim=3", "--vlagents-port", str(robots)],
         ["--set", "action_dim=5", "--serve-set", "batch.max_size=2"],
     ]
     with contextlib.ExitStack() as stack:
-        # Ray may warn of a replica on a busy machine, truly; see test_start_and_stop.py.
+        # On a busy machine Ray may rightly warn of a slow replica; see test_start_and_stop.py.
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         patch.setenv("RAY_SERVE_QUEUE_LENGTH_RESPONSE_DEADLINE_S", "60")
         processes = [
@@ -164,21 +167,21 @@ def test_two_servers_on_one_machine_do_not_meet(two_servers: list[Started]) -> N
 def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds_and_in_silence(
     number: int, whole: signal.Signals, two_servers: list[Started]
 ) -> None:
-    """systemd sends SIGTERM to all of a service's processes; Ray's head then ends before Serve can.
+    """systemd sends SIGTERM to all processes of a service. Then Ray's head may end before Serve.
 
-    tests/cli/test_start_and_stop.py sends it to the command alone.
+    tests/cli/test_start_and_stop.py sends the signal only to the command.
     """
     server, other = two_servers[number], two_servers[1 - number]
     process = server.process
     family = psutil.Process(process.pid).children(recursive=True)
     for one in [psutil.Process(process.pid), *family]:
-        # Some end on their own, or with those before them.
+        # Some processes end on their own, or together with earlier ones.
         with suppress(ProcessLookupError, psutil.NoSuchProcess):
             if whole == signal.SIGTERM or os.getpgid(one.pid) == process.pid:
                 one.send_signal(whole)
     begun = time.monotonic()
     assert process.wait(60) == 0
-    assert time.monotonic() - begun < 15  # 3 s where nothing else runs; it was 36 s
+    assert time.monotonic() - begun < 15  # 3 s on an idle machine; an earlier version took 36 s
     assert not psutil.wait_procs(family, timeout=10)[1]
     assert process.stdout is not None
     assert process.stdout.read() == ""
@@ -203,7 +206,7 @@ def test_a_taken_port_is_said_at_once() -> None:
 
 @pytest.mark.integration
 def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
-    """Ray's own tools, on a cluster that Ray's own tools started."""
+    """Ray's own tools deploy the file on a cluster that they started."""
     serve_port, dashboard, gcs, robots = free_port(), free_port(), free_port(), free_port()
     text = (ROOT / "deployments" / "scripted.yaml").read_text()
     file = tmp_path / "scripted.yaml"
@@ -250,8 +253,8 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
             f"http://127.0.0.1:{dashboard}",
             str(file),
         )
-        # The dashboard comes a while after `ray start` has ended; a try of `serve deploy` takes
-        # seconds.
+        # The dashboard starts some time after `ray start` has ended. Each attempt of `serve deploy`
+        # takes seconds.
         wait_for(
             lambda: _answer(f"http://127.0.0.1:{dashboard}/api/serve/applications/")[0] != 0, 120
         )
@@ -291,7 +294,7 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
 
 
 def _status(dashboard: int, app: str) -> tuple[str, str]:
-    """What `serve status` says of an application, and why."""
+    """Return the status of an application in `serve status`, and its reason."""
     with urllib.request.urlopen(
         f"http://127.0.0.1:{dashboard}/api/serve/applications/", timeout=30
     ) as answer:
@@ -315,7 +318,7 @@ def _answer(url: str) -> tuple[int, Mapping[str, str]]:
 
 
 def _name_at(port: int) -> str | None:
-    """What the vlagents endpoint on that port calls the policy."""
+    """Return the name of the policy at the vlagents endpoint on that port."""
     try:
         with Client(port) as client:
             client.send(call("name"))

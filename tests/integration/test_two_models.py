@@ -1,4 +1,4 @@
-"""examples/two_models on real servers: one robot, a planner and a policy, and what happens when
+"""examples/two_models on real servers: one robot with a planner and a policy, and the effect when
 one of them is down.
 """
 
@@ -65,8 +65,8 @@ def test_a_planner_that_ends_leaves_the_policy_its_subtask_and_then_the_robot_ho
     report = drive_until_down(server, "planner", max_age_s=3.0)
     assert report.reasons["robot"].startswith("planner: expected a subtask of at most 3 s")
     held = report.safe["robot"]
-    assert held >= 20, "from 3 s after the planner's last answer on"
-    # Until then the policy went on with the last subtask, for about 3 + 3 s of the 12.
+    assert held >= 20, "the robot holds from 3 s after the planner's last answer"
+    # Until then the policy continued with the last subtask, for about 3 + 3 s of the 12 s.
     assert report.jitter["ticks"] - report.safe_ticks >= 40
     assert "lost" not in report.safe, "the policy's server answered all the time"
 

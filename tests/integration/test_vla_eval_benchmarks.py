@@ -21,7 +21,7 @@ EPISODES, STEPS = 2, 7
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """An application for each benchmark, whose policy returns chunks of three rows."""
+    """Serve an application for each benchmark, whose policy returns chunks of three rows."""
     apps = []
     for name in BENCHMARKS:
         args = {
@@ -43,8 +43,8 @@ def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def test_a_benchmark_of_vla_eval_gets_the_actions_for_its_observations(
     server: Server, benchmark: str
 ) -> None:
-    """Two shards at once; each action is the row for its step, also where an observation between
-    two chunks has no image.
+    """Two shards run at the same time. Each action is the row for its step, even if an observation
+    between two chunks has no image.
     """
     url = server.url.replace("http://", "ws://") + f"/{benchmark}/vla-eval"
     shards = drive(Path(peers_python()), f"{benchmark}_run", url, 2, EPISODES)

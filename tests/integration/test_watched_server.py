@@ -1,4 +1,4 @@
-"""What a server writes for those who watch it: traces for OpenTelemetry."""
+"""The monitoring data of a server: traces for OpenTelemetry."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ACTS = 5
 
 
 class Collector(ThreadingHTTPServer):
-    """An OpenTelemetry collector that keeps all spans."""
+    """An OpenTelemetry collector that stores all spans."""
 
     spans: list[Span]
 
@@ -54,7 +54,7 @@ def collector() -> Iterator[Collector]:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, collector: Collector) -> Iterator[Server]:
-    """A server whose replica and whose clients in this process export their traces."""
+    """Run a server whose replica, and whose clients in this process, export their traces."""
     variables = {
         "VLAGENTS_RAY_OTEL": "1",
         "OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{collector.server_port}",
@@ -78,7 +78,7 @@ def act(url: str, transport: TransportName) -> None:
 
 
 def batches_of_acts(collector: Collector) -> list[Span]:
-    """The spans of batches whose acts have arrived, too."""
+    """Return the spans of batches whose acts have also arrived."""
     acts = {one.span_id for one in collector.spans if one.name == "vlagents act"}
     return [one for one in collector.spans if one.name == "batch" and one.parent_span_id in acts]
 
@@ -105,6 +105,6 @@ def test_client_and_replica_export_one_trace_of_each_request(
         assert batch.trace_id == served.trace_id == sent.trace_id
         about = {one.key: one.value.string_value for one in sent.attributes}
         assert about["transport"] == transport
-        # One machine has one clock.
+        # Both processes use the clock of the same machine.
         assert sent.start_time_unix_nano <= batch.start_time_unix_nano < batch.end_time_unix_nano
     assert len({one.trace_id for one in batches}) == ACTS

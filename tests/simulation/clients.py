@@ -1,4 +1,6 @@
-"""Robots of the simulation: what each asked, what it was told, and whether that can be true."""
+"""Robots of the simulation: their requests, the answers, and checks whether these answers are
+possible.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +15,21 @@ _UNCERTAIN = ("silence", "outcome_unknown", "connection_lost")
 _NOT_DONE = ("deadline_exceeded", "unavailable")
 
 
-PATIENCE_S = 4.5  # more than a request, and some messages between replicas, take on their way
+PATIENCE_S = 4.5  # longer than a request and some messages between replicas take
 
 
 class Violation(AssertionError):
-    """What must not happen."""
+    """A result that must not happen."""
 
 
 class Robot:
-    """One session, for a few episodes. With `steps` it sends back the step of the last answer.
+    """One session with a few episodes. With `steps` it sends the step of the last answer in each
+    request.
 
     Without `steps` and with `gives_up` it sends no deadline, and begins its next episode when an
-    answer does not come: over HTTP after longer than a message between replicas takes, or over a
-    connection at once. Either way it closes the connection, to connect again elsewhere, and each
-    act belongs to the episode in which it was sent.
+    answer does not arrive. Over HTTP it waits for longer than a message between replicas takes;
+    over a connection it begins at once. In both cases it closes the connection and connects to
+    another replica, and each act belongs to the episode in which it was sent.
     """
 
     def __init__(self, world: World, number: int) -> None:
@@ -34,22 +37,23 @@ class Robot:
         self.name = f"robot{number}"
         draw = world.draw
         self.steps = draw.random() < 0.6
-        self.timed = draw.random() < 0.5  # over HTTP; else as over a connection
+        self.timed = draw.random() < 0.5  # whether it uses HTTP; otherwise it uses a connection
         self.gives_up = not self.steps and draw.random() < 0.6
         self.link = world.connect() if self.gives_up and not self.timed else None
-        # A fault may hold an HTTP request back until later ones have been executed elsewhere.
+        # A fault may delay an HTTP request until later requests have been executed at another
+        # replica.
         self.strict = self.link is not None or (self.gives_up and not world.plan.rough)
         self.history: list[str] = []
-        # Acts whose answer says that they were not executed, and never will be.
+        # Acts whose answer says that they were not and will never be executed.
         self.refused: list[str] = []
         self.done: list[str] = []  # acts that were answered with an action
         self.over = False
-        self.uncertain: set[str] = set()  # acts and resets of which it does not know what became
+        self.uncertain: set[str] = set()  # acts and resets with an unknown outcome
         self._step: int | None = None
         self._asked = 0
 
     async def run(self) -> None:
-        """Until its episodes are over, or the world is."""
+        """Run until its episodes or the world have ended."""
         draw = self.world.draw
         for episode in range(draw.randint(1, 3)):
             await asyncio.sleep(draw.random() * 0.5)
@@ -68,10 +72,10 @@ class Robot:
                 self.uncertain.add(instruction)
             self._reconnect(reply)
             await asyncio.sleep(0.1)
-        # An answer to a reset does not wait for the slowest of messages to the other replicas.
+        # The answer to a reset does not wait for the slowest messages to the other replicas.
         if self.gives_up:
             await asyncio.sleep(max(0.0, self.world.plan.latest_s - session_migration._OTHERS_S))
-        acted: list[str] = []  # that it was told of
+        acted: list[str] = []  # acts with an answer
         for _ in range(draw.randint(2, 6)):
             await asyncio.sleep(draw.random() * (3.0 if self.gives_up else 0.4))
             self._asked += 1
@@ -88,23 +92,24 @@ class Robot:
             elif outcome in _UNCERTAIN:
                 self.uncertain.add(name)
                 if self.steps or self.gives_up:
-                    return  # where it is now is not known: another episode
+                    # the state of the session is unknown, so the robot begins another episode
+                    return
             else:
                 if not self.world.plan.rough and not self._excuses():
                     raise Violation(
-                        f"{name}: {outcome} ({reply and reply.error}), though nothing was lost: a "
-                        "session was"
+                        f"{name}: {outcome} ({reply and reply.error}), although no fault "
+                        "occurred: a session was lost"
                     )
                 return
 
     def _excuses(self) -> set[str]:
-        """Requests that may come late and end its episode: over connections that it has closed,
-        only resets.
+        """Return the requests that may arrive late and end the episode. Over connections that the
+        robot has closed, only resets may.
         """
         return {name for name in self.uncertain if self.link is None or "/" in name}
 
     def _reconnect(self, reply: Reply | None) -> None:
-        """Elsewhere, if the connection is silent, or its replica stops."""
+        """Connect to another replica if the connection is silent or its replica stops."""
         if self.link is not None and (
             reply is None or reply.draining or code(reply) == "unavailable"
         ):
@@ -114,14 +119,16 @@ class Robot:
     def _check(self, reply: Reply, instruction: str, expected: list[str]) -> None:
         obeyed, ids = reply.act.info["obeys"], reply.act.info["ids"]
         if not obeyed.startswith(self.name + "/"):
-            raise Violation(f"{expected[-1]}: crossed with another session, it obeys {obeyed}")
+            raise Violation(
+                f"{expected[-1]}: mixed up with another session, whose instruction is {obeyed}"
+            )
         if not (self.steps or self.strict) and (self.uncertain or self.world.plan.rough):
-            # What it gave up may come late, and what a fault left behind may be met: steps are for
-            # that.
+            # An abandoned request may arrive late, and a replica may have an old state after a
+            # fault. Only steps prevent these cases.
             return
         if obeyed != instruction:
             raise Violation(
-                f"{expected[-1]}: of an older episode, it obeys {obeyed}, not {instruction}"
+                f"{expected[-1]}: from an older episode: instruction {obeyed}, not {instruction}"
             )
         if [one for one in ids if one not in self.uncertain] != expected:
             raise Violation(
@@ -130,7 +137,7 @@ class Robot:
             )
 
     async def _ask(self, op: str, instruction: str, name: str | None) -> Reply | None:
-        """The answer, if it comes in time."""
+        """Return the answer if it arrives in time."""
         draw = self.world.draw
         deadline_s = None if self.gives_up else draw.choice([0.05, 0.5, 3.0, None])
         answer = self.world.send(
@@ -138,7 +145,7 @@ class Robot:
             self.name,
             Obs(info={"id": name, "of": instruction if self.strict else None}),
             link=self.link,
-            # Without a step, only the clocks say which of two replicas has the newer episode.
+            # Without a step, only the clocks determine which of two replicas has the newer episode.
             steady=not (self.steps or (self.gives_up and self.world.clocks_agree)),
             timed=self.timed,
             instruction=instruction if op == "reset" else None,
@@ -163,7 +170,7 @@ class Robot:
 
 
 def play(world: World) -> list[Robot]:
-    """Run a world with its robots to the end; `Violation` if a history cannot be."""
+    """Run a world with its robots to the end; raise `Violation` if a history is impossible."""
     robots = [Robot(world, number) for number in range(world.draw.randint(2, 3))]
     tasks = [world.outside.create_task(robot.run()) for robot in robots]
     try:
@@ -182,7 +189,7 @@ def play(world: World) -> list[Robot]:
         for robot in robots:
             if late := executed.intersection(robot.refused):
                 raise Violation(
-                    f"executed, though answered with that they never would be: {sorted(late)}"
+                    f"executed, although the answer said that they never would be: {sorted(late)}"
                 )
             if unheard := set(robot.done) - executed:
                 raise Violation(f"answered, but never executed: {sorted(unheard)}")
@@ -190,7 +197,9 @@ def play(world: World) -> list[Robot]:
             if sent_in is not None and sent_in != obeyed:
                 raise Violation(f"{name}: sent in episode {sent_in}, executed in {obeyed}")
             if name.partition(".")[0] != obeyed.partition("/")[0]:
-                raise Violation(f"{name}: crossed with another session, it obeyed {obeyed}")
+                raise Violation(
+                    f"{name}: mixed up with another session, whose instruction was {obeyed}"
+                )
     finally:
         world.close()
     return robots

@@ -1,6 +1,7 @@
-"""Robots that share one policy, in virtual time: the real queue, and the real pace of its replica.
+"""Robots that share one policy in virtual time, with the real queue and the real pace of its
+replica.
 
-`python -m tests.simulation.robots --seeds 100000` runs drawn worlds, and checks each; `python -m
+`python -m tests.simulation.robots --seeds 100000` runs random worlds, and checks each; `python -m
 tests.simulation.robots --fleets` prints the largest fleets in time, with the queue's use of slack
 and without it.
 """
@@ -31,11 +32,11 @@ GRAPHS = CostCurve(0.0415, 0.0105)
 SMALL = CostCurve(0.004, 0.0005)
 LARGEST = 16
 WIRE_S = 0.002  # network time of a message, one way
-MEASURED_S = 30.0  # of a fleet, at least
+MEASURED_S = 30.0  # minimum duration of a measurement
 
 
 class _NoFiles:
-    """In place of what the queue's thread waits on."""
+    """Replaces the poller on which the queue's thread waits."""
 
     def wake(self) -> None:
         pass
@@ -51,19 +52,19 @@ class Robot:
     hz: float
     rows: int
     states_slack: bool = True
-    states_slo: bool = True  # whether its rate is known from its reset on
-    lies: bool = False  # whether it says that it is about to run out of rows
-    obeys: bool = True  # whether it replans at the pace that it is told
+    states_slo: bool = True  # whether its rate is known from its reset
+    lies: bool = False  # whether it claims in each request to be about to run out of rows
+    obeys: bool = True  # whether it replans at the requested pace
     source: str = ""
-    executed: int = 0  # rows
-    end: int = 0  # rows up to the end of its plan, with those executed
-    begun: bool = False  # whether the first answer is there, which its reset waits for
-    captured: float = 0.0  # tick of the observation of its rows, s
+    executed: int = 0  # number of executed rows
+    end: int = 0  # number of rows to the end of its plan, including executed ones
+    begun: bool = False  # whether the first answer has arrived, for which its reset waits
+    captured: float = 0.0  # tick of the observation of its current rows, s
     ticks: int = 0
     starved: int = 0
     ages: list[float] = field(default_factory=list)
     waiting: PendingRequest | None = None
-    waits_until: float = 0.0  # time before which a request is of no use, s
+    waits_until: float = 0.0  # time before which a request is useless, s
     inference_s: float = 0.0  # duration of its last batch
     late: list[float] = field(default_factory=list)  # times of its starved ticks, s
     plan: RobotPlan = field(default_factory=RobotPlan)
@@ -75,7 +76,7 @@ class Robot:
 
 @dataclass
 class Simulation:
-    """An environment that sends its next observation a moment after each answer."""
+    """An environment that sends its next observation shortly after each answer."""
 
     name: str
     answered: int = 0
@@ -83,7 +84,7 @@ class Simulation:
 
 
 class World:
-    """A policy, its queue, and those that use it."""
+    """A policy, its queue, and the robots and simulations that use it."""
 
     def __init__(
         self,
@@ -97,14 +98,14 @@ class World:
         jitter: float = 0.02,
         begin_s: float | None = None,
     ) -> None:
-        self.begin_s = begin_s  # time within which robots begin; None: one round of their chunks
+        self.begin_s = begin_s  # time within which robots begin; None for the duration of one chunk
         self.draw = random.Random(seed)
         self.costs, self.slack = costs, slack
         self.deadlines, self.jitter = deadlines, jitter
         self.robots = list(robots)
         self.simulations = [Simulation(f"env{number}") for number in range(simulations)]
         self.now = 0.0
-        self.measured_from = 0.0  # ticks before are not counted
+        self.measured_from = 0.0  # earlier ticks are not counted
         self.queue = BatchQueue(
             LARGEST,
             sessions=AnySession(),
@@ -126,11 +127,11 @@ class World:
         self._count = itertools.count()
 
     def at(self, when: float, call: Callable[[], None]) -> None:
-        """Call something at that time."""
+        """Call `call` at that time."""
         heapq.heappush(self._due, (when, next(self._count), call))
 
     def run(self, seconds: float) -> World:
-        """Play so long."""
+        """Run the world for so many seconds."""
         for robot in self.robots:
             round_s = max(1.0, robot.rows / robot.hz)
             phase = self.draw.random() * (round_s if self.begin_s is None else self.begin_s)
@@ -143,7 +144,9 @@ class World:
         return self
 
     def _tick(self, robot: Robot, phase: float, tick: int) -> None:
-        """Send a request if it is due, by the rules of `ChunkPlayer`, and execute a row."""
+        """Send a request if it is due according to the rules of `ChunkPlayer`, and execute
+        a row.
+        """
         period_s = 1 / robot.hz
         at = phase + tick * period_s
         self.at(at + period_s, lambda: self._tick(robot, phase, tick + 1))
@@ -215,7 +218,7 @@ class World:
 
     @staticmethod
     def _can_wait(pending: PendingRequest, urgent_s: float) -> bool:
-        """Whether a request is not urgent, if those are that are needed until `urgent_s`."""
+        """Return whether a request can wait, if requests needed before `urgent_s` are urgent."""
         if pending.waits_behind_others:
             return pending.arrived + BEHIND_OTHERS_S > urgent_s
         return pending.needed > urgent_s
@@ -224,7 +227,7 @@ class World:
         taken = self.queue.take()
         assert taken is not None
         for late in taken.expired:
-            assert late.deadline < self.now, "a request was dropped that was of use"
+            assert late.deadline < self.now, "a useful request was dropped"
             self.expired += 1
             if "robot" in late.observer_data:
                 late.observer_data["robot"].waiting = None
@@ -238,10 +241,10 @@ class World:
         self.at(self.now + took, lambda: self._finish(taken.batch, took))
 
     def _check(self, batch: list[PendingRequest]) -> None:
-        """What must be true of each batch."""
+        """Check the properties of each batch."""
         assert len(batch) <= LARGEST
         assert len({pending.session_id for pending in batch}) == len(batch), (
-            "two of pending session"
+            "two requests of one session"
         )
         costs_s = self.queue.window.costs_s
         if not costs_s:
@@ -260,7 +263,7 @@ class World:
             for pending in batch
             if pending.observer_data["patient"] and self._can_wait(pending, urgent_s)
         ]
-        assert not (left and patient), "an urgent request is behind pending that can wait"
+        assert not (left and patient), "an urgent request is behind one that can wait"
 
     def _finish(self, batch: list[PendingRequest], took: float) -> None:
         self.queue.end()
@@ -290,56 +293,56 @@ class World:
         pending.observer_data["done"]()
 
     def _receive(self, robot: Robot, row: int, captured: float) -> None:
-        """Take the rows of an answer, as `ChunkBuffer.add` does."""
+        """Replace the plan by the rows of an answer, like `ChunkBuffer.add`."""
         robot.begun = True
         end = row + robot.rows
         if end == robot.executed == robot.end:
-            end += 1  # the last row may be executed one step late
+            end += 1  # the last row may be executed one tick late
         if end > robot.executed and end > robot.end:
             robot.end, robot.captured = end, captured
 
     def check_all_answered(self) -> None:
-        """Nothing is lost, and no simulation waits for ever."""
+        """Check that no request is lost, and that no simulation waits forever."""
         under_way = sum(robot.waiting is not None for robot in self.robots)
         under_way += len(self.simulations) if self.now > 0.2 else 0
         missing = self.sent - self.answered - self.expired
         assert 0 <= missing <= under_way, f"{missing} requests without an answer, {under_way} sent"
 
-        # Each second batch has a slot for a simulation that has waited for long.
+        # Every second batch has a slot for a simulation that has waited for long.
         longest_batch_s = self.costs.cost_s(LARGEST) * (1 + self.jitter)
         bound_s = PATIENCE_S + 2 * (len(self.simulations) + 1) * longest_batch_s
         for simulation in self.simulations:
             assert simulation.longest_s <= bound_s, f"{simulation.name} waited for too long"
 
     def in_time(self) -> int:
-        """The robots of whose ticks at least 98 % had an action."""
+        """Return the robots of which at least 98 % of the ticks had an action."""
         return sum(
             robot.ticks > 0 and 1 - robot.starved / robot.ticks >= 0.98 for robot in self.robots
         )
 
     def all_in_time_s(self) -> float:
-        """The time after which at least 98 % of each robot's ticks had an action."""
+        """Return the time after which at least 98 % of each robot's ticks had an action."""
         return max(_in_time_from_s(robot, self.now) for robot in self.robots)
 
     def share(self) -> float:
-        """The lowest share in time of a robot."""
+        """Return the lowest share in time of all robots."""
         return min(
             (1 - robot.starved / robot.ticks if robot.ticks else 0.0) for robot in self.robots
         )
 
     def mean_share(self) -> float:
-        """The share in time of all robots together."""
+        """Return the share in time over all ticks of all robots."""
         ticks = sum(robot.ticks for robot in self.robots)
         return 1 - sum(robot.starved for robot in self.robots) / max(1, ticks)
 
     def age_p95_s(self) -> float:
-        """Of executed actions."""
+        """Return the 95th percentile of the age of executed actions, in s."""
         ages = sorted(age for robot in self.robots for age in robot.ages)
         return ages[int(0.95 * len(ages))] if ages else math.nan
 
 
 def _in_time_from_s(robot: Robot, until_s: float) -> float:
-    """Return the time from which on at least 98 % of a robot's ticks had an action, s."""
+    """Return the time from which at least 98 % of a robot's ticks had an action, in s."""
     for count, late_s in enumerate(reversed(robot.late), start=1):
         if count > 0.02 * (until_s - late_s) * robot.hz:
             return late_s
@@ -347,7 +350,7 @@ def _in_time_from_s(robot: Robot, until_s: float) -> float:
 
 
 def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
-    """So many robots, of each kind (rows, hz) in turns."""
+    """Return `number` robots, with the kinds (rows, hz) in turn."""
     return [
         Robot(f"robot{index}", kinds[index % len(kinds)][1], kinds[index % len(kinds)][0])
         for index in range(number)
@@ -355,17 +358,18 @@ def fleet(number: int, *kinds: tuple[int, float]) -> list[Robot]:
 
 
 def play(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) -> World:
-    """A fleet, long enough to have settled."""
+    """Run a fleet for long enough to settle."""
     longest_s = max(rows / hz for rows, hz in kinds)
     world = World(costs, fleet(number, *kinds), seed=number, slack=slack)
     world.measured_from = 4 * longest_s + 2
-    # With less than this, a robot with two late ticks in all would have less than 98 % in time.
+    # With a shorter measurement, a robot with only two late ticks would have less than 98 % in
+    # time.
     measured_s = max(MEASURED_S, 6 * longest_s + 4)
     return world.run(world.measured_from + measured_s)
 
 
 def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float]) -> int:
-    """The largest fleet of which 98 % of all robots' ticks have an action."""
+    """Return the largest fleet in which 98 % of each robot's ticks have an action."""
 
     def fits(number: int) -> bool:
         return play(costs, number, slack, *kinds).share() >= 0.98
@@ -380,13 +384,13 @@ def largest(costs: CostCurve, slack: bool, *kinds: tuple[int, float]) -> int:
 
 
 def start_at_once(costs: CostCurve, number: int, slack: bool, *kinds: tuple[int, float]) -> World:
-    """A fleet whose robots all begin within 0.1 s, for a minute."""
+    """Run a fleet whose robots all begin within 0.1 s, for a minute."""
     robots = fleet(number, *kinds)
     return World(costs, robots, seed=number, slack=slack, begin_s=0.1).run(60.0)
 
 
 def print_starts() -> None:
-    """Print what robots miss that all begin at once."""
+    """Print the late ticks of robots that all begin at the same time."""
     print("robots  rows     slack  starved s a robot (mean, most)  s until none is starved")
     for kinds, numbers in (
         (((50, 10.0),), (64, 128, 192, 256, 320, 400)),
@@ -407,7 +411,7 @@ def print_starts() -> None:
 
 
 def most_of(costs: CostCurve, needs: Sequence[RobotNeed]) -> int:
-    """Return the largest fleet by arithmetic, of robots with these needs in turns."""
+    """Return the largest fleet according to the formula, for robots with these needs in turn."""
     number = 0
     while True:
         counts = Counter(needs[index % len(needs)] for index in range(number + 1))
@@ -443,7 +447,7 @@ def print_fleets() -> None:
 
 
 def print_overload() -> None:
-    """Print what fleets get that all start at once, and fleets that are too large."""
+    """Print the results of fleets that all start at once, and of fleets that are too large."""
     print("all start at once     states an SLO  slack  share  in time  s until all are in time")
     for robots in (200, 400):
         for states_slo in (True, False):
@@ -482,7 +486,9 @@ def print_overload() -> None:
 
 
 def drawn(seed: int) -> World:
-    """A world of a few seconds: robots that obey and that do not, liars, simulations, deadlines."""
+    """Return a random world of a few seconds: robots that obey and that do not, robots with false
+    claims, simulations, and deadlines.
+    """
     draw = random.Random(seed)
     robots = []
     for number in range(draw.choice([1, 3, 8, 20, 40])):
@@ -507,7 +513,7 @@ def drawn(seed: int) -> World:
 
 
 def play_drawn(seed: int) -> World:
-    """Play the world of a seed; what is wrong with it is an `AssertionError` that names the seed."""
+    """Run the world of a seed; raise an `AssertionError` that names the seed if a check fails."""
     world = drawn(seed)
     try:
         world.run(3.0)
@@ -521,9 +527,9 @@ def play_drawn(seed: int) -> World:
 
 
 def main() -> None:
-    """Play seeds, or print the largest fleets."""
+    """Run seeds, or print the largest fleets."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=0, help="number of worlds to play")
+    parser.add_argument("--seeds", type=int, default=0, help="number of worlds to run")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--fleets", action="store_true", help="print the largest fleets in time")
     parser.add_argument("--starts", action="store_true", help="print starts of all robots at once")

@@ -1,4 +1,5 @@
-"""Robots that share a policy, in virtual time: what holds for every seed, and how many are in time.
+"""Robots that share a policy in virtual time: properties that hold for every seed, and the number
+of robots in time.
 
 `python -m tests.simulation.robots --seeds 100000` runs more seeds, and `--fleets` prints the
 largest fleets.
@@ -25,7 +26,7 @@ from vlagents_ray.serve.queue.replica_pace import RobotPlan
 
 def test_no_request_is_lost_and_none_overtakes_an_urgent_one() -> None:
     answered = sum(play_drawn(seed).answered for seed in range(300))
-    assert answered > 300 * 20, "the worlds left too little to be judged"
+    assert answered > 300 * 20, "the worlds had too few answers for a judgement"
 
 
 @pytest.mark.parametrize("costs", [PI0, GRAPHS, SMALL])
@@ -49,7 +50,7 @@ def test_a_lone_robot_is_answered_as_soon_with_slack_as_without(
 def test_slack_serves_a_third_more_robots_with_chunks_of_50(
     kinds: list[tuple[int, float]], robots: int
 ) -> None:
-    """Each number is more than 1.3 times the largest fleet without the use of slack."""
+    """Each number is more than 1.3 times the largest fleet without slack."""
     assert play(PI0, robots, True, *kinds).share() >= 0.98
     assert play(PI0, round(robots / 1.3), False, *kinds).share() < 0.98
 
@@ -93,7 +94,7 @@ def test_a_robot_that_claims_to_have_no_slack_gains_nothing_over_today() -> None
         world.run(40.0)
         assert world.share() == 1.0
         ages_s.append(sum(robots[1].ages) / len(robots[1].ages))
-    assert ages_s[1] <= ages_s[0], "the others have no older actions for it"
+    assert ages_s[1] <= ages_s[0], "the other robots have no older actions because of it"
 
 
 def test_a_robot_without_an_slo_is_paced_by_what_it_does() -> None:
@@ -126,4 +127,4 @@ def test_robots_that_came_first_are_in_time_where_there_are_too_many() -> None:
     admitted = [robot for robot in world.robots if robot.plan.is_admitted]
     assert 0.7 * 96 <= len(admitted) < 96
     assert world.in_time() >= 0.9 * len(admitted)
-    assert min(robot.ticks - robot.starved for robot in world.robots) > 0, "none gets nothing"
+    assert min(robot.ticks - robot.starved for robot in world.robots) > 0, "each robot gets actions"

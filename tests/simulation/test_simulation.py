@@ -1,4 +1,4 @@
-"""Histories of sessions under faults, each drawn from a seed, and run in a few milliseconds.
+"""Histories of sessions under faults. Each is drawn from a seed, and takes a few milliseconds.
 
 VLAGENTS_SIMULATION_SEED=1234 pytest tests/simulation -s     replays a seed that failed, and prints
 its history VLAGENTS_SIMULATION_SEEDS=100000 pytest tests/simulation     more of them than 2,000
@@ -22,21 +22,21 @@ from vlagents_ray.serve.requests import Answer, Opening, PendingRequest, Reserve
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.sessions import Session, SessionState
 
-# It finds each bug below within so many.
+# With so many seeds, the simulation finds each of the bugs below.
 SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "2000"))
 SEED = os.environ.get("VLAGENTS_SIMULATION_SEED")
 
 
 @pytest.fixture(autouse=True)
 def _quiet() -> Iterator[None]:
-    """What replicas say of a fault is no news here, and takes longer than all the rest."""
+    """Disable the replicas' logs of faults, which would take more time than everything else."""
     logging.disable(logging.CRITICAL)
     yield
     logging.disable(logging.NOTSET)
 
 
 def run(seed: int, **world: Any) -> list[Robot]:
-    """Play a seed; what is wrong with it is raised with what it takes to play it again."""
+    """Run a seed. An error contains the command that runs the seed again."""
     try:
         return play(World(seed, **world))
     except Exception as error:
@@ -46,7 +46,7 @@ def run(seed: int, **world: Any) -> list[Robot]:
 
 
 def run_all(seeds: int, **world: Any) -> None:
-    """The first so many."""
+    """Run the first `seeds` seeds."""
     for seed in range(seeds):
         run(seed, **world)
 
@@ -62,11 +62,11 @@ def test_no_history_is_impossible() -> None:
         for robot in run(seed):
             seen.update(line.split()[1] + " " + line.split()[-1] for line in robot.history)
     print(seen)
-    assert seen["act ok"] > SEEDS, "the faults left too little to be judged"
+    assert seen["act ok"] > SEEDS, "too few acts succeeded for a judgement"
 
 
 def show(seed: int) -> None:
-    """Play a seed and print all of it."""
+    """Run a seed and print its history."""
     world = World(seed)
     print(world.plan.__dict__)
     try:
@@ -83,7 +83,7 @@ def test_a_seed_is_one_history() -> None:
 
 
 def overwrite(replica: Replica) -> None:
-    """A session that arrives takes the place of whatever is here, and no reset is announced."""
+    """A bug: an arriving session replaces any session here, and resets are not announced."""
     table = replica.engine.sessions
 
     def enter(arriving: Session) -> None:
@@ -101,7 +101,7 @@ def overwrite(replica: Replica) -> None:
 
 
 def export_at_once(replica: Replica) -> None:
-    """To copy a session is to give it up, whether or not the one who asked still waits."""
+    """A bug: copying a session gives it up, whether or not the other replica still waits."""
     held = replica.migrator.sessions
 
     async def copy(session_id: str, offered: bool = False) -> SessionState | None:
@@ -120,8 +120,8 @@ def export_at_once(replica: Replica) -> None:
 
 
 def deadlines_begin_anew(replica: Replica) -> None:
-    """Counts the deadline again once the session was fetched, and asks nobody whether it was
-    answered.
+    """A bug: the deadline counts again from the time when the session was fetched, and earlier
+    answers are not checked.
     """
     engine = replica.engine
 
@@ -149,7 +149,9 @@ def deadlines_begin_anew(replica: Replica) -> None:
 
 
 def forget_episodes(replica: Replica) -> None:
-    """An act without a step is for whatever episode its session is in when the policy is free."""
+    """A bug: an act without a step belongs to the session's episode at the time when the policy is
+    free.
+    """
     reserve, fetch = replica.engine.intake.reserve, replica.migrator.fetch
 
     def reserve_and_forget(pending: PendingRequest) -> ReservedAct | Opening | None:
@@ -167,7 +169,7 @@ def forget_episodes(replica: Replica) -> None:
 
 
 def outlive_connections(replica: Replica) -> None:
-    """The requests of a connection that has ended wait on for the policy."""
+    """A bug: the requests of a closed connection still wait for the policy."""
     close_owned = replica.engine.sessions.close_owned
 
     def forget_the_end(connection: str, session_ids: Any) -> None:

@@ -1,5 +1,5 @@
-"""Event loops under one virtual clock: what is due next runs next, at once, in an order that the
-seed decides.
+"""Event loops under one virtual clock. The next due event runs immediately; the seed decides the
+order of events that are due at the same time.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from typing import Any
 
 
 class Clock:
-    """The time, s, and what is to happen in it."""
+    """The time in s, and the scheduled events."""
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.errors: list[BaseException] = []  # that nobody caught
+        self.errors: list[BaseException] = []  # errors that no code caught
         self._due: list[tuple[float, int, asyncio.Handle, Loop]] = []
         self._count = 0
 
     def add(self, when: float, handle: asyncio.Handle, loop: Loop) -> None:
-        """Run `handle` at that time, unless its process is not able to."""
+        """Run `handle` at that time, unless its process is dead or frozen."""
         self._count += 1
         heapq.heappush(self._due, (when, self._count, handle, loop))
 
     def run(self, until: float, over: Callable[[], bool]) -> None:
-        """Until then, or `over`, or nothing is due."""
+        """Run until the time `until`, until `over` is true, or until no event is left."""
         due = self._due
         while due and not over():
             when, _, handle, loop = heapq.heappop(due)
@@ -83,7 +83,9 @@ class Loop(asyncio.AbstractEventLoop):
         return task
 
     def close(self) -> None:
-        """Drop what is under way, as when a process ends; its `finally` blocks see nobody."""
+        """Drop all pending events, like at the end of a process; the effects of `finally` blocks
+        are invisible to others.
+        """
         self.ended = True
         for task in list(self._tasks):
             task._log_destroy_pending = False  # type: ignore[attr-defined]

@@ -1,10 +1,10 @@
-"""Replicas, a network and clients in one thread under a virtual clock, and the faults that a seed
-has for them.
+"""Replicas, a network and clients in one thread under a virtual clock, with faults drawn from a
+seed.
 
-The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. What
-a replica's thread, its event loop and Ray's calls between replicas do is run here: a batch takes
-a time that is drawn, a message is late, comes twice or out of order, or waits until a partition
-heals; a replica stops, is killed or frozen; clocks are set.
+The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. A
+replica's thread, its event loop and Ray's calls between replicas are simulated. The duration of a
+batch is random. A message is late, arrives twice or out of order, or waits until a partition heals.
+A replica stops, or is killed or frozen. Clocks are changed.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from vlagents_ray.serve.engine.settings import EngineSettings
 from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
-LENGTH_S = 60.0  # length of a world, at most
+LENGTH_S = 60.0  # maximum length of a world
 _EPOCH_NS = 1_700_000_000 * 10**9
 
 
 class Log:
-    """What the policy did: the ids of the acts, in order, with what the session obeyed, and what
-    the client meant.
+    """The policy's acts: their ids in order, the instruction of the session, and the instruction
+    that the client meant.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Log:
 
 
 class Remembering(Agent):
-    """Answers each act with all that its session has acted on since its reset."""
+    """A policy that answers each act with the ids of all acts of its session since the reset."""
 
     shared = ("log",)
 
@@ -64,8 +64,8 @@ _ACTION = np.zeros(1, np.float32)
 
 
 class _NoFiles:
-    """In place of what the queue's thread waits on: has the replica take its turn when something
-    waits.
+    """Replaces the poller on which the queue's thread waits: when a request waits, the replica runs
+    its next batch.
     """
 
     def __init__(self, wake: Callable[[], None]) -> None:
@@ -103,7 +103,7 @@ class Replica:
 
     @property
     def alive(self) -> bool:
-        """Is it there, if perhaps frozen?"""
+        """Whether the process is alive, although it may be frozen."""
         return not self.loop.ended
 
     async def _others(self) -> Sequence[Peer]:
@@ -115,7 +115,7 @@ class Replica:
         self.loop.call_soon(self._turn)
 
     def _turn(self) -> None:
-        """Of the policy's thread."""
+        """Run one turn of the policy's thread."""
         if self._busy:
             return
         batch, expired = self.engine.queue.take() or Taken([], [])
@@ -137,10 +137,10 @@ class Replica:
     def receive(
         self, request: Request, session_id: str, answer: Callable[[list[Reply]], None], timed: bool
     ) -> Callable[[], Any]:
-        """A client's request: `timed` as over HTTP, else as over a connection, where only the queue
-        knows deadlines.
+        """Receive a client's request: with `timed` like over HTTP, otherwise like over a
+        connection, where only the queue checks deadlines.
 
-        Returns what the end of its connection does.
+        Returns the function that is called when the connection ends.
         """
         sender = Sender(
             self.engine, "http", session_id, connected=False, caller=NoKey.OPEN, has_left=None
@@ -154,8 +154,8 @@ class Replica:
 
 
 class Link:
-    """A client's connection to one replica: what is sent arrives in order, and last that it has
-    ended.
+    """A client's connection to one replica. Messages arrive in order, and the end of the connection
+    arrives last.
     """
 
     def __init__(self, world: World, replica: Replica) -> None:
@@ -165,22 +165,22 @@ class Link:
         self._latest = 0.0  # time at which the last message arrives
 
     def carry(self, deliver: Callable[[], None]) -> None:
-        """To the replica, if it still lives."""
+        """Deliver to the replica if it is still alive."""
         self._latest = max(self._latest + 1e-6, self._world.arrival(None, self.replica))
         loop = self.replica.loop if self.replica.alive else self._world.outside
         loop.call_at(self._latest, lambda: deliver() if self.replica.alive else None)
 
     def send(self, request: Request, answer: Callable[[list[Reply]], None]) -> None:
-        """A request of one of its sessions."""
+        """Send a request of one of its sessions."""
         self.carry(lambda: send(self._sender, [request], answer) and None)
 
     def end(self) -> None:
-        """Close it."""
+        """Close the connection."""
         self.carry(self._sender.release)
 
 
 class _Peer(Peer):
-    """One replica as another one sees it: by messages."""
+    """One replica as another replica sees it: through messages."""
 
     def __init__(self, me: Replica, other: Replica) -> None:
         self.name = other.name
@@ -220,17 +220,17 @@ async def _at_once(call: Callable[..., Any], *args: Any) -> Any:
 
 
 class Plan:
-    """What may happen in a world."""
+    """The faults that may occur in a world."""
 
     def __init__(self, draw: random.Random) -> None:
-        self.rough = draw.random() < 0.4  # with faults that may end a session
-        # S that a batch may take, of a replica.
+        self.rough = draw.random() < 0.4  # whether faults may end a session
+        # Possible durations of a replica's batches in s.
         self.slowness = draw.choice([(0.02,), (0.02, 4.0), (0.02, 30.0)])
-        self.late = draw.choice([0.0, 0.1, 0.3])  # share of messages
+        self.late = draw.choice([0.0, 0.1, 0.3])  # share of late messages
         self.latest_s = draw.choice([0.2, 1.0])
         self.twice = draw.choice([0.0, 0.2])
         self.replicas = draw.choice([2, 2, 3])
-        # Share of requests that the load balancer sends elsewhere.
+        # Share of requests that the load balancer sends to another replica.
         self.stray = draw.choice([0.0, 0.2])
         names = ["drain", "drain", "clock"] + (
             ["kill", "freeze", "partition"] if self.rough else []
@@ -241,16 +241,16 @@ class Plan:
 
 
 class World:
-    """All of it, for one seed. `spoil` may undo a fix in each replica."""
+    """The complete world of one seed. `spoil` may undo a fix in each replica."""
 
     def __init__(self, seed: int, spoil: Callable[[Replica], None] = lambda _: None) -> None:
         self.draw = random.Random(seed)
         self.clock = Clock()
         self.plan = Plan(self.draw)
         self.log = Log()
-        self.outside = Loop(self.clock)  # of clients and network
+        self.outside = Loop(self.clock)  # the event loop of clients and network
         self.replicas = [Replica(self, number) for number in range(self.plan.replicas)]
-        self.faults: list[str] = []  # that happened
+        self.faults: list[str] = []  # the faults that occurred
         for replica in self.replicas:
             spoil(replica)
         for when, name in self.plan.faults:
@@ -258,11 +258,11 @@ class World:
 
     @property
     def clocks_agree(self) -> bool:
-        """Has no replica's clock been set?"""
+        """Return whether no replica's clock has been changed."""
         return not any(replica.clock_error_s for replica in self.replicas)
 
     def delay_s(self) -> float:
-        """Of a message."""
+        """Return the delay of a message in s."""
         if self.draw.random() < self.plan.late:
             return self.draw.random() * self.plan.latest_s
         return 0.0005 + 0.004 * self.draw.random()
@@ -270,8 +270,8 @@ class World:
     def transport(
         self, source: Replica | None, target: Replica | None, deliver: Callable[[], None]
     ) -> None:
-        """Carry a message. What leaves a replica that is cut off, or is for one, waits until it
-        is not.
+        """Carry a message. A message from or to a replica that is cut off waits until the replica
+        can be reached again.
         """
         if source is not None and not source.alive:
             return
@@ -279,14 +279,14 @@ class World:
         (self.outside if target is None or not target.alive else target.loop).call_at(when, deliver)
 
     def connect(self) -> Link:
-        """A client's connection to any replica that accepts one."""
+        """Return a client's connection to any replica that accepts it."""
         ready = [
             replica for replica in self.replicas if replica.alive and not replica.draining
         ] or self.replicas
         return Link(self, self.draw.choice(ready))
 
     def arrival(self, source: Replica | None, target: Replica | None) -> float:
-        """When a message arrives that is sent now."""
+        """Return the arrival time of a message that is sent now."""
         when = self.clock.now + self.delay_s()
         for end in (source, target):
             if end is not None and end.cut_off_until > when:
@@ -294,10 +294,12 @@ class World:
         return when
 
     def watch(self, other: Replica, me: Replica, answer: asyncio.Future[Any]) -> None:
-        """The caller hears of a replica's end a moment later, even if that had its message."""
+        """Notify the caller of a replica's end a moment later, even if the replica had received the
+        message.
+        """
 
         def look() -> None:
-            if not other.alive:  # what it said before may still come
+            if not other.alive:  # earlier answers may still arrive
                 me.loop.call_later(
                     2 * self.plan.latest_s, _settle, answer, None, PeerEnded(other.name)
                 )
@@ -307,8 +309,8 @@ class World:
         me.loop.call_later(0.5, look)
 
     def route(self, session_id: str, steady: bool) -> Replica:
-        """Where the load balancer sends a request: by its session, and now and then elsewhere
-        unless `steady`.
+        """Return the replica to which the load balancer sends a request: by its session, and
+        sometimes another one unless `steady`.
         """
         ready = [one for one in self.replicas if one.alive and not one.draining] or self.replicas
         if not steady and self.draw.random() < self.plan.stray:
@@ -339,7 +341,7 @@ class World:
     def _stop(self, replica: Replica) -> None:
         async def stop() -> None:
             await replica.migrator.hand_over()
-            await asyncio.sleep(2.0)  # its last answers
+            await asyncio.sleep(2.0)  # time for its last answers
             replica.loop.close()
 
         replica.loop.create_task(stop())
@@ -355,8 +357,8 @@ class World:
         timed: bool,
         **fields: Any,
     ) -> asyncio.Future[Reply]:
-        """A client's request; its answer may never come. A client that cancels the answer closes
-        its connection.
+        """Send a client's request and return its answer, which may never arrive. A client that
+        cancels the wait closes its connection.
         """
         answer: asyncio.Future[Reply] = self.outside.create_future()
         replica = self.route(session_id, steady) if link is None else link.replica
@@ -378,14 +380,14 @@ class World:
         return answer
 
     def close(self) -> None:
-        """End everything."""
+        """End all processes."""
         for replica in self.replicas:
             replica.loop.close()
         self.outside.close()
 
 
 def code(reply: Reply | None) -> str:
-    """What came of a request: "ok", an error's code, or "silence"."""
+    """Return the outcome of a request: "ok", an error's code, or "silence"."""
     if reply is None:
         return "silence"
     error: VLAgentsError | None = reply.error
