@@ -24,7 +24,7 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, MessageLimi
 Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
-HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the size of the body limits a reply's
+HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the body's size limits a reply's JSON
 VALUES = 20_000  # maximum number of values in a request's JSON; parsing that many takes about 2 ms
 # JSON that is longer than this is parsed within a budget, which may move it to a decoding thread.
 _INLINE_BYTES = 64 * 1024
@@ -166,7 +166,7 @@ def parse_json(
 
 
 def is_plain(dtype: Any) -> bool:
-    """Return whether `dtype`, as numpy writes it, names booleans, integers or floats."""
+    """Return whether `dtype`, in numpy's notation, means booleans, integers or floats."""
     return isinstance(dtype, str) and _PLAIN.fullmatch(dtype) is not None
 
 

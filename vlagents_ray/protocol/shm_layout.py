@@ -71,7 +71,7 @@ class Layout:
         return cls(session, priority, tuple(placed[0]), tuple(placed[1]), at)
 
     def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
-        """Return the offset of each array if the first one is at `at`; None if the request is not
+        """Return the offset of each array if the first array is at `at`; None if the request is not
         an act with this layout.
 
         Comparing each array is faster than computing the request's `_key`.
@@ -149,7 +149,7 @@ class ShmWriter:
             arrays += placed
             at += layout.size
 
-            obs: Obs = request.obs  # type: ignore[assignment]  # a request with a layout has one
+            obs: Obs = request.obs  # type: ignore[assignment]  # a request with a layout has an obs
             step = -1 if request.step is None else request.step
             deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
             gripper = _NONE if obs.gripper is None else obs.gripper

@@ -11,13 +11,14 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import OPEN, SERVER, Protocol
 from websockets.streams import StreamReader
 
-# Parts of a frame up to this size are copied, since a view of them may outlast the buffer.
+# Parts of a frame up to this size are copied, since a view of them may outlive the contents of the
+# buffer.
 _SMALL_BYTES = 1024
 _BINARY = 0x80 | Opcode.BINARY  # first byte of a message in one frame
 # Maximum size of a frame's head: two bytes, eight bytes of the size, and a mask of four bytes.
 HEAD_BYTES = 14
-# A connection may send one control frame each second, or 16 at once. For keep-alive, one in 20 s is
-# usual.
+# A connection may send one control frame each second, or 16 at once. For keep-alive, one frame in
+# 20 s is usual.
 CONTROL_FRAMES_PER_S, CONTROL_FRAMES = 1.0, 16
 
 

@@ -1,6 +1,6 @@
 """Builds the Serve application of one policy: its deployments, and Serve's options for them.
 
-Deployment files name it, as `import_path: vlagents_ray.serve.app:build`.
+Deployment files refer to it with `import_path: vlagents_ray.serve.app:build`.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def build(args: Mapping[str, Any] | ServerArgs) -> Application:
     """Build the Serve application of one policy from the `args` of a deployment file.
 
     Raises:
-        RayServeException: A setting is wrong, or the policy's environment is missing. `serve
-            status` shows only the text of this exception, but a traceback of forty lines for any
-            other.
+        RayServeException: A setting is wrong, or the policy's environment is missing. For this
+            exception, `serve status` shows only the text; for any other, it shows a traceback of
+            forty lines.
     """
     try:
         check_ray()
@@ -81,8 +81,8 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         # only these checks limit the time of a call. The failed checks take as long together as the
         # time limit of a call; with Serve's defaults they would take 95 s for every policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve retries
-        # forever.
+        # A policy that failed to load once will fail again. While other replicas run, Serve ignores
+        # this limit and retries forever.
         "max_constructor_retry_count": 1,
         # Settings of the policy that a deployment file may contain next to `args`; they can change
         # without a restart.

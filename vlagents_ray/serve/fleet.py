@@ -87,7 +87,7 @@ class RobotNeed:
 
     hz: float  # ticks per second
     rows: int = 1  # maximum number of rows of an answer that the robot executes
-    age_s: float | None = None  # largest age of an executed action, s; None: any
+    age_s: float | None = None  # largest allowed age of an executed action, s; None for any age
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.hz) and self.hz > 0):
@@ -133,7 +133,7 @@ class ReplicaLoad(NamedTuple):
     """Requests per second that the robots need, as a share of the requests per second that the
     replica can answer in time; `inf` if a robot could not be in time at this replica even alone.
     """
-    batch_size: int  # size of the batches with which the load is least
+    batch_size: int  # size of the batches with which the load is smallest
     latency_s: float  # time from a request to its answer with batches of that size, s
     # Time between two requests of each robot that can wait so long, with which the load of the
     # replica is at most `USABLE`, s.

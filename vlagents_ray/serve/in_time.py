@@ -86,12 +86,13 @@ class RobotTimes:
         self.priority = priority
         self.target_share = SHARE  # required share of ticks that have an action in time
         self.is_of_further_model = False  # whether the session of another model counts the robot
-        self.ticks = 0  # in total
-        self.starved = 0  # in total
+        self.ticks = 0  # total number of ticks
+        self.starved = 0  # total number of starved ticks
         self._lock = threading.Lock()
         # Number, ticks and starved ticks of each second, oldest first.
         self._seconds: deque[tuple[int, int, int]] = deque(maxlen=WINDOW_S + 1)
-        self._ages: deque[tuple[float, float]] = deque(maxlen=_AGES)  # time, s, and age, ms
+        # Pairs of time, s, and age, ms.
+        self._ages: deque[tuple[float, float]] = deque(maxlen=_AGES)
 
     def add(self, report: RobotReport, now: float) -> None:
         """Add a report that arrived at `now`, s."""
@@ -130,7 +131,7 @@ class RobotTimes:
 
     def is_in_time(self, now: float) -> bool | None:
         """Return whether the robot's share was at least its target in the last `WINDOW_S` seconds
-        before `now`, s; None if it reported no ticks.
+        before `now`, s; None if the robot reported no ticks.
         """
         # Computing the ages would take ten times as long.
         share = TimeShare(*self._ticks_lately(now)).share

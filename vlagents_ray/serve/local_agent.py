@@ -124,7 +124,9 @@ class LocalAgent(Agent):
         return reply.info or {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Act in several sessions at once. The info of each result contains its `timing`."""
+        """Compute the acts of several sessions together. The info of each result contains its
+        `timing`.
+        """
         requests = [Request("act", observation, priority="simulation") for observation in obs]
         results: list[Act | Exception] = []
         for reply in self._replies(sessions, requests):
@@ -191,7 +193,9 @@ class LocalPolicy(LocalAgent):
         self.engine.start()
 
     def sessions(self, n: int) -> list[LocalAgent]:
-        """Open `n` more sessions, for `act_batch` of this agent; close each of them."""
+        """Open `n` more sessions, for `act_batch` of this agent. The caller must close each
+        session.
+        """
         return [LocalAgent(self.engine) for _ in range(n)]
 
     def close(self) -> None:

@@ -34,9 +34,9 @@ def free_port(host: str = LOOPBACK) -> int:
 
     The server for an earlier port may not listen yet, so this process claims each port that it
     returns. While this process runs, and until it has returned `_CLAIMS` further ports, the
-    function does not return that port in any other process on this machine. Ports are drawn with
-    the system's random generator, so that processes with equal seeds for Python's generator do not
-    draw the same ports.
+    function does not return the claimed port in any other process on this machine. Ports are drawn
+    with the system's random generator, so that processes with equal seeds for Python's generator do
+    not draw the same ports.
     """
     for _ in range(100):
         port = _random.randrange(*_PORTS)

@@ -233,7 +233,7 @@ delivery.
 
 
 def deliver(answers: Iterable[Answer]) -> None:
-    """Deliver answers to the messages of their requests, in this order."""
+    """Store answers in the messages of their requests, in the given order."""
     for pending, reply in answers:
         pending.finish(reply)
 

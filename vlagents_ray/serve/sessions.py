@@ -38,7 +38,7 @@ _MOST_STEP = 2**62  # larger steps that clients report are ignored
 
 class Outdated(UnknownSession):
     """Raised if the replica has, or had, a state of the session that is at least as new as the
-    arriving one.
+    arriving state.
     """
 
 
@@ -91,7 +91,8 @@ class Session(Generic[M]):
     """The state of a policy for one robot or env."""
 
     id: str
-    agent: Agent | None = None  # None until the first `reset` succeeded; see `set_agent`
+    # The session's agent; None until the first `reset` has succeeded, see `set_agent`.
+    agent: Agent | None = None
     # Ability of the session's agent, which is looked up once in an episode.
     prepares: Prepares | None = None
     # Observations that wait for the acts that refer to them, and their preparations, by number.
@@ -183,7 +184,7 @@ class SessionModels(Protocol[M]):
     """The models that sessions hold: `vlagents_ray.serve.models.model_manager.ModelCache`."""
 
     def release_model(self, session: Session[M]) -> bool:
-        """Release the model that the session holds; return whether it held one."""
+        """Release the model that the session holds; return whether the session held a model."""
 
 
 class SessionTable(Generic[M]):
@@ -228,7 +229,7 @@ class SessionTable(Generic[M]):
         return session_id in self._sessions
 
     def get(self, session_id: str) -> Session[M]:
-        """Return the session, and mark it used.
+        """Return the session, and mark it as used.
 
         Raises:
             UnknownSession: The table does not have the session.
@@ -417,7 +418,9 @@ class SessionTable(Generic[M]):
             }
 
     def versions(self) -> dict[str, Version]:
-        """Return the versions of all sessions, including those whose first reset is in progress."""
+        """Return the versions of all sessions, including sessions whose first reset is
+        in progress.
+        """
         with self._lock:
             return {session.id: session.version for session in self._sessions.values()}
 

@@ -207,7 +207,9 @@ class ModelWeights:
         self._switches = 0
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
-        """Choose the newest or the pinned version for the session's next episode, and return it."""
+        """Choose the newest or the pinned version for the session's next episode, and return the
+        version.
+        """
         with self._lock:
             session.follows = follows
             session.weights = self.newest if follows else self.pinned
@@ -243,8 +245,8 @@ class ModelWeights:
 
         Args:
             number: Number of the version.
-            digest: Its fingerprint.
-            values: Its values, as another replica's `portable_values` returns them.
+            digest: The fingerprint of the version.
+            values: The values of the version, as another replica's `portable_values` returns them.
 
         Raises:
             VersionNotHeld: The values have another fingerprint.
@@ -299,7 +301,7 @@ class ModelWeights:
         self._live = version
         if self._in_place:
             version.values, version.on_host = None, False
-            if not self._swaps:  # otherwise the parameters are the same objects
+            if not self._swaps:  # a swap keeps the parameter objects
                 self._live_values = self._own_values()
         self._switches += 1
 
@@ -683,7 +685,7 @@ class HeldVersion:
     number: int
     pinned: bool
     kept: int  # number of the replica's last version whose mode was "keep"
-    values: dict[str, np.ndarray]  # by name, as returned by `portable`
+    values: dict[str, np.ndarray]  # values by name, as returned by `portable`
 
 
 class OwnWeights(Protocol):
@@ -885,7 +887,7 @@ def follows(options: dict[str, Any], *, by_default: bool) -> bool:
     the newest version.
 
     Raises:
-        InvalidInput: The option has another value than "follow" or "pinned".
+        InvalidInput: The option has a value other than "follow" or "pinned".
     """
     choice = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
     if not isinstance(choice, str) or choice not in (_FOLLOW, _PINNED):

@@ -301,8 +301,8 @@ def may_be_state(value: Any) -> bool:
 def read_state(
     flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: MessageLimits
 ) -> dict[str, np.ndarray]:
-    """Return the state `name`, its parts concatenated, (D,) float32; several states if the name
-    ends with `*`.
+    """Return the state `name`, its parts concatenated, (D,) float32; if the name ends with `*`,
+    return several states.
     """
     vectors_by_name: dict[str, list[np.ndarray]] = {}
     for source in sources:
@@ -355,7 +355,8 @@ def read_text(
     An integer without a text is an error if the instruction is `needed`; otherwise, None is
     returned.
     """
-    while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
+    # Some clients send a batch with one element.
+    while isinstance(value, (list, tuple)) and len(value) == 1:
         value = value[0]
     if isinstance(value, np.ndarray) and value.dtype.kind in "Uiu" and value.size == 1:
         value = value.item()

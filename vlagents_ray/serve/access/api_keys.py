@@ -1,9 +1,9 @@
 """API keys and their permissions, without sockets or Ray.
 
 A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its
-SHA-256. Slow password hashes are necessary only for passwords that people choose, since those can
-be guessed. Therefore users cannot choose keys: random keys need no slow hash, which would take
-longer than the policy at every request.
+SHA-256. Slow password hashes are necessary only for passwords that people choose, since such
+passwords can be guessed. Therefore users cannot choose keys: random keys need no slow hash, which
+would take longer than the policy at every request.
 
 Limits apply per replica and per gateway: two replicas together allow a key twice its rate and
 sessions.
@@ -79,7 +79,7 @@ class Keys:
         self._lock = threading.Lock()
         self.audit = Audit()
 
-        self._keys: dict[bytes, Key] = {}  # by the SHA-256 of the key
+        self._keys: dict[bytes, Key] = {}  # keys by their SHA-256
         self._buckets: dict[str, TokenBucket] = {}
         # Time until which no connection of a key is read, s, by the key's name.
         self._unread_until: dict[str, float] = {}
@@ -313,7 +313,7 @@ class Caller:
             raise
 
     def take_request(self) -> Key:
-        """Check the key as `require` does, and take one request from its rate.
+        """Check the key as `require` does, and count one request towards its rate.
 
         Only `vlagents_ray.serve.access.charges` calls this, for all endpoints.
 
@@ -361,7 +361,7 @@ class Caller:
             raise error
 
     def hold(self, number: int = 1) -> None:
-        """Count `number` more connections of the key, or fewer if it is negative.
+        """Count `number` more connections of the key, or fewer if `number` is negative.
 
         Raises:
             TooManyRequests: The key would have more connections than sessions.

@@ -66,7 +66,7 @@ class Account:
             self.identify(caller)
 
     def identify(self, caller: Identity) -> None:
-        """Set the caller, which has sent a valid key or needs none."""
+        """Set the caller, which has sent a valid key or needs no key."""
         self.caller = caller
         self._free = None if isinstance(caller, Caller) else Charge(caller)
 
@@ -155,7 +155,7 @@ class Charge:
     def __init__(
         self, caller: Identity, *, refusal: VLAgentsError | None = None, is_robot: bool = True
     ) -> None:
-        """Create the charge of a message; only an `Account` does.
+        """Create the charge of a message; only an `Account` creates charges.
 
         Args:
             caller: The sender.
@@ -166,7 +166,7 @@ class Charge:
         # The holder of the key that is charged; None without a key.
         self.caller = caller if isinstance(caller, Caller) else None
         self._refusal = refusal
-        self._charged = 1  # number of requests that the key has been charged for
+        self._charged = 1  # number of requests that were charged to the key
 
     @property
     def key(self) -> str | None:
@@ -223,7 +223,7 @@ def current_charge() -> Charge:
 
 @contextmanager
 def charged(charge: Charge) -> Iterator[None]:
-    """Make `charge` the current one within the context, and in tasks that are started there."""
+    """Make `charge` the current charge within the context, and in tasks that are started there."""
     token = _CHARGE.set(charge)
     try:
         yield

@@ -44,12 +44,12 @@ class Key:
 
     name: str
     sha256: str  # SHA-256 of the key's UTF-8 text, 64 hexadecimal digits
-    apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
+    apps: tuple[str, ...] = ()  # applications for which the key is valid; empty for all
     rate: float | None = None  # maximum rate, requests/s
     sessions: int | None = None  # maximum number of sessions at once
     # "simulation" applies to all requests of the key; otherwise each request sets its priority.
     priority: PriorityName | None = None
-    scopes: tuple[str, ...] = ()  # some of `SCOPES`
+    scopes: tuple[str, ...] = ()  # a subset of `SCOPES`
     expires: float | None = None  # time of expiry, s since 1970
     revoked: bool = False
 
@@ -237,7 +237,7 @@ def revoke(file: Path, name: str) -> None:
 def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
     """Read, change and replace the file as a whole, so that a server never reads a partial file.
 
-    The new file has the owner of the old one; otherwise a server could not read it, and would
+    The new file has the owner of the old file; otherwise a server could not read it, and would
     accept the old keys for some time. If the owner cannot be preserved, nothing is changed and
     `ConfigError` is raised.
     """

@@ -1,5 +1,5 @@
-"""Checks requests from pages in a browser, which can reach a server on their machine as any program
-can.
+"""Checks requests from pages in a browser, which, like any program, can reach a server on their
+machine.
 
 A server with API keys needs no such check, since a page also needs a key.
 
@@ -52,7 +52,7 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
 
 
 def require_same_origin(headers: Mapping[str, str]) -> None:
-    """Reject a GET from another site's page, even if it has no `origin`, as requests of images.
+    """Reject a GET from another site's page, even if it has no `origin`, as is the case for images.
 
     Raises:
         Forbidden: The browser reports that another site's page sent the request.

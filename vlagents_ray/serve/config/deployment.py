@@ -233,8 +233,8 @@ class SloArgs(_DeploymentModel):
 class StreamArgs(_DeploymentModel):
     """The port of each replica for WebSockets, which bypasses the proxy.
 
-    Clients get its address from the metadata; clients that cannot reach it (a firewall, a tunnel)
-    use the proxy.
+    Clients get its address from the metadata; clients that cannot reach it, for example through a
+    firewall or a tunnel, use the proxy.
     """
 
     enabled: bool = Field(
@@ -496,7 +496,7 @@ class AutoscalingArgs(_DeploymentModel):
             "target_sessions",
             "target_slo_load",
         }
-        # A replica reports at each measurement; Serve's own default is every 10 s.
+        # Interval of the reports of a replica, s. Serve's default is 10 s.
         report_s = min(2.0, self.look_back_s / 5)
         # The needs of robots are known, and reported as soon as they change. The first measured
         # costs of batches become more accurate within a second.

@@ -272,7 +272,7 @@ async def _run_upload(
     timer = loop.call_later(min(_TICK_S, slow_s), check_time)
 
     async def receive_in_time() -> Message:
-        """Receive a message of the body; the last one ends the time limit."""
+        """Receive a message of the body; the last message ends the time limit."""
         cancel_again(refusal is not None)
         message = await receive()
         if message["type"] == "http.disconnect" or not message.get("more_body", False):

@@ -54,7 +54,7 @@ _WAITING_BYTES = 4 * STREAM_BYTES  # maximum total size of those messages
 _UNSENT_BYTES = 2**16
 _UNSENT_S = 0.01
 _NORMAL = 1000  # close code
-_POLL_S = 60.0  # maximum time for which the polling thread waits at once, s
+_POLL_S = 60.0  # maximum duration of one wait of the polling thread, s
 
 MakeHandler = Callable[[WebSocketConnection], MessageHandler]
 
@@ -63,7 +63,7 @@ class AsgiWebSockets(ConnectionOwner["TakenConnection"]):
     """The WebSockets of one ASGI application.
 
     Args:
-        admission: The memory in flight of the replica; None without a replica.
+        admission: The in-flight memory of the replica; None without a replica.
         slow_s: Maximum time that a message may take to arrive, s.
         idle_s: Maximum time that a WebSocket may be silent, s.
         shutdown: The end of the replica.
@@ -262,7 +262,7 @@ class AsgiWebSocket:
 
 
 class _AsgiMessages(MessageHandler):
-    """The messages that an application receives; its event loop takes them in order."""
+    """The messages that an application receives; its event loop receives them in order."""
 
     most_unanswered = _WAITING_MESSAGES
     most_unanswered_bytes = _WAITING_BYTES
@@ -322,7 +322,7 @@ class _AsgiMessages(MessageHandler):
 
 
 class _WaitingBytes:
-    """The bytes of the messages that wait for an application, as part of the memory in flight.
+    """The bytes of the messages that wait for an application, as part of the in-flight memory.
     Thread-safe.
     """
 
@@ -368,7 +368,9 @@ def uncancel(task: asyncio.Task[object] | None) -> None:
 
 @functools.cache
 def _own_poller() -> Poller:
-    """Return the poller of this process for all its applications, with a separate thread."""
+    """Return the poller that all applications of this process share. It runs on a
+    separate thread.
+    """
     poller = Poller()
 
     def poll() -> None:

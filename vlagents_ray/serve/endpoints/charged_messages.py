@@ -18,12 +18,12 @@ _POLICY_VIOLATION = 1008  # WebSocket close code
 class ChargedMessage(NamedTuple):
     """A message, and its charge to the key of the client."""
 
-    data: bytes | None  # None for a text
+    data: bytes | None  # None for a text message
     charge: Charge
 
     @property
     def size(self) -> int:
-        """The number of bytes to decode: none of a text, which is rejected."""
+        """The number of bytes to decode; 0 for a text message, which is rejected."""
         return 0 if self.data is None else len(self.data)
 
 

@@ -1,6 +1,7 @@
 """The connection below a request or a WebSocket of uvicorn.
 
-ASGI exposes no connection; uvicorn's bound method `receive` has its protocol and transport.
+ASGI exposes no connection; The protocol and the transport are attributes of uvicorn's bound method
+`receive`.
 """
 
 from __future__ import annotations
@@ -139,7 +140,8 @@ class ClientSocket:
             self._loop.call_soon_threadsafe(self._end.set)
 
     async def receive(self) -> Message:
-        """Receive a message as uvicorn's `receive`; after `take`, the end of the connection.
+        """Receive a message like uvicorn's `receive`; after `take`, receive only the end of the
+        connection.
 
         uvicorn reports an end when the socket is taken.
         """

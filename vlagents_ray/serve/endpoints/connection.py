@@ -2,8 +2,8 @@
 WebSockets at a replica's own port.
 
 That thread accepts clients, reads and decodes their messages, and submits the requests, so that a
-request needs no thread switch; while a batch runs for milliseconds, another thread does this
-(`vlagents_ray.serve.queue.poller`). Answers are written by the thread that produced them.
+request needs no thread switch; while a batch that takes milliseconds is running, another thread
+does this (`vlagents_ray.serve.queue.poller`). Answers are written by the thread that produced them.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ KeyCheck = Callable[[str | None], Caller]
 
 
 class ReadBuffer(threading.local):
-    """Memory of `size` bytes for each thread to read into: new memory would cost as much as
-    copying from here.
+    """A buffer of `size` bytes for each thread, into which connections are read. Allocating memory
+    for each read would cost as much as copying the data from this buffer.
     """
 
     def __init__(self, size: int) -> None:
@@ -392,11 +392,11 @@ class ConnectionOwner(Generic[C]):
 
 
 class PolledServer(ConnectionOwner[C], ABC):
-    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all
+    """Listens after `open`; the polling thread of the batch queue accepts clients and reads all
     connections.
 
     Args:
-        check_key: Returns the caller that a key belongs to, or raises for an invalid key; or the
+        check_key: Returns the caller that owns a key, or raises an error for an invalid key; or the
             reason why no key is needed.
         listener: A non-blocking socket.
     """

@@ -27,8 +27,8 @@ class ForwardedWebSocket:
     """A WebSocket that ends with its client and its replica, and if its key becomes invalid or its
     client is too slow.
 
-    Messages are read ahead of the application, so that the end of the client is noticed while the
-    application acts.
+    Messages are read before the application requests them, so that the end of the client is noticed
+    while the application works.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class ForwardedWebSocket:
         return 0.0 if self._silent_since is None else self._loop.time() - self._silent_since
 
     def _close_cause(self) -> tuple[int, str] | None:
-        """Return the close code and the reason if the WebSocket has to end at once."""
+        """Return the close code and the reason if the WebSocket has to end immediately."""
         if (
             self._sending_since is not None
             and self._loop.time() - self._sending_since > self._slow_s

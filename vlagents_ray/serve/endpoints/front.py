@@ -1,6 +1,6 @@
 """Middleware that a replica's server runs before Serve's own code, for each connection.
 
-Serve loads it by `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH`: see
+The variable `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH` makes Serve load it: see
 `vlagents_ray.serve.launch.haproxy`.
 """
 

@@ -1,12 +1,12 @@
 """HTTP/1.1 at the replica's own port: `POST …/reset`, `…/act` and `…/close`, below its path.
 
-The policy thread reads the connections, like those of WebSockets, so a request passes through no
-proxy and no event loop. The decoders, the status codes and the documents of errors are those of the
-server's port (`http_messages`), and the access control is that of `AccessMiddleware`: each request
-needs a key if the server has keys, and otherwise a host and an origin of this server.
+The policy thread reads these connections like WebSockets, so a request passes through no proxy and
+no event loop. The decoders, the status codes and the error documents are the same as at the
+server's port (`http_messages`), and the access control is the same as in `AccessMiddleware`: each
+request needs a key if the server has keys, and otherwise a host and an origin of this server.
 
-One request of a connection is served at a time. The bytes of the next one stay in the socket until
-the answer is sent.
+One request of a connection is served at a time. The bytes of the next request stay in the socket
+until the answer is sent.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ _NO_PATH = (
     "no such path at a replica's own port, which has only reset, act and close; GET /docs of the "
     "server's port lists the others"
 )
-# The errors with which a connection ends during a request, by the close code of a WebSocket.
+# The error for the client if a connection ends during a request, by the close code that a WebSocket
+# would have.
 _ENDINGS: dict[int, type[VLAgentsError]] = {
     POLICY_VIOLATION: Unauthorized,
     TRY_AGAIN_LATER: Overloaded,
@@ -158,7 +159,7 @@ def read_head(data: bytes) -> _Reading:
     parser = httptools.HttpRequestParser(reading)
     try:
         parser.feed_data(data)
-    except httptools.HttpParserUpgrade:  # the offer of another protocol may be ignored
+    except httptools.HttpParserUpgrade:  # the client's offer of another protocol may be ignored
         pass
     except httptools.HttpParserError as error:
         got = f"{data[:40]!r} ({error})"
@@ -195,8 +196,8 @@ def _path_of(url: str) -> str:
 
 
 def head_bytes(connection: socket.socket, received: bytes) -> int:
-    """Return how many bytes to read of a head of which `received` has been read: not beyond its
-    end, and at least one.
+    """Return how many more bytes of a head to read after `received`: at least one, and no byte
+    beyond the end of the head.
 
     Raises:
         BlockingIOError: The socket is empty.
@@ -211,7 +212,7 @@ def head_bytes(connection: socket.socket, received: bytes) -> int:
 
 
 class HttpServer(PolledServer[MessageConnection]):
-    """A server at whose port HTTP connections arrive."""
+    """A server that accepts HTTP connections at its port."""
 
     slow_s: float  # maximum time that a request may take to arrive, s
     idle_s: float  # maximum time that a connection may be silent, s

@@ -91,8 +91,8 @@ class Body:
 async def read_requests(
     op: Op, http: HttpRequest, admission: MessageAdmission, name: str
 ) -> Decoded:
-    """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has
-    none.
+    """Read the requests of a POST to the path of `op`; the first request gets the id `name` if it
+    has no id.
 
     An error that concerns the whole body is raised.
     """
@@ -281,8 +281,8 @@ async def _receive_form(
 
 
 def _limited(http: HttpRequest, admission: MessageAdmission) -> Receive:
-    """Return a `receive` that limits the whole body: the parser limits only single parts, and
-    files not at all.
+    """Return a `receive` that limits the whole body: the parser limits only single parts, and no
+    files.
     """
     size = 0
     limit = admission.limits.body_bytes
@@ -398,7 +398,7 @@ def request_id(http: HttpRequest) -> str:
 
 
 def valid_request_id(header: str) -> str:
-    """Return the request id of a header, or a new one if the header is empty, invalid, or could
+    """Return the request id of a header, or a new id if the header is empty, invalid, or could
     forge a log line.
     """
     return header if header and is_name(header) else uuid.uuid4().hex
@@ -501,8 +501,8 @@ def public_problem(error: Exception, operation: str, request_id: str) -> VLAgent
 
 
 def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:
-    """Return the problem document of an error, with the status of the error unless another is
-    given.
+    """Return the problem document of an error, with `status` or, if it is None, the status of the
+    error.
     """
     document = problem(error, request_id)
     if status is not None:

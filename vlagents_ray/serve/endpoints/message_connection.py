@@ -159,7 +159,7 @@ class MessageConnection(PolledConnection):
             self._call_soon(lambda: self._resume(BACKLOGGED))
 
     def _pause_if_backlogged(self) -> None:
-        """Read nothing more while too many messages are unanswered."""
+        """Stop reading while too many messages are unanswered."""
         with self._sending:
             paused = self._is_backlogged() and not self._is_over
             self._paused = paused

@@ -93,7 +93,7 @@ class OwnPortServer(HttpServer):
 
         Args:
             ports: The first and last port to try, both included; None for any free port.
-            check_key: Returns the caller that a key belongs to, or raises for an invalid key.
+            check_key: Returns the caller that owns a key, or raises an error for an invalid key.
             slow_s: Maximum time that a message may take to arrive, s.
             idle_s: Maximum time that a connection may be silent, s.
             hosts: Further host names of the server.
@@ -114,7 +114,7 @@ class OwnPortServer(HttpServer):
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
-        # Accepted connections inherit the option, which the kernel enables after a moment.
+        # Accepted connections inherit this socket option, which the kernel enables after a moment.
         enable_timestamps(self._listener)
         super().open()
 

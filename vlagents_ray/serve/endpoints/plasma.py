@@ -100,7 +100,7 @@ class Channel:
 
 
 class Pool:
-    """The channels of one replica, whose number is the largest number used at once; thread-safe."""
+    """The channels of one replica: as many as have ever been used at the same time. Thread-safe."""
 
     def __init__(self, limits: MessageLimits) -> None:
         self._limits = limits
@@ -233,7 +233,7 @@ class PlasmaServer(UnixServer):
 
 
 class LeasedChannel:
-    """A `Payload`: the channel of one client, which leases a larger one for larger frames."""
+    """A `Payload`: the channel of one client, which leases a larger channel for larger frames."""
 
     def __init__(self, pool: Pool, admission: Admission) -> None:
         self._pool = pool

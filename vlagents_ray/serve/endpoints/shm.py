@@ -76,11 +76,12 @@ _KEY_BYTES = 4096  # maximum size of a key
 # A request is copied if the policy already holds views of this many memory files.
 _MAX_VIEWS = 8
 
-_read_buffer = ReadBuffer(_MESSAGE_BYTES)  # each message is processed before the next one is read
+# Each message is processed before the next message is read.
+_read_buffer = ReadBuffer(_MESSAGE_BYTES)
 
 
 class Payload(Protocol):
-    """The memory outside of the messages that holds the requests of one connection."""
+    """The memory outside of the messages that contains the requests of one connection."""
 
     def read(
         self, message: memoryview, descriptors: list[int]
@@ -164,7 +165,7 @@ class UnixConnection(PolledConnection):
         enable_timestamps(connection)
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
-        self._key: bytes | None = None  # the key as sent
+        self._key: bytes | None = None  # the key as the client has sent it
         # Sender of the requests; None until the client has sent its key.
         self._sender: Sender | None = None
         self._is_rated = False  # whether the client's key has a rate that it may exceed

@@ -21,7 +21,9 @@ class Shutdown:
         self._patience_s = 0.0
 
     def begin(self, patience_s: float = 0.0) -> None:
-        """End the connections that are silent for a second, and after `patience_s` all of them."""
+        """End all connections that are silent for a second, and after `patience_s` all remaining
+        connections.
+        """
         self._patience_s = patience_s
         self._begun = time.monotonic()
 

@@ -2,8 +2,8 @@
 
 All WebSockets of a replica are `WebSocketConnection`s, whichever port their clients used: the
 replica's own port (`vlagents_ray.serve.endpoints.own_port`), or the server's port, where uvicorn
-accepts the handshake and gives its socket away (`vlagents_ray.serve.endpoints.asgi_websocket`).
-A `MessageHandler` serves the messages.
+accepts the handshake and hands over its socket (`vlagents_ray.serve.endpoints.asgi_websocket`). A
+`MessageHandler` serves the messages.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ class WebSocketConnection(MessageConnection):
         super().__init__(owner, connection, admission, slow_s=slow_s, idle_s=idle_s)
         self._pings = pings
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
-        self._handler: MessageHandler | None = None  # None before the handshake is accepted
+        # Handler of the messages; None before the handshake is accepted.
+        self._handler: MessageHandler | None = None
 
         self._frame_head = b""  # received part of a frame's head, until the head is complete
         self._frame_left = 0  # unread bytes of the current frame, once its head is complete
@@ -128,7 +129,8 @@ class WebSocketConnection(MessageConnection):
 
         self._has_ended_sessions = False
         self._is_finishing = False  # whether the connection ends once all messages are answered
-        # Time of the last ping since the last bytes, s; 0 without one. Only `overdue` uses it.
+        # Time of the last ping since the last bytes, s; 0 if there was none. Only `overdue` uses
+        # it.
         self._pinged_at = 0.0
 
     def accepted(self, handler: MessageHandler) -> None:

@@ -83,8 +83,8 @@ class Admission:
         has_cores = window is not None and thread_map.allowed() >= SIDE_BY_SIDE_CORES
         # The smallest possible result of `inline_s`, s. Decoding most messages takes less.
         self.least_inline_s = SIDE_BY_SIDE_S if has_cores else INLINE_S
-        # Maximum number of bytes in flight of all messages together, by whether the message that
-        # needs more is a robot's.
+        # Maximum number of bytes in flight of all messages together, for messages of robots (True)
+        # and of simulations (False).
         self._limits = {True: in_flight_bytes, False: int(in_flight_bytes * (1 - _ROBOTS_SHARE))}
         self.held = 0  # number of bytes in flight
         # Bytes to release with each message that has no admission.
@@ -362,8 +362,8 @@ class MessageAdmission(Budget):
         self._inline = inline
 
     def begin_message(self) -> None:
-        """Raise the reason why the message is rejected, as in `Budget`; it was charged when it
-        arrived.
+        """Raise an error if the message is rejected, as in `Budget`. The message was charged when
+        it arrived.
         """
         self.charge.require()
 
@@ -386,7 +386,8 @@ class MessageAdmission(Budget):
             self.charge.cover(self._requests + 1)
             self._requests += 1
 
-        if not self._inline:  # otherwise a thread with other work decodes a small message
+        # An inline message is small, and is decoded on a thread with other work.
+        if not self._inline:
             self.serial = not self._robot or self._admission.fills_cores()
         if self.size:
             self.grow(self.size)
@@ -446,7 +447,7 @@ class MessageAdmission(Budget):
 
     async def decoded(self, read: Callable[[Budget], T], *, long: bool = False) -> T:
         """Decode with `read` and return the result; if it is `long`, the images are large, or a
-        part of the message was decoded there before, use another thread.
+        decoding thread has already decoded a part of the message, use a decoding thread.
         """
         if self._inline and not long:
             try:

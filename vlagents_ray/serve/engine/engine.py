@@ -45,7 +45,8 @@ class Engine:
     loads) to `close`.
 
     `intake` checks and queues requests, `runner` runs the batches, and `models` loads checkpoints.
-    `health` has the reason why the policy cannot act, and `moves` moves sessions between replicas.
+    `health` contains the reason if the policy cannot act, and `moves` moves sessions between
+    replicas.
     """
 
     def __init__(

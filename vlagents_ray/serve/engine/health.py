@@ -145,8 +145,8 @@ class Health:
             self._calls.require_device()
 
     def check(self) -> None:
-        """Raise the full reason why the policy cannot act, including errors of the agents' own
-        health checks.
+        """Raise an error with the full reason if the policy cannot act, including errors of the
+        agents' own health checks.
 
         The error is meant for the operator, and for the controller that replaces unhealthy
         replicas.

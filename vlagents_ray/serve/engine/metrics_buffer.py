@@ -31,11 +31,13 @@ Kind = tuple[str, str, str, str]
 """Kind of a request: op, transport, priority, and "ok" or the error's code."""
 
 Times = tuple[float, ...]
-"""Durations of a request, ms: in total, and in each of `STAGES`."""
+"""Durations of a request, ms: the total, and the duration of each stage in `STAGES`."""
 
 
 class Sample(Generic[T]):
-    """The number of values added, and a uniform random sample of up to `SAMPLE` of them."""
+    """The number of added values, and a uniform random sample of at most `SAMPLE` of
+    these values.
+    """
 
     __slots__ = ("count", "values")
 
@@ -111,8 +113,8 @@ class MetricsBuffer:
                 self.handled(kind, (total_ms, *_NOT_MEASURED))
 
     def record_failure(self, message: IncomingMessage, code: str) -> None:
-        """Record all requests of a message as failed with this error code, even if its caller no
-        longer waits.
+        """Record all requests of a message as failed with the given error code, even if the caller
+        no longer waits.
         """
         total_ms = (time.perf_counter() - message.arrived) * 1e3
         for op, priority in message.kinds:
@@ -140,7 +142,9 @@ class MetricsBuffer:
                 collected.ages_ms.setdefault(priority, Sample()).add(report.age_ms)
 
     def batch(self, observations: int, rows: int) -> None:
-        """Record a forward pass with this number of observations, and of rows including padding."""
+        """Record a forward pass with this number of observations, and this number of rows including
+        padding.
+        """
         if not self._enabled:
             return
         with self._lock:

@@ -1,4 +1,4 @@
-"""Moves of sessions between replicas: their state is bytes and settings."""
+"""Moves of sessions between replicas. The state of a session consists of bytes and settings."""
 
 from __future__ import annotations
 

@@ -22,8 +22,8 @@ class Observer:
     """Observes decoded requests and their answers; a class overrides the methods that it needs."""
 
     def on_request(self, pending: PendingRequest) -> None:
-        """Observe a request before it is queued; its observation may be in memory that the
-        client reuses.
+        """Observe a request before it is queued; the observation may be in memory that the client
+        reuses.
         """
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
@@ -37,7 +37,7 @@ class Observer:
         """
 
     def close(self) -> None:
-        """Write or export the kept data, and end."""
+        """Write or export the stored data, and end."""
 
 
 class Observers(Observer):

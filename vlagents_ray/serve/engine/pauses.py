@@ -19,7 +19,7 @@ from typing import Any
 
 from vlagents_ray.serve.periodic import Periodic
 
-_LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data were last received, ms
+_LAST_DATA = struct.Struct("@52xI")  # field of TCP_INFO: time since data were last received, ms
 _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
 # Minimum and maximum time to read the backlog of a pause, s. Between these limits, it is half as

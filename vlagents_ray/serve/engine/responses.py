@@ -1,4 +1,4 @@
-"""Replies from a policy's results and errors, checked and bounded."""
+"""Builds replies from a policy's results and errors, which are checked and limited in size."""
 
 from __future__ import annotations
 
@@ -114,14 +114,14 @@ def raised_at(error: Exception) -> str:
 
 
 def timing(pending: PendingRequest, began: float, ended: float) -> dict[str, Any]:
-    """Return how long a request waited for the policy's call, from `began` to `ended`, s, and
-    how long it took, ms.
+    """Return how long a request waited for the policy's call, from `began` to `ended`, s, and how
+    long the call took, ms.
     """
     return {"queue_ms": (began - pending.arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
 def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
-    """Check that the info of a reply can be sent, so that an invalid one fails only the session's
+    """Check that the info of a reply can be sent, so that an invalid info fails only the session's
     own request.
 
     Arrays are not copied. An info of more than `limit` bytes, or of more values than the client

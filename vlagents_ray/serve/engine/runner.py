@@ -1,6 +1,6 @@
 """The policy's thread, which takes batches from the queue and runs them.
 
-Each call of the policy returns its answers as values, which are delivered after the call. Answers
+Each call of the policy returns the answers as values, which are delivered after the call. Answers
 to simulations may be delivered on another thread, while the next batch runs.
 """
 
@@ -100,7 +100,7 @@ class Runner:
         # `start` is the policy's thread.
         self.threaded = parts.settings.threaded
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
-        # Done when loading the policy has succeeded or failed.
+        # Future that is done when loading the policy has succeeded or failed.
         self._started: Future[None] = Future()
         # Answers that another thread delivers while the next batch runs.
         self._unsent: list[Answer] = []
@@ -125,7 +125,7 @@ class Runner:
         self._started.result()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the end of the thread, whose queue is closed, but at most `timeout_s`."""
+        """Wait at most `timeout_s` for the end of the thread. The queue must be closed."""
         if self._thread.ident is None:
             self._queue.poller.close()
         elif self._thread is not threading.current_thread():
@@ -171,7 +171,7 @@ class Runner:
             self._health.end_thread()
 
     def _without_late(self, taken: Taken) -> Taken:
-        """Return the work without the requests that have become useless since they were taken."""
+        """Return the work without requests that have become useless since they left the queue."""
         now = self._clock()
         late = [
             pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)
@@ -280,7 +280,8 @@ class Runner:
         due now.
         """
         request, model = pending.request, session.model
-        if model is None or request.obs is None:  # the decoder ensures the second condition
+        # The decoder ensures that a reset has an observation.
+        if model is None or request.obs is None:
             raise UnknownSession(
                 f"session {pending.session_id!r}: closed before its reset was over"
             )
@@ -331,8 +332,8 @@ class Runner:
         return ()
 
     def requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
-        """Queue a reset again whose checkpoint is loaded, or answer it with the error; called on
-        any thread.
+        """Queue a reset again, since its checkpoint is loaded, or answer it with the error; called
+        on any thread.
         """
         pending.loaded = self._clock()
         try:
@@ -455,8 +456,8 @@ class Runner:
         acting: Sequence[Acting],
         prepared_s: float,
     ) -> list[Answer]:
-        """Act in sessions with one version of one model's weights, and return the answers that are
-        due now.
+        """Compute the acts of sessions that use the same model and version of its weights, and
+        return the answers that are due now.
         """
         observations = [pending.request.obs for pending, _ in acting]
         agents = [session.agent for _, session in acting]

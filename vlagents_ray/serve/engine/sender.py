@@ -1,4 +1,4 @@
-"""Submission of decoded messages to the engine, with the sessions and the key of their sender."""
+"""Submission of decoded messages to the engine, with the sessions and the key of the sender."""
 
 from __future__ import annotations
 
@@ -318,7 +318,7 @@ class Sender:
         if owner and (
             for_good or not (self._asked_to_reconnect or self._engine.drain_list.draining)
         ):
-            # The sessions are copied, since a migrator's thread may add one.
+            # The dict is copied, since a migrator's thread may add a session.
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))
 
 
@@ -342,7 +342,7 @@ def message_admission(
 
 
 class WaitingTask:
-    """The receiver of a message for whose replies a task waits; created on the task's loop."""
+    """The receiver of a message if a task waits for the replies; created on the task's loop."""
 
     def __init__(self) -> None:
         self.replies: asyncio.Future[list[Reply]] = asyncio.get_running_loop().create_future()

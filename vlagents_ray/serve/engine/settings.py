@@ -31,7 +31,7 @@ class EngineSettings:
     version: str = ""
     # Function that raises an error if a policy with a given contract cannot be served.
     check: Callable[[Contract | None], None] = accept_any
-    # Time limits of the policy's calls, over which the engine is unhealthy.
+    # Time limits of the policy's calls, above which the engine is unhealthy.
     limits: CallLimits = field(default_factory=CallLimits)
     reply_bytes: int = DEFAULT_LIMITS.reply_bytes  # maximum size of a reply
     # Maximum size of all messages in flight together, bytes.

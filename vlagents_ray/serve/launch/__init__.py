@@ -1,1 +1,3 @@
-"""Starts a server: its Ray, HAProxy, ports and deployment file, and the check that it is ready."""
+"""Starts a server: Ray, HAProxy, ports and the deployment file, and the check that the server is
+ready.
+"""

@@ -51,7 +51,8 @@ class Application(BaseModel, extra="allow"):
     import_path: str
     args: dict[str, Any] = {}
     runtime_env: dict[str, Any] = {}
-    deployments: list[dict[str, Any]] = []  # settings of Serve, and `user_config`, by `name`
+    # Settings of Serve and `user_config`, with the deployment's `name`.
+    deployments: list[dict[str, Any]] = []
 
 
 class Deployment(BaseModel, extra="allow"):
@@ -193,7 +194,9 @@ def _application_to_change(
 
 
 def _refuse_unknown(source: str, path: Path) -> None:
-    """Raise an error that names the likely mistake, for a source that is not a registered name."""
+    """Raise an error that explains the likely mistake, for a source that is not a
+    registered name.
+    """
     if path.name and path.with_suffix(".py").is_file():
         module = ".".join(path.parts).removesuffix(".py")
         raise UnknownPolicy(
@@ -362,11 +365,11 @@ def settings_in_file(file: str) -> dict[str, Any]:
 
 
 def declared_contract(config: Deployment) -> Contract | None:
-    """Return the contract of a deployment's policy, without loading the policy.
+    """Return the contract of a deployment's only policy, without loading the policy.
 
     Returns:
-        The contract; None if the policy has none before it is loaded, cannot be built here, or is
-        one of several.
+        The contract; None if the policy has no contract before it is loaded or cannot be built
+        here, or if the deployment has several policies.
     """
     app = config.applications[0]
     if len(config.applications) > 1 or app.import_path != IMPORT_PATH or app.runtime_env:
@@ -384,8 +387,8 @@ def our_apps(config: Deployment) -> list[Application]:
 
 
 def _checked(document: object, source: str, step_follows: bool = False) -> Deployment:
-    """Return the document, with the `args` of this package and the settings of Serve checked
-    before anything starts.
+    """Check the `args` of this package and the settings of Serve, before anything starts, and
+    return the document.
     """
     try:
         config = Deployment.model_validate(document)

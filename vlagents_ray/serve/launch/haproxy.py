@@ -37,7 +37,8 @@ _RETRY_AFTER_S = 1
 _OPEN = "open"  # file in the launcher's folder that marks a port as open; it then stays open
 # File there that marks the port of a stopping server as closed to new connections.
 _CLOSED = "closed"
-_REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
+# File in the launcher's folder with the response of a server without replicas.
+_REFUSAL = "no-replica.http"
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
 _CONNECTIONS = 16384  # maximum number of connections, if the process may open that many
@@ -50,8 +51,8 @@ _LIMIT_PER_ADDRESS = (
     "    tcp-request connection track-sc0 src",
     f"    tcp-request connection reject if {{ sc0_conn_cur gt {_CONNECTIONS_PER_ADDRESS} }}",
 )
-# HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain
-# the same settings, for clusters that are started in another way.
+# HAProxy's settings on every Serve cluster to which robots connect. The files in cluster/ contain
+# the same settings, for clusters that are not started by this package.
 ROBOTS = {
     "RAY_SERVE_ENABLE_HA_PROXY": "1",
     # The hash of a header, which the router behind the Python proxy also uses, keeps a session on
@@ -60,7 +61,7 @@ ROBOTS = {
     # value into HAProxy's settings, so it may contain further lines.
     _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
     "    timeout http-request 5s\n    timeout tunnel 24h\n",
-    "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
+    "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request, s
     # When replicas change, a new HAProxy takes over, and the old HAProxy keeps its connections
     # until this time limit. With the default of two minutes, it would then close every robot's
     # WebSocket.
@@ -160,8 +161,8 @@ class PublicListener:
         return "\n".join(lines)
 
     def require(self) -> None:
-        """Raise `ConfigError` if the environment, which the user may have set, lacks this
-        listener's settings.
+        """Raise `ConfigError` if the environment variables, which the user may have set, do not
+        contain this listener's settings.
         """
         is_enabled = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
         if not is_enabled or self.settings() not in os.environ.get(_BALANCE, ""):
@@ -202,7 +203,8 @@ def ingress_environment(
     `folder`.
     """
     replicas = free_block(_REPLICA_PORTS)
-    # These ports are free on all addresses, as HAProxy's metrics and statistics listen on all.
+    # These ports must be free on all addresses, since HAProxy's metrics and statistics listen on
+    # all addresses.
     metrics = free_port(EVERYWHERE)
     stats = free_port(EVERYWHERE)
     fallback = free_port(EVERYWHERE)

@@ -277,8 +277,8 @@ def deploy(client: Any, config: Deployment, *, is_own_ray: bool, ingress: bool) 
 
     For a deployment file, Serve starts a process that imports the server again. On a Ray of this
     process, applications of this package are built in this process instead, unless their file has
-    settings that Serve must apply. Such a file may also be deployed again, and Serve would replace
-    all replicas of an application that it did not build.
+    settings that Serve must apply. If such a file were deployed again, Serve would replace all
+    replicas of an application that Serve did not build.
 
     Args:
         client: Serve's client.
@@ -307,7 +307,8 @@ def _require_gpus(config: Deployment, local_gpus: float | None = None) -> None:
     they would wait forever.
 
     `local_gpus` is the number of GPUs that a new local Ray would have. An existing cluster may
-    grow. There, missing GPUs only cause a warning, which is repeated while the replicas wait.
+    grow. Missing GPUs of such a cluster therefore only cause a warning, which is repeated while the
+    replicas wait.
     """
     if local_gpus is None and not session.started_here():
         return
@@ -342,7 +343,7 @@ def _begins_with_replicas(app: Application) -> bool:
 
 
 def _gpus(args: ServerArgs) -> float:
-    """Return the number of GPUs that the initial replicas need together."""
+    """Return the total number of GPUs that the initial replicas need."""
     return args.initial_replicas * args.resources.num_gpus
 
 
@@ -379,7 +380,9 @@ def _ray(
     ingress: bool,
     begins_empty: bool,
 ) -> Iterator[dict[str, Any]]:
-    """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
+    """Connect to a Ray cluster or start one; yield Serve's options for host, port and
+    certificate.
+    """
     if not ray.is_initialized() and address is None:
         with own_ray(
             host, port, tls=tls, num_cpus=num_cpus, ingress=ingress, begins_empty=begins_empty
@@ -416,8 +419,8 @@ def _ray(
 def spread_over_gpus(
     deployments: Mapping[str, Deployment], *, reserved: float = 0.0
 ) -> dict[str, Deployment]:
-    """Return deployments that share the GPUs of the connected cluster equally, except for the
-    `reserved` number of GPUs.
+    """Return deployments that share the GPUs of the connected cluster equally; `reserved` GPUs stay
+    free.
     """
     gpus = max(0.0, ray.cluster_resources().get("GPU", 0.0) - reserved)
     share = gpus / len(deployments)
@@ -574,7 +577,9 @@ def wait_until_ready(
 
 
 def _deploy_failure(app: Any) -> str:
-    """Return the reason why an application failed to deploy, from Serve's status of it."""
+    """Return the reason why an application failed to deploy, from Serve's status of the
+    application.
+    """
     lines: list[str] = []
     for text in (app.message, *(deployment.message for deployment in app.deployments.values())):
         lines += [line.strip() for line in (text or "").splitlines() if line.strip()]

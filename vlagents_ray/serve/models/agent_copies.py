@@ -6,12 +6,12 @@ episode. A copy shares objects that are large or cannot be copied, and owns ever
 
 - Shared: attributes named in `Agent.shared`, torch parameters, JAX arrays (immutable), functions,
   classes, modules, and objects that cannot be copied (locks, sockets, native handles).
-- Shared and made read-only: numpy arrays of 64 MiB and more, so that writing into one raises an
-  error instead of changing other sessions.
+- Shared and made read-only: numpy arrays of 64 MiB and more, so that writing into such an array
+  raises an error instead of changing other sessions.
 - Copied: all other attributes, at any depth.
 
-When a session moves to another replica of the same policy, its copied state is sent there; the
-shared objects are looked up there by their index.
+When a session moves to another replica of the same policy, its copied state is sent there; the new
+replica looks up the shared objects by their index.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 class AgentCopies:
-    """Makes copies of an initialized agent, each independent of the others."""
+    """Makes copies of an initialized agent that are independent of each other."""
 
     def __init__(self, agent: Agent) -> None:
         self._shared = _Shared()

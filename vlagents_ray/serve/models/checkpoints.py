@@ -1,13 +1,13 @@
 """The checkpoints that a deployment offers, and a session's choice among them. This module does not
 load checkpoints.
 
-A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint:
-/runs/a/{step}`, `checkpoint_step: 20000`). A session chooses among the checkpoints in the
-deployment file; it never names a path.
+A policy's settings contain its checkpoint, and optionally a training step of the checkpoint
+(`checkpoint: /runs/a/{step}`, `checkpoint_step: 20000`). A session chooses among the checkpoints in
+the deployment file; it can never choose a path.
 
 A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with
 that checkpoint, as its setting `adapters`, so that sessions with different adapters share a model;
-the adapter is an option of their reset.
+the adapter is an option of a session's reset.
 """
 
 from __future__ import annotations
@@ -174,6 +174,6 @@ class Checkpoints:
 
 
 def resolved(settings: Mapping[str, Any]) -> str | None:
-    """Return the checkpoint that the settings name, with the step filled in."""
+    """Return the checkpoint in the settings, with the step filled in."""
     checkpoint, step = settings.get(CHOICE), settings.get(STEP)
     return at_step(checkpoint, step) if isinstance(checkpoint, str) else checkpoint

@@ -1,4 +1,4 @@
-"""One checkpoint in memory: loading it, and releasing its memory."""
+"""One checkpoint in memory, from loading it to releasing its memory."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ class Padding:
     """Dummy sessions that pad a batch to the next of `sizes`. They are only used on the policy's
     thread.
 
-    Each dummy session is a pristine copy of the agent. It is reset with the first reset request
-    that the policy accepted, and acts on an observation of a real session in the same batch. Its
-    actions and errors are dropped. If a dummy session cannot be created, the policy gets batches
-    without padding.
+    Each dummy session is a pristine copy of the agent. The dummy session is reset with the first
+    reset request that the policy accepted, and acts on an observation of a real session in the same
+    batch. Its actions and errors are dropped. If a dummy session cannot be created, the policy gets
+    batches without padding.
 
     Args:
         sizes: Batch sizes for which the model is compiled.
@@ -74,7 +74,9 @@ class Padding:
         self._rows: list[_DummySession] = []
 
     def record_reset(self, request: Request, kwargs: dict[str, Any]) -> None:
-        """Store the first reset that the policy accepted. It also resets the dummy sessions."""
+        """Store the first reset that the policy accepted, which is also used to reset the dummy
+        sessions.
+        """
         if self._first is None and self._sizes and request.obs is not None:
             # The request is copied, since the observation may be in the sender's memory.
             self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
@@ -359,7 +361,8 @@ class Loader:
             )
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
-            # The statistics are compared with a robot. They may exist for weights without a digest.
+            # Statistics are compared with a robot's values. They may also exist for weights without
+            # a digest.
             trained_on = ability(agent, HasStatistics)
             if trained_on is not None:
                 weights = {

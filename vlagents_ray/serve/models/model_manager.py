@@ -52,7 +52,8 @@ from vlagents_ray.weights.trainable import beside_acts
 # Waiting time for a slot after which a checkpoint in use accepts no more episodes.
 PATIENCE_S = 10.0
 
-# Called with None when a session holds its model, otherwise with the error.
+# Callback with the argument None when a session holds its model, or with the error if loading
+# failed.
 OnLoaded = Callable[[VLAgentsError | None], None]
 # Callbacks to call, each with its argument.
 DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]
@@ -248,7 +249,9 @@ class ModelCache:
         return None
 
     def next_deferring(self) -> str | None:
-        """Return the key of a model that is not loaded completely; None if all are."""
+        """Return the key of a model that is not loaded completely; None if all models
+        are complete.
+        """
         return next((key for key, model in self.loaded.items() if model.deferred is not None), None)
 
     def failed(self, settings: dict[str, Any], failure: str) -> DueCallbacks:
@@ -303,9 +306,9 @@ class ModelManager:
             cache: The loaded models, which the sessions release when they end.
             sessions: The sessions of the replica. If a model is evicted immediately, its sessions
                 are closed.
-            on_step: Called with each step of a long first load, on the loading thread.
-            quiet_s: Returns the time since a model last acted, s; 0 if models may not be loaded
-                completely now.
+            on_step: Called with each step of a long first load, on the thread that loads.
+            quiet_s: Returns the time since a model last computed actions, s; 0 if deferred parts
+                may not be loaded now.
         """
         # Whether chunks of the deployment's own model continue the executed plan.
         self.continues_plans = False
@@ -388,15 +391,15 @@ class ModelManager:
 
     @property
     def version(self) -> tuple[str, str]:
-        """Version that is equal in replicas of the same policy with equal settings of the
-        deployment.
+        """Version of the policy, which is equal in replicas of the same policy with
+        equal settings.
         """
         return self._loader.version(self.config), self._fingerprint
 
     @property
     def own_weights(self) -> ModelWeights:
-        """Versions of the weights of the deployment's own model; raises `PolicyUnavailable`
-        before it is loaded.
+        """Versions of the weights of the deployment's own model; raises `PolicyUnavailable` before
+        that model is loaded.
         """
         with self._changed:
             model = self._cache.find(DEFAULT)

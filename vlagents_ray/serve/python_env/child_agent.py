@@ -57,8 +57,8 @@ def version_of(args: ServerArgs) -> str:
 
 
 class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
-    """Proxy for the policy in a child process; a copy is one of its sessions and moves to
-    another child by pickling.
+    """Proxy for the policy in a child process; each copy of the proxy is one session of the policy,
+    which moves to another child by pickling.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("_program", "_connection")
@@ -100,8 +100,8 @@ class ChildAgent(Agent, HoldsWeights, ComputesElsewhere):
         return self._ask(Request("reset", obs, instruction, kwargs)).info or {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Send the observations in one message, except those that the child has stored; return the
-        action or the error of each.
+        """Send the observations in one message, except observations that the child has already
+        stored; return the action or the error of each.
         """
         requests = []
         for session, session_obs in zip(sessions, obs, strict=True):

@@ -143,7 +143,7 @@ class ChildConnection:
             return GpuWork()
 
     def call_for_weights(self, op: Op, **arguments: Any) -> dict[str, Any]:
-        """Make a call for the weights, as `call_in_background` does."""
+        """Make a call for the weights; see `call_in_background`."""
         try:
             return self.call_in_background(op, **arguments)
         except ConnectionLost as error:
@@ -218,7 +218,7 @@ class StoredObservation:
     is_named: bool = False  # whether an act has referred to it
 
     def waits_for(self, connection: ChildConnection, session: str) -> bool:
-        """Return whether the child keeps the observation for an act of this session."""
+        """Return whether the child still stores the observation for an act of the given session."""
         return not self.is_named and self.connection is connection and self.session == session
 
     def __del__(self) -> None:

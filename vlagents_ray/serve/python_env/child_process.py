@@ -1,4 +1,4 @@
-"""The child process of a replica, from its start to its end; `child_main` is the program in it."""
+"""The child process of a replica, from its start to its end. It runs the program `child_main`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""The first steps of a child process that answers its parent in lines.
-
-It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load
-this file with a Python without vlagents_ray.
+"""The first steps of a child process that answers its parent in lines. This module needs only the
+standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a
+Python without vlagents_ray.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Make the kernel kill this process when its parent ends, however that happens. Linux only."""
+    """Make the kernel kill this process when its parent ends for any reason. Linux only."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 

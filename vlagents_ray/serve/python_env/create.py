@@ -1,5 +1,5 @@
-"""Virtual environments, created with uv, for policies that need one and for the benchmark's
-peers.
+"""Virtual environments, created with uv, for policies that need a separate environment, and for the
+other servers in the benchmarks.
 """
 
 from __future__ import annotations

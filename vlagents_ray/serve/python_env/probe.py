@@ -70,7 +70,8 @@ class EnvironmentProbe:
 def probe(
     python: str, policy: dict[str, Any] | None = None, env_vars: Mapping[str, str] | None = None
 ) -> EnvironmentProbe:
-    """Start the interpreter once, to get its versions and optionally to build a policy.
+    """Start the interpreter once, to read the versions of its packages and optionally to build a
+    policy.
 
     Args:
         python: The path of the interpreter.

@@ -79,7 +79,7 @@ class BatchQueue:
         self.most_with_others: float = math.inf
         self._waiting = FairQueue()
 
-        self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
+        self._load_timer = LoadTimer()  # the time until the policy is loaded counts as idle
         self._lock = threading.Lock()
         self._closed = False
         self._thread = 0  # id of the policy's thread
@@ -104,7 +104,7 @@ class BatchQueue:
         self._load_timer.mark_busy()
 
     def put(self, *requests: PendingRequest) -> None:
-        """Queue requests, for the same batch if it has room for all; raise `PolicyUnavailable`
+        """Queue requests, for the same batch if that has room for all; raise `PolicyUnavailable`
         after `close`.
         """
         with self._lock:
@@ -311,7 +311,8 @@ class LoadTimer:
     """Adds up the waiting time of requests and the idle time of the policy's thread, which is idle
     at first.
 
-    Callers of `count` and `waited_s` must hold one lock; `idle_time_s` may be called on any thread.
+    Callers of `count` and `waited_s` must hold a common lock; `idle_time_s` may be called on any
+    thread.
     """
 
     def __init__(self) -> None:
@@ -335,13 +336,13 @@ class LoadTimer:
         return self._waited + waiting * max(0.0, time.perf_counter() - self._counted)
 
     def mark_idle(self) -> float:
-        """Mark the policy's thread idle, and return the current time, s."""
+        """Mark the policy's thread as idle, and return the current time, s."""
         now = time.perf_counter()
         self._idle = (self._idle[0], now)
         return now
 
     def mark_busy(self) -> float:
-        """Mark the policy's thread busy, and return the current time, s."""
+        """Mark the policy's thread as busy, and return the current time, s."""
         now = time.perf_counter()
         idle, since = self._idle
         self._idle = (idle if since is None else idle + now - since, None)

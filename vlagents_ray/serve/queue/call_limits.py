@@ -1,8 +1,9 @@
 """Running calls of a policy, and whether one of them exceeds its time limit.
 
 A deadlocked driver, or a policy that waits for an event that never occurs, keeps its thread alive.
-Only the time since the call began distinguishes it from a policy that is computing. A policy that
-compiles takes long for its first few calls, so these calls and loading have longer limits.
+Only the time since the call began distinguishes such a policy from a policy that is computing. A
+policy that compiles takes long for its first few calls, so these calls and loading have longer
+limits.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class PolicyCalls:
         self.clock = clock
         self.under_way: set[PolicyCall] = set()
         self.failed_batches = 0  # number of consecutive failed batches
-        # Error of an accelerator, after which every call fails.
+        # Error of an accelerator after which every call fails; None if there was none.
         self.broken: BaseException | None = None
 
     def record_error(self, error: BaseException) -> None:

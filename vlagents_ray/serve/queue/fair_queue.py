@@ -54,7 +54,9 @@ class _SourceQueue:
         self.queues: dict[str, deque[_SessionQueue]] = {}
 
     def add(self, queue: _SessionQueue) -> None:
-        """Add the queue of a session that did not wait before, at the end of its source."""
+        """Add the queue of a session that did not wait before, behind all other sessions of its
+        source.
+        """
         source = queue[0].origin.connection or queue[0].session_id
         queues = self.queues.get(source)
         if queues is None:
@@ -206,7 +208,7 @@ class FairQueue:
             size: The largest batch.
             now: The time, s.
             most_with_others: The size up to which the batch is filled with requests that wait
-                behind others.
+                behind the requests of other robots.
 
         Returns:
             The batch, and the requests whose deadlines have passed or whose clients have left,

@@ -130,7 +130,7 @@ class Poller:
     def _read(self) -> None:
         # The reader polls the epoll's own descriptor: two threads inside one epoll would take each
         # other's wake-ups. Events that occur after the owner's `reclaim` are left to the owner: the
-        # reader waits until it is lent again.
+        # reader waits until the poller is lent to it again.
         outside = select.poll()
         outside.register(self._poll, select.POLLIN)
         while True:

@@ -32,7 +32,7 @@ from vlagents_ray.serve.fleet import (
 )
 from vlagents_ray.slo import SHARE, Slo
 
-_READ_S = 0.5  # time after which the needs of all sessions are read again
+_READ_S = 0.5  # time after which the needs of all sessions are read again, s
 # The same time at the beginning; it then doubles until it is `_READ_S`. The first curve is computed
 # from a single batch, and later curves are soon more accurate.
 _FIRST_READ_S = 0.02
@@ -97,7 +97,7 @@ class RobotPlan:
         return cls(need_of(slo, rows), is_stated=True, share=slo.share, most_rows=slo.rows)
 
     def is_present(self, now: float) -> bool:
-        """Return whether the robot sends requests, at the time `now`, s."""
+        """Return whether the robot has sent a request recently, at the time `now`, s."""
         rows_s = 0.0 if self.need is None else self.need.rows / self.need.hz
         return now - self.heard <= _PRESENT_S + rows_s
 
@@ -186,7 +186,7 @@ class ReplicaPace:
         self._curve, self._plans = curve, plans
         self._max_batch_size, self._clock = max_batch_size, clock
         self._depth = depth
-        self._load = IDLE  # load of all robots that can be in time
+        self._load = IDLE  # load of all robots, except robots that cannot be in time
         self._admitted_load = IDLE
         # The size up to which batches are filled with requests of robots that are not admitted. In
         # larger batches, the answers of the admitted robots would be late.

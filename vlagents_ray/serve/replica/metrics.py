@@ -1,11 +1,10 @@
 """Prometheus metrics of a replica. Ray exports them at the metrics port of the node, with the
-prefix `ray_`.
-
-`Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and
-`policy`. The tag `transport` is `shm`, `plasma`, `websocket`, `http` or `handle`, `priority` is
-`robot` or `simulation`, and `code` is "ok", an error's code or "disconnected". Latencies are
-measured for successful requests, and stages for successful acts. Counters are exact. Histograms use
-a random sample of up to 100 values per second for each kind of request and for the batches.
+prefix `ray_`. `Exporter` creates the series. All series have the tags `application`, `deployment`,
+`replica` and `policy`. The tag `transport` is `shm`, `plasma`, `websocket`, `http` or `handle`,
+`priority` is `robot` or `simulation`, and `code` is "ok", an error's code or "disconnected".
+Latencies are measured for successful requests, and stages for successful acts. Counters are exact.
+Histograms use a random sample of up to 100 values per second for each kind of request and for the
+batches.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ T = TypeVar("T")
 
 
 class Exporter:
-    """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
+    """Exports an engine's metrics to Ray once per second, on a separate thread, until `close`."""
 
     def __init__(self, engine: Engine, tags: Mapping[str, str], keys: Keys | None = None) -> None:
         """Create the series of an engine with the `tags` application, deployment, replica and
@@ -127,7 +126,8 @@ class Exporter:
             "priority",
             boundaries=MS_BOUNDARIES,
         )
-        # The values of the tag `model` are first, and further for the second model of a robot.
+        # The values of the tag `model` are `first`, and `further` for each additional model of a
+        # robot.
         self._robots = make(
             Gauge, "robots", "Robots that reported ticks in the last 10 s.", "priority", "model"
         )
@@ -152,12 +152,12 @@ class Exporter:
         self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
-        """Make the engine record its stats, and start to export them."""
+        """Make the engine record its metrics, and start to export the metrics."""
         self._engine.stats.enable()
         self._periodic.add(self.export)
 
     def close(self) -> None:
-        """Export the remaining stats and end the thread."""
+        """Export the remaining metrics and end the thread."""
         self._periodic.remove(self.export)
         try:
             self.export()
@@ -165,7 +165,7 @@ class Exporter:
             logger.exception("the last metrics were not exported")
 
     def export(self) -> None:
-        """Export the stats since the last call."""
+        """Export the metrics since the last call."""
         collected = self._engine.collect_stats()
         self._export_collected(collected)
         self._export_gpu_work(collected)

@@ -71,7 +71,7 @@ async def no_siblings() -> Sequence[OtherReplica]:
 
 @dataclass(frozen=True, slots=True)
 class PartContext:
-    """The facts and abilities of a replica that its parts may use."""
+    """The information and the functions of a replica that its parts may use."""
 
     engine: Engine
     replica: str  # name of the replica, unique over time
@@ -98,7 +98,7 @@ class SiblingPart:
     def __init__(
         self, replica: OtherReplica, part: str, methods: Mapping[str, float | None]
     ) -> None:
-        """Call the part with the name `part` of a replica; `methods` are its
+        """Create a proxy for the part with the name `part` of a replica; `methods` are its
         `ReplicaPart.sibling_methods`.
         """
         self.name = replica.name  # name of the replica, unique over time
@@ -177,8 +177,8 @@ class ReplicaPart:
         return None
 
     def describe(self) -> Mapping[str, Any]:
-        """Return facts for clients. The replica's metadata contains them under `parts` and the name
-        of this part.
+        """Return facts for clients, which the replica's metadata contains under `parts` and the
+        name of this part.
 
         `GET /docs` lists a part with a `summary` and the path of its `page` or its `paths`, such as
         ["GET /count"].

@@ -100,7 +100,7 @@ class PolicyReplica(ClientApi, SiblingApi):
     `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
     """
 
-    _opened = False  # whether `close` has anything to close
+    _opened = False  # whether `close` has something to close
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self, args: dict[str, Any], gateway: Any = None
@@ -400,7 +400,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         )
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
-        """Return metadata and actor for a client that another replica redirects to this one."""
+        """Return metadata and actor for a client that another replica redirects to this replica."""
         self._rebalancer.expect_client()
         return self._connection_info()
 
@@ -424,7 +424,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         clients.
 
         The WebSockets are closed, since Serve waits for them before it calls `close`, and kills the
-        replica after a while. Until then, this task detects a policy that hangs. A policy that
+        replica after a time limit. Until then, this task detects a policy that hangs. A policy that
         holds the interpreter's lock also blocks this task; in that case a thread that needs no lock
         writes the stack traces into the log.
         """
@@ -456,7 +456,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         """
         while True:
             try:
-                # Waits until the gateway runs.
+                # This call waits until the gateway runs.
                 self._gateways = await self._gateway.description.remote()
             except (ray.exceptions.RayError, RayServeException) as error:
                 self._gateways = {}

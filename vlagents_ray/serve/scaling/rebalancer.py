@@ -37,7 +37,7 @@ PERIOD_S = 3.0  # interval of the comparisons
 _EXPECTED_S = 3.0  # time after which a client that was sent here is no longer expected
 _SETTLE_S = 6.0  # time for which a connection counts as leaving after a request to reconnect
 _RECONNECT_S = 20.0  # shortest time between two requests to reconnect on one connection
-# Time since its last request for which a session is active; only replies can request a
+# Time after its last request for which a session counts as active, s; only replies can request a
 # reconnection.
 _ACTIVE_S = 30.0
 _AT_ONCE = 32  # largest number of sessions to send away after one comparison
@@ -66,7 +66,9 @@ class ReplicaLoad:
 
 @dataclass(frozen=True, slots=True)
 class ClientLocation:
-    """The location of a client, as far as the client reports it. Replicas nearby are preferred."""
+    """The location of a client, as far as the client reports its location. Replicas near the client
+    are preferred.
+    """
 
     node: str = ""  # Ray's id of the client's node; empty outside the cluster
     boot_id: str = ""  # boot id of the client's machine; empty if it is unknown
@@ -107,7 +109,7 @@ def choose_replica(loads: Sequence[ReplicaLoad], location: ClientLocation) -> Re
 class _Candidate(NamedTuple):
     """A replica for a client."""
 
-    sessions: float  # sessions of `mean_sessions`
+    sessions: float  # number of sessions, computed by `mean_sessions`
     load: ReplicaLoad
 
 
@@ -183,7 +185,7 @@ def _tolerated(sessions: float) -> float:
 class _Excess:
     """The excess that a replica should send away: a number of sessions, or a load in `PARTS`."""
 
-    sizes: Counter[str]  # by connection
+    sizes: Counter[str]  # sizes by connection
     amount: int  # in the unit of `sizes`
     text: str  # for the log
 
@@ -197,8 +199,8 @@ class Siblings(Protocol):
     """
 
     async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
-        """Return the loads of the replicas near these locations, and of some others, that answer
-        quickly.
+        """Return the loads of replicas that answer quickly: the replicas near these locations, and
+        some other replicas.
         """
 
     async def announce_client(self, replica: str) -> Any:
@@ -278,8 +280,8 @@ class Rebalancer:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
-            *locations: Locations of the client in order of preference; the first one that suits any
-                replica is used.
+            *locations: Locations of the client in order of preference; the first location for which
+                a replica is suitable is used.
 
         Returns:
             The result of `Siblings.announce_client`; None if the client stays here.

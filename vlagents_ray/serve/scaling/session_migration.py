@@ -101,7 +101,7 @@ class HeldSessions:
         fetch_from: FetchFrom,
         spawn: Spawn,
     ) -> None:
-        """Hold the sessions of `engine`.
+        """Manage the sessions of `engine`.
 
         Args:
             engine: The engine of the replica.
@@ -130,7 +130,7 @@ class HeldSessions:
 
     async def copy(self, session_id: str, is_leaving: bool = False) -> SessionState | None:
         """Return the session's state after its queued acts; None if this replica does not have the
-        session, or if it cannot be pickled.
+        session, or if the session cannot be pickled.
 
         Args:
             session_id: The session.

@@ -111,7 +111,7 @@ class SiblingReplica(Peer):
         """Call a method of `HeldSessions`; raise `PeerEnded` or `PeerUnreachable`."""
         try:
             result: T = await self.call(method, *args)
-        except VLAgentsError as error:  # the server has another version
+        except VLAgentsError as error:  # the server has another version of this package
             raise PeerUnreachable(str(error)) from error
         return result
 
@@ -163,7 +163,7 @@ class ReplicasInCluster:
         self._initialized: set[str] = set()
 
     async def others(self) -> list[SiblingReplica]:
-        """Return the replicas."""
+        """Return proxies of the replicas."""
         actors = dict(await asyncio.to_thread(lambda: list(self._actors())))
         self._initialized &= actors.keys()  # without replicas that have ended
         return [SiblingReplica(name, actor, self._initialized) for name, actor in actors.items()]
@@ -197,8 +197,8 @@ class SiblingReplicas(ReplicasInCluster):
         return await self._loads_of(await self._audible())
 
     async def some_loads(self, near: Collection[ClientLocation] = ()) -> list[ReplicaLoad]:
-        """Return the loads of the replicas near these locations, and of 32 others, that answer
-        within 0.3 s.
+        """Return the loads of replicas that answer within 0.3 s: the replicas near these locations,
+        and 32 other replicas.
         """
         audible = await self._audible()
         self._last_loads = {
