@@ -1,6 +1,6 @@
 """The connection below a request or a WebSocket of uvicorn.
 
-ASGI exposes no connection; The protocol and the transport are attributes of uvicorn's bound method
+ASGI exposes no connection; the protocol and the transport are attributes of uvicorn's bound method
 `receive`.
 """
 
