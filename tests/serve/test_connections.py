@@ -43,7 +43,13 @@ from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.access.charges import Account, Charge
-from vlagents_ray.serve.endpoints import answers, http_connection, http_messages, own_port
+from vlagents_ray.serve.endpoints import (
+    answers,
+    http_connection,
+    http_messages,
+    message_connection,
+    own_port,
+)
 from vlagents_ray.serve.endpoints import shm as local
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -141,6 +147,8 @@ def replica(*, keyed: bool = True, slow_s: float = 60.0, idle_s: float = 60.0) -
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
     monkeypatch.setattr(periodic.each_half_second, "_period_s", 0.02)
+    # Time for a client to read the reason why its connection ends; many here never read it.
+    monkeypatch.setattr(message_connection, "_CLOSING_S", 0.5)
 
 
 @pytest.fixture
