@@ -1,4 +1,4 @@
-"""The fixtures of tests of evaluations."""
+"""Fixtures for tests of evaluations."""
 
 from evaluation_fixtures import commits_reach_the_disk, config
 

@@ -1,4 +1,4 @@
-"""A checkpoint that a trainer is still writing is never taken, and always in the end."""
+"""A checkpoint that a trainer is still writing is never used, but a complete one always is."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def safetensors(numbers: int = 50) -> bytes:
 
 
 def in_pieces(path: Path, data: bytes, pieces: int = 5) -> Iterator[None]:
-    """Write a file piece by piece; each yield is a moment at which somebody may look."""
+    """Write a file piece by piece. Between two yields a watcher may look at it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
         yield
@@ -43,7 +43,7 @@ def one_file(folder: Path) -> Iterator[None]:
 
 
 def shards(folder: Path) -> Iterator[None]:
-    """The index first, as the worst order that there is."""
+    """Write the index before the shards, which is the worst possible order."""
     names = [f"model-0000{i}.safetensors" for i in (1, 2)]
     weights = {"weight_map": {f"w{i}": name for i, name in enumerate(names)}}
     yield from in_pieces(folder / "model.safetensors.index.json", json.dumps(weights).encode(), 3)
@@ -59,7 +59,7 @@ def zipped(folder: Path) -> Iterator[None]:
 
 
 def renamed(folder: Path) -> Iterator[None]:
-    """As orbax does: under another name until it is whole."""
+    """Write like orbax does: under another name until the checkpoint is complete."""
     temporary = folder.with_name(f"{folder.name}.orbax-checkpoint-tmp-7")
     yield from in_pieces(temporary / "params" / "array", bytes(300))
     temporary.rename(folder)
@@ -74,14 +74,14 @@ def test_half_a_checkpoint_is_never_taken_and_a_whole_one_is(write: Write, tmp_p
     watcher = CheckpointWatcher(str(tmp_path / "{step}"), settle_s=10)
     now, moments = 0.0, 0
     for _ in write(tmp_path / "100"):
-        now += 1  # written on and on, with less than the settling time between two changes
+        now += 1  # continuous writes, with less than the settling time between two changes
         moments += 1
         assert watcher.scan(now) == []
     assert moments > 3
     assert watcher.scan(now + 9) == []
     assert watcher.waiting() == {100: "changed less than 10 s ago"}
     assert watcher.scan(now + 20) == [100]
-    assert watcher.scan(now + 99) == [], "each is told once"
+    assert watcher.scan(now + 99) == [], "each checkpoint is reported once"
 
 
 @pytest.mark.parametrize("write", KINDS)
@@ -117,7 +117,7 @@ def test_steps_are_found_in_any_part_of_the_path_with_and_without_leading_zeros(
     for name in ("step_000100", "step_2000", "step_0300", "last", "step_x"):
         list(one_file(tmp_path / name / "model"))
     watcher = CheckpointWatcher(str(tmp_path / "step_{step}" / "model"), settle_s=0)
-    assert watcher.scan(0) == [100, 2000], "0300 is no name that a policy would be served from"
+    assert watcher.scan(0) == [100, 2000], "a policy is never served from a folder named 0300"
 
 
 def test_what_the_policy_loads_has_to_be_there(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_watching_ends_when_the_trainer_says_so_and_all_is_taken(tmp_path: Path)
     def train(pause: int) -> None:
         if pause == 0:
             list(one_file(tmp_path / "10"))
-            (tmp_path / "20").mkdir()  # never gets anything in it
+            (tmp_path / "20").mkdir()  # this folder stays empty
             (tmp_path / FINISHED).touch()
 
     assert rounds_until(tmp_path, None, train) == [[10]]

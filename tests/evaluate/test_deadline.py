@@ -1,4 +1,4 @@
-"""An evaluation ends in time: which episodes it still begins, and what it says in the end."""
+"""An evaluation ends in time: the episodes that it still begins, and its messages at the end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JOBS = plan_jobs(plan_cases(flat_config(envs=["tabletop"], episodes=3, out="out"
 
 def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longest() -> None:
     assert (Deadline(None, [1e9]).leaves_room, Deadline(None).is_over) == (True, False)
-    for longest, leaves_room in ((90.0, False), (70.0, True)):  # of earlier runs
+    for longest, leaves_room in ((90.0, False), (70.0, True)):  # durations of earlier runs
         assert Deadline(100 + CLOSING_S, [20.0, longest], Clock()).leaves_room is leaves_room
     clock = Clock()
     deadline = Deadline(1000 + CLOSING_S, now=clock)
@@ -35,13 +35,13 @@ def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longes
     assert deadline.leaves_room
     clock.now = 1000 - 160 * MARGIN
     assert not deadline.leaves_room
-    assert not deadline.is_over, "what is being played may go on"
+    assert not deadline.is_over, "running episodes may continue"
     clock.now = 1000
     assert deadline.is_over
 
 
 class SlowAfterTwo(Progress):
-    """Once two episodes are recorded, there is no time for another one."""
+    """After two recorded episodes, the time does not suffice for another one."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._left, self._monkeypatch = 2, monkeypatch

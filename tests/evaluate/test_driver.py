@@ -1,4 +1,4 @@
-"""The driver of evaluations and rollouts: what becomes of each report."""
+"""The driver of evaluations and rollouts, and its handling of each report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ BROKEN = Failure("worker", EnvFailed.code, "the simulator exploded")
 
 
 class Collected(Consumer):
-    """Keeps the results of episodes, and whether each failed attempt was repeated."""
+    """A consumer that stores the results of episodes, and whether each failed attempt was
+    repeated.
+    """
 
     policy_cure, loss_cure = "mend the policy", "mend the simulator"
 
@@ -52,7 +54,7 @@ class Collected(Consumer):
 
 
 def driver_of(config: EvalConfig, consumer: Consumer) -> tuple[Driver, list[Job]]:
-    """A driver whose queue is empty, as if all its jobs were being run."""
+    """Return a driver whose queue is empty, as if all its jobs were running, and the jobs."""
     plan = resolve(config)
     return Driver(plan, [], consumer), plan_jobs(plan.cases)
 
@@ -81,7 +83,7 @@ def test_a_failed_attempt_is_repeated_until_its_episode_is_lost(config: Config) 
 def test_an_episode_whose_simulator_breaks_again_is_played_alone(
     config: Config, retries: int, alone: list[bool]
 ) -> None:
-    """Another episode in the same simulator may be the cause."""
+    """Another episode in the same simulator may be the cause of the failure."""
     driver, [job, *_] = driver_of(config(retries=retries), Collected())
     attempts = []
     for _ in range(retries):

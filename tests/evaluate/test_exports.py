@@ -1,4 +1,4 @@
-"""Tables of episodes: the same values in each format."""
+"""Tables of episodes: the same values in each format, and documented columns."""
 
 from __future__ import annotations
 

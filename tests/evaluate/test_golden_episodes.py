@@ -1,7 +1,8 @@
-"""The episodes of a small evaluation are those of earlier versions, byte for byte but for times.
+"""The episodes of a small evaluation are identical to those of earlier versions, byte for byte,
+except times.
 
-`python tests/evaluate/test_golden_episodes.py` writes golden_episodes.json again, after a change
-that is meant to change them: of an environment, a policy, or the keys of episodes.
+`python tests/evaluate/test_golden_episodes.py` writes golden_episodes.json again. This is needed
+after an intended change of an environment, a policy, or the keys of episodes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ SIZE = {"width": 32, "height": 32}
 ENVS = ["tabletop", "tabletop/lift", "tabletop/slide"]
 CHUNKS = {"chunk": 8, "action_dim": 4}
 
-# By name: the policy, its configuration, what the plan says of the policy, and of the suite.
+# Plans by name: the policy, its configuration, and the plan's settings of the policy and of the
+# suite.
 PLANS: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "expert": ("scripted", {}, {}, {"seeds": [0, 40]}),
     "expert, three envs side by side": ("scripted", {}, {}, {"num_envs": 3}),
@@ -38,7 +40,7 @@ PLANS: dict[str, tuple[str, dict[str, Any], dict[str, Any], dict[str, Any]]] = {
 
 
 def episodes(name: str, out: Path) -> list[dict[str, Any]]:
-    """Play a plan in this process, and return the outcomes of its episodes."""
+    """Run a plan in this process, and return the outcomes of its episodes."""
     policy, settings, in_plan, in_suite = PLANS[name]
     suite = {"envs": ENVS, "env_options": SIZE, "episodes": 4} | in_suite
     config = EvalConfig.model_validate(

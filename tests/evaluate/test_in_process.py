@@ -139,7 +139,7 @@ def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(
     summary = evaluate(config(env_options=trouble, workers=0), agent_factory=ToZero)
     with closing(sqlite3.connect(summary.out / "results.db")) as db:
         assert db.execute("SELECT episode FROM episodes WHERE attempts = 2").fetchall() == [(2,)]
-    assert len(summary.results.workers) == 2, "one for each simulator"
+    assert len(summary.results.workers) == 2, "one worker for each simulator"
     whole = evaluate(config(out=tmp_path / "whole", workers=0), agent_factory=ToZero)
     assert [one | {"key": 0} for one in outcomes(summary)] == [
         one | {"key": 0} for one in outcomes(whole)
@@ -164,7 +164,7 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
             waiting = [job for one in self._workers for job in one.jobs]
             reports = [*super().wait(timeout_s)]
             if waiting and waiting[0].key.episode == 2:
-                # It arrives here.
+                # The signal arrives during this wait.
                 threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGTERM)).start()
                 if cluster_is_lost:
                     raise ClusterLost("no head")
@@ -185,8 +185,8 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
 def test_failures_that_come_together_wait_for_a_signal_once(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A policy that is lost fails an episode of each environment at once, and all workers wait
-    meanwhile.
+    """A lost policy fails an episode of each environment at once. All workers wait for a signal
+    together, only once.
     """
     once, limits, wait = [True], [], StopRequest.wait
 
@@ -236,7 +236,7 @@ def test_results_are_read_without_ray(config: Callable[..., EvalConfig]) -> None
 
 
 class Slow(ToZero):
-    """Each action takes longer than the limit."""
+    """A policy whose actions take longer than the limit."""
 
     def act(self, obs: Obs) -> Act:
         time.sleep(0.5)

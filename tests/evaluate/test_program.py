@@ -1,4 +1,6 @@
-"""An evaluation is of one program: whatever file of it changes, results are not mixed."""
+"""An evaluation belongs to one version of the program: after a change of any of its files, results
+are not mixed.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ Play = Callable[..., EvalConfig]
 
 @pytest.fixture
 def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with an own environment, an own policy, and files that their settings name."""
+    """Create a folder with an environment, a policy, and files that their settings name."""
     folder = tmp_path / "work"
     for name, text in FILES.items():
         path = folder / name
@@ -68,7 +70,7 @@ def edit(name: str) -> None:
 
 
 def served(own_weights: str | None) -> dict[str, Any]:
-    """The metadata of a server of the policy, as a replica makes it."""
+    """Return the metadata of a server of the policy, like a replica creates them."""
     files = files_named({"checkpoint": "w.npz", "gains": "gains.yaml"})
     weights = {"digest": own_weights or digest_of(files), "revision": None}
     program = code_of_class("prog_pilot:Pilot") | files
@@ -90,7 +92,7 @@ def played(
     contract: dict[str, Any] | None = None,
     **changes: Any,
 ) -> EvalConfig:
-    """Play the episodes of a plan that have no result, without a simulator."""
+    """Run the episodes of a plan that have no result, without a simulator."""
     settings = {
         "envs": ["prog_env:Sea"],
         "episodes": episodes,
@@ -133,14 +135,16 @@ def merged(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results
 
 
 def watched(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
-    """One step of a training, then the same step with more episodes, and the next one."""
+    """Run one step of a training, make a change, and then run the same step with more episodes and
+    the next step.
+    """
     played(tmp_path / "out", steps=[1])
     again: dict[str, Any] = change() or {}
     settings = {"steps": [1, 2], "episodes": 3, **again, **options}
     return Results.load(played(tmp_path / "out", resume=True, **settings).out)
 
 
-# Each runs, makes a change, and runs on.
+# Each function begins an evaluation, makes a change, and continues the evaluation.
 CONTINUATIONS = [resumed, merged, watched]
 NAMED = [name for name in FILES if not name.endswith("__init__.py")]
 
@@ -177,7 +181,7 @@ def test_a_changed_file_is_refused_by_its_name_and_an_accepted_change_is_in_the_
     assert any(change.name.endswith(name) for change in found.accepted_changes)
     assert summarize(found).to_json()["accepted_changes"]
     column = "env_program" if name in ENV_FILES else "policy_program"
-    # Each step has its weights, which are in the results of its episodes.
+    # Each step has its own weights, which are recorded in the results of its episodes.
     swept = continuation is watched and name == "w.npz"
     assert len({row["weights" if swept else column] for row in rows(found)}) == 2
 
@@ -234,7 +238,7 @@ def test_two_policies_are_not_compared_in_different_environments(
 
 
 def compared(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
-    """Two policies in two folders, between which something changed."""
+    """Compare two policies in two folders, with a change between the two evaluations."""
     played(tmp_path / "a", **STATED)
     again: dict[str, Any] = change() or {}
     played(tmp_path / "b", **{**STATED, **again, "policy": "another"})
@@ -244,8 +248,8 @@ def compared(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Resul
 
 
 def reported(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
-    """As `compared`, by the page and the JSON of `report`, which name the pairs that they do not
-    compare.
+    """Compare like `compared`, through the page and the JSON of `report`. Both name the pairs that
+    are not compared.
     """
     played(tmp_path / "a", **STATED)
     again: dict[str, Any] = change() or {}
@@ -284,7 +288,7 @@ STATED: dict[str, Any] = {
     "contract": {"control_hz": 20},
 }
 COMMANDS = [resumed_as_stated, merged_as_stated, compared, reported]
-# What `--resume` rejects about an environment: the change, and the name that a message has for it.
+# Changes of an environment that `--resume` rejects: the change, and its name in the message.
 OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
     "its code": (lambda: edit("prog_parts/sea.py"), "prog_parts/sea.py was"),
     "a file of its settings": (lambda: edit("chart.txt"), "chart.txt was"),
@@ -322,8 +326,8 @@ def test_no_command_refuses_the_same_environment(
     assert command(tmp_path, lambda: None).accepted_changes == []
 
 
-# Settings that a deployment file gives a policy, and that no plan names: before, after, and the
-# change's name.
+# Policy settings in a deployment file that no plan contains: before, after, and the name of the
+# change.
 OF_THE_POLICY: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a setting": (
         {"config": {"steps": 4}},
@@ -382,9 +386,7 @@ def test_other_settings_of_a_policy_in_its_file_are_refused_unless_they_are_acce
 def test_settings_of_the_checkpoint_and_of_the_machine_are_no_change(
     work: Path, tmp_path: Path
 ) -> None:
-    """The checkpoint has its own comparison, and a server without these fields has stated
-    nothing.
-    """
+    """Checkpoints are compared separately, and a server without these fields declares nothing."""
     played(tmp_path, stated={"config": {"checkpoint": "a/1", "steps": 4}})
     played(
         tmp_path, stated={"config": {"checkpoint": "w.npz", "steps": 4}}, episodes=3, resume=True

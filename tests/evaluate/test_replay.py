@@ -1,4 +1,4 @@
-"""An episode again, from what is recorded of it."""
+"""Replaying an episode from its recording."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Config = Callable[..., EvalConfig]
 
 
 class Noisy(ToZero):
-    """Acts with other noise in each run from its fourth act on, by more than rounding."""
+    """A policy whose noise differs in each run from its fourth act, by more than rounding."""
 
     _draws: ClassVar[Iterator[int]] = itertools.count(10)
 
@@ -91,7 +91,9 @@ def test_without_a_trajectory_it_is_said_that_the_actions_differ(
 
 
 class Rounded(ToZero):
-    """Differs from the recorded policy in its third action, as in a batch of another size."""
+    """A policy that differs from the recorded one in its third action, like in a batch of another
+    size.
+    """
 
     def __init__(self, difference: float) -> None:
         super().__init__()
@@ -114,13 +116,15 @@ def test_rounding_is_told_from_another_action(
     found = actions_difference(recorded, replayed)
     assert found is not None
     assert found.step == 2
-    assert 0 < found.at_first <= 1.1 * difference, "relative, as the action is above 1"
+    assert 0 < found.at_first <= 1.1 * difference, (
+        "the difference is relative, since the action is above 1"
+    )
     assert found.is_rounding is is_rounding
     assert (compare(recorded, replayed) == []) is is_rounding
 
 
 class Drifting(ToZero):
-    """Differs from its third act on, each time by a larger number."""
+    """A policy that differs from its third act, by a number that grows with each act."""
 
     def __init__(self, first: float, factor: float) -> None:
         super().__init__()
@@ -143,8 +147,8 @@ class Drifting(ToZero):
 def test_rounding_may_grow_with_the_steps_but_not_begin_as_another_action(
     config: Config, tmp_path: Path, first: float, factor: float, is_rounding: bool
 ) -> None:
-    """A difference of 1e-7 at one step is 1e-5 some steps later, as each observation depends on
-    earlier actions.
+    """A difference of 1e-7 at one step becomes 1e-5 some steps later, since each observation
+    depends on earlier actions.
     """
     recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
     replayed = play(recorded.config(tmp_path / "again"), lambda: Drifting(first, factor))
@@ -169,7 +173,7 @@ def test_the_same_actions_have_no_difference_and_without_a_recording_it_is_unkno
 
 
 class Tired(Noisy):
-    """Is done with its sixth act."""
+    """A policy that is done with its sixth act."""
 
     def act(self, obs: Obs) -> Act:
         self._acts += 1

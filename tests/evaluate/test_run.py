@@ -62,7 +62,7 @@ def here(settings: EvalConfig, make: Callable[[], Agent] = ToZero) -> Summary:
 class TestOnACluster:
     @pytest.mark.parametrize(
         ("kind", "error"),
-        [  # in this process, test_in_process.py shows one that raises
+        [  # test_in_process.py tests a simulator that raises
             ("exit", f"the worker on {socket.gethostname()} died"),
             ("hang", "env step after 3 steps took longer than 8 s"),
             ("freeze", "no sign of life"),
@@ -85,7 +85,7 @@ class TestOnACluster:
         assert (attempt, cause) == (1, "worker")
         assert error in text
         assert f"misbehaving: {kind}" in log
-        assert "_misbehave" in stack or kind != "hang", "a hang shows where"
+        assert "_misbehave" in stack or kind != "hang", "the error shows the line of the hang"
 
     def test_a_policy_that_never_answers_is_an_infrastructure_failure(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
@@ -100,7 +100,8 @@ class TestOnACluster:
     def test_a_signal_keeps_what_is_finished_and_leaves_no_worker(
         self, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        found: list[str] = []  # when Ray is left, which takes long if it is being stopped as well
+        # names of processes when Ray is disconnected, which takes long if Ray is also being stopped
+        found: list[str] = []
 
         @contextlib.contextmanager
         def looking(plan: ResolvedPlan) -> Iterator[None]:

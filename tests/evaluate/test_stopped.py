@@ -1,4 +1,4 @@
-"""Evaluations in separate processes, with a Ray of their own, stopped from outside."""
+"""Evaluations in separate processes with a separate Ray, which are stopped from outside."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.evaluate import EvalConfig
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
-KEY = f"vlr_{os.urandom(8).hex()}"  # no other test's, which may run beside this one
+KEY = f"vlr_{os.urandom(8).hex()}"  # a unique key, since other tests may run at the same time
 
 SCRIPT = """
 import sys
@@ -55,7 +55,7 @@ def start(config: EvalConfig, ray_folder: Path) -> Popen[bytes]:
 
 
 def episodes(config: EvalConfig) -> list[tuple[int, int, int]]:
-    """(run, episode, attempts) of every recorded episode."""
+    """Return (run, episode, attempts) of each recorded episode."""
     if not (config.out / "results.db").exists():
         return []
     with closing(sqlite3.connect(config.out / "results.db")) as db:
@@ -77,13 +77,14 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
 
     with start(settings, ray_folder) as evaluation:
         wait_for(lambda: all((tmp_path / f"gate-{seed}").exists() for seed in (5, 6)))
-        wait_for(lambda: len(episodes(settings)) == 5)  # both workers are in mid-episode
-        # A process that is being started has its parent's environment for a moment.
+        # both workers are in the middle of an episode
+        wait_for(lambda: len(episodes(settings)) == 5)
+        # A process that is starting has its parent's environment for a moment.
         wait_for(lambda: leaked(KEY, [ray_folder]) == [f"/proc/{evaluation.pid}/environ"])
         if number == signal.SIGKILL:
             evaluation.kill()
         else:
-            os.killpg(evaluation.pid, number)  # as a terminal does, or a service manager
+            os.killpg(evaluation.pid, number)  # like a terminal or a service manager does
         assert evaluation.wait(300) == code
     wait_for_end(ray_folder, "Rollout")
     wait_for(lambda: not processes(ray_folder) and not [*ray_folder.iterdir()])
@@ -91,7 +92,7 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     if number != signal.SIGKILL:
         assert json.loads((settings.out / "summary.json").read_text())["state"] == "interrupted"
 
-    # Without another Ray: tests/integration/test_cli.py resumes with workers.
+    # This run needs no further Ray; tests/integration/test_cli.py resumes with workers.
     with start(
         config(episodes=9, env_options=options, workers=0, resume=True), ray_folder
     ) as evaluation:

@@ -1,4 +1,6 @@
-"""Each case is told once, when it is complete, and trackers never harm the evaluation."""
+"""Each case is reported to trackers once, when it is complete, and failing trackers never harm the
+evaluation.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ Config = Callable[..., EvalConfig]
 
 
 class Listener:
-    """Keeps what it is told."""
+    """A tracker that stores its calls."""
 
     begun: ClassVar[list[TrackedPolicy]] = []
     told: ClassVar[list[tuple[str, int | None, dict[str, float]]]] = []
@@ -64,7 +66,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
-    """What is told of the results as they are, and nothing of before."""
+    """Report the current results to a new tracker, and return its calls."""
     Listener.told.clear()
     with TrackerFeed(resolve(config)) as told:
         told.update()

@@ -1,5 +1,5 @@
-"""Stops, pauses, take-overs and commands from afar in any order: the robot moves only when it is
-allowed to.
+"""Stops, pauses, take-overs and remote commands in any order: the robot moves only when this is
+allowed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import OF_THE_LOOP, SAFE
 from vlagents_ray.robot import Guard, LoopOptions, Watchdog, run_loop
 
-HUMANS, WILD = 0.5, 9.0  # actions; the policy's are below 0.3
+HUMANS, WILD = 0.5, 9.0  # values of actions; the policy's are below 0.3
 GARBAGE = st.one_of(
     st.none(),
     st.booleans(),
@@ -43,11 +43,11 @@ GARBAGE = st.one_of(
     st.just(float("nan")),
     st.just(-1e9),
 )
-ENDING_S = 30.0  # a loop that does not end in this time is what fails
+ENDING_S = 30.0  # time limit after which a loop that does not end counts as failed
 
 
 def event(**drawn: Any) -> Callable[[Callable[..., None]], Any]:
-    """Make a rule of what happens between two ticks, with up to two ticks after it."""
+    """Make a Hypothesis rule from an event between two ticks, followed by up to two ticks."""
 
     def decorate(function: Callable[..., None]) -> Any:
         def happen(machine: Machine, after: int, **values: Any) -> None:
@@ -61,7 +61,7 @@ def event(**drawn: Any) -> Callable[[Callable[..., None]], Any]:
 
 
 class Machine(RuleBasedStateMachine):
-    """A control loop that makes a tick when a rule says so, and a model of what may move the
+    """A control loop that runs a tick when a rule requests it, and a model of what may move the
     robot.
     """
 
@@ -69,12 +69,13 @@ class Machine(RuleBasedStateMachine):
         super().__init__()
         self.commanded_stop = self.paused = self.ticked = False
         self.barked: set[str] = set()
-        self.held = self.engaged = False  # the human's device, and as it was polled last
+        self.held = self.engaged = False  # state of the human's device, now and at the last poll
         self.wild = self.broken = False
         self.info: dict[str, Any] = {}
         self.from_afar: list[dict[str, str]] = []
         self.passed: list[bytes] = []
-        # Applied actions of a run that are the human's, and not safe ones in their place.
+        # Number of applied actions in a run that came from the human, without the safe actions that
+        # replaced rejected ones.
         self.humans = 0
         self.wrong: list[str] = []
         self.thread: threading.Thread | None = None
@@ -94,7 +95,9 @@ class Machine(RuleBasedStateMachine):
         played=st.booleans(),
     )
     def build(self, *, simulated: bool, options: dict[str, Any], played: bool) -> None:
-        """Build a robot, with a chunk player and its leader, or with a policy of single actions."""
+        """Build a robot with a chunk player and its leader, or with a policy that returns single
+        actions.
+        """
         machine = self
 
         class Passing(Guard):
@@ -156,7 +159,7 @@ class Machine(RuleBasedStateMachine):
             self.failing = False
             raise RuntimeError("a sensor")
         if self.simulated and self.ticked:
-            self.barked.discard("server")  # which the last tick was a sign of life of
+            self.barked.discard("server")  # the last tick was a sign of life of the server
         self.ticked = True
         return Obs()
 
@@ -166,7 +169,7 @@ class Machine(RuleBasedStateMachine):
         """Compare an action with the model."""
         value = float(action[0])
         humans = value == HUMANS
-        # The guard rejects a wild one, and a safe one takes its place.
+        # The guard rejects a wild action, and a safe action replaces it.
         accepted = self.engaged and not self.wild
         self.humans += accepted
         if self.commanded_stop or self.barked:
@@ -213,13 +216,13 @@ class Machine(RuleBasedStateMachine):
                     f"{interventions} interventions, of which {self.humans} are the human's"
                 )
         except InvalidAction:
-            # A wild action before the first one, as there is nothing to hold: the run ends with a
-            # stop.
+            # A wild action came before the first accepted one. Then there is nothing to hold, so
+            # the run ends with a stop.
             pass
         except RuntimeError as error:
             if str(error) != "a sensor":
                 self.wrong.append(repr(error))
-        except Exception as error:  # noqa: BLE001 - a loop that ends by itself would hide everything that follows
+        except Exception as error:  # noqa: BLE001 - a loop that ends by itself would hide all later events
             self.wrong.append(repr(error))
         self.over = True
         self.ready.release()
@@ -233,7 +236,7 @@ class Machine(RuleBasedStateMachine):
         assert self.ready.acquire(timeout=ENDING_S)
 
     def tick(self, times: int) -> None:
-        """Make ticks, in another run if the last one is over."""
+        """Run ticks, in another run if the last one has ended."""
         for _ in range(times):
             if self.over:
                 self._begin()
@@ -369,7 +372,7 @@ def test_nothing_moves_after_a_stop_or_in_a_pause_or_past_the_guard_in_any_order
 
 
 class Loop(Agent):
-    """A policy whose answers have this in their info."""
+    """A policy whose answers have a given info."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
 

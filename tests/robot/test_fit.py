@@ -1,4 +1,4 @@
-"""Whether a checkpoint's training fits the arm, before the first motion."""
+"""The comparison of a checkpoint's training data with the arm, before the first motion."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> 
     assert "number 1 is 'lift'" in second
     assert Trained().misfits(None, None, MotionLimits(joints=("pan.pos", "lift.pos")), NAMES) == []
     assert Trained().misfits(None, None, MotionLimits(joints=("joint1", "joint2")), NAMES) == [], (
-        "other names say nothing"
+        "other names prove nothing"
     )
 
 
@@ -173,7 +173,7 @@ class Standing:
 
 
 class Nameless(Standing):
-    """A robot that names no joints."""
+    """A robot without names of joints."""
 
     joint_names = ()
 

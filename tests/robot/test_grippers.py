@@ -1,5 +1,5 @@
-"""No producer of commands changes a gripper on its own: each of them, for both kinds of actions,
-one arm and two.
+"""No source of commands changes a gripper by itself, for both kinds of actions and for one or two
+arms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ KINDS = [
 
 
 def spec_of(delta: bool, arms: int) -> ActionSpec:
-    """Return actions of three joints and a gripper for each arm."""
+    """Return the specification of actions with three joints and a gripper for each arm."""
     names = tuple(f"arm{i}" for i in range(arms)) if arms > 1 else None
     return ActionSpec(
         dim=4 * arms,
@@ -49,7 +49,7 @@ def spec_of(delta: bool, arms: int) -> ActionSpec:
 
 
 def limits_of(arms: int, gripper: float) -> MotionLimits:
-    """Return limits with a speed of the grippers, units/s."""
+    """Return limits whose gripper speed is `gripper`, in units/s."""
     return MotionLimits(
         velocity=(1.0, 1.0, 1.0, gripper) * arms,
         acceleration=(20.0, 20.0, 20.0, 20 * gripper) * arms,
@@ -64,7 +64,7 @@ def test_the_columns_are_the_last_of_each_arms_part() -> None:
     assert spec_of(False, 2).delta_columns(8) == []
     assert ActionSpec(delta=True).gripper_columns(7) == []
     assert ActionSpec(gripper_closed=0.0).gripper_columns(7) == [6], (
-        "also if only one of its ends is stated"
+        "this must also hold if only one end of the gripper is declared"
     )
 
 
@@ -100,7 +100,7 @@ def test_a_safe_action_keeps_each_gripper_and_the_neutral_one_opens_all(
 
 
 class Grasping(Agent):
-    """A policy whose grippers close and open in turn; now and then its server is gone."""
+    """A policy whose grippers close and open in turn, and whose server is sometimes unavailable."""
 
     contract: Contract | None = None
 
@@ -136,7 +136,7 @@ class Grasping(Agent):
 def test_a_grippers_command_is_the_last_one_or_the_policys(
     delta: bool, arms: int, mode: str, seed: int
 ) -> None:
-    """Ease-in, hold, lost answers, pauses and stops change no gripper that has no limits."""
+    """Ease-in, hold, lost answers, pauses and stops change no gripper without limits."""
     spec = spec_of(delta, arms)
     columns = spec.gripper_columns(4 * arms)
     policy = Grasping(spec, seed, largest_change=2.0)
@@ -155,9 +155,9 @@ def test_a_grippers_command_is_the_last_one_or_the_policys(
             if event == "pause":
                 player.control.pause()
             elif event == "stop" and last is not None:
-                player.act(Obs(state={"joints": joints}))  # is not executed
+                player.act(Obs(state={"joints": joints}))  # this action is not executed
                 player.interrupt()
-                # The fingers give way.
+                # The fingers yield.
                 joints = joints + np.float32(0.2) * np.isin(np.arange(len(joints)), columns)
             act = player.act(Obs(state={"joints": joints}))
             player.control.resume()
@@ -205,7 +205,7 @@ def test_a_gripper_with_limits_goes_from_the_last_command_to_the_policys_and_not
         player.interrupt()
         commands = [first] + [player.act(Obs(state={"joints": joints})).action for _ in range(300)]
     path = np.array(commands)[:, columns]
-    assert (np.diff(path, axis=0) <= 1e-6).all(), "closes, and never opens"
+    assert (np.diff(path, axis=0) <= 1e-6).all(), "the gripper only closes"
     assert np.abs(np.diff(path, axis=0)).max() * HZ <= 2.0 * 1.001
     assert np.allclose(path[-1], CLOSED)
 
@@ -247,7 +247,7 @@ def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(
 
 
 def test_arms_whose_openings_are_unknown_stand_until_the_first_action_that_is_accepted() -> None:
-    """No safe action is known of them, and the loop needs none for a robot that stands."""
+    """No safe action is known for them. The loop needs none for a robot that stands still."""
     spec = spec_of(True, 2)
 
     class TooFast(Agent):
@@ -285,7 +285,7 @@ def test_a_number_of_the_second_arm_that_is_not_finite_moves_neither_arm(
             self.chunks += 1
             rows = np.full((4, 8), 0.001, np.float32)
             rows[:, [3, 7]] = 0.5
-            if self.chunks > 1:  # the first chunk, that of the reset, raises
+            if self.chunks > 1:  # the first chunk is the reset's, and raises an error
                 rows[2, column] = broken
             return Act(rows)
 

@@ -1,4 +1,4 @@
-"""The guard: what it rejects, and what passes as it is."""
+"""The guard: the actions that it rejects, and the actions that it passes unchanged."""
 
 from __future__ import annotations
 

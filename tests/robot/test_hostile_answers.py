@@ -1,5 +1,6 @@
-"""What a server says besides actions, of any type: a run of the control loop depends on none of it,
-or ends with an error of the package before the first motion, and no text of it forges a line.
+"""Data of any type next to the actions in a server's answers: it does not affect a run of the
+control loop, or the run ends with an error of this package before the first motion; and no text of
+it can forge a log line.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Arm:
 
 
 class Told(Agent):
-    """Acts, and passes on what a server said."""
+    """A policy that acts, and returns the given info of a server."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
     reads_slo = True

@@ -1,5 +1,5 @@
-"""Interventions in the control loop: how long they take to begin, what the robot gets, and what
-is recorded.
+"""Interventions in the control loop: the delay of their start, the robot's actions, and the
+recordings.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
 
 
 class Going(Agent):
-    """Goes on by 0.01 a tick from where the robot stands."""
+    """A policy that moves by 0.01 per tick from the robot's position."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False, low=-3.0, high=3.0))
 
@@ -43,7 +43,7 @@ class Going(Agent):
 
 
 class Arm(SimulatedRobot):
-    """Keeps what it was commanded, and stands there at once."""
+    """An arm that stores its commands and reaches them at once."""
 
     def __init__(self) -> None:
         super().__init__(Going.contract)
@@ -86,7 +86,7 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
     recorder = Recorder(tmp_path, HZ, frames=1000, interventions=True)
 
     def answered() -> bool:
-        """Let the policy answer within a tick, as no time passes between ticks."""
+        """Wait until the policy has answered, since no simulated time passes between ticks."""
         wait_for(lambda: player._caller is None or not player._caller.busy, every_s=0.001)
         return False
 
@@ -102,19 +102,19 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
     assert 49 <= len(led) <= 51
     assert report.interventions == len(led) == len(leader.given)
     assert led == list(range(led[0], led[0] + len(led)))
-    assert abs(led[0] - round(1.0 * HZ)) <= 1, "at the first tick after the human wants the robot"
+    assert abs(led[0] - round(1.0 * HZ)) <= 1, "at the first tick after the human engages"
     first = seen["tick"].index(led[0])
     human = np.array(seen["action"])[first : first + len(led)]
     policy = np.array(seen["policy_action"])[first : first + len(led)]
     assert human == pytest.approx(np.array(leader.given))
     assert all(seen["policy_known"][first : first + len(led)])
-    assert (policy > human).all(), "it wants to go the other way"
+    assert (policy > human).all(), "the policy moves in the opposite direction"
     others = [
         i for i in range(len(seen["tick"])) if not seen["intervention"][i] and not seen["safe"][i]
     ]
     assert [seen["policy_action"][i] for i in others] == [seen["action"][i] for i in others]
     steps = np.abs(np.diff(np.stack([np.zeros(2), *arm.commanded]), axis=0))
-    assert steps.max() <= MAX_STEP + 1e-6, "at the release, too"
+    assert steps.max() <= MAX_STEP + 1e-6, "also at the release"
     assert all(action.tolist() in guarded for action in arm.commanded)
 
 
@@ -133,9 +133,7 @@ def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: Simul
 
 
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
-    """A silent policy gives safe actions; a human's count as signs of life of whoever moves the
-    robot.
-    """
+    """A silent policy yields only safe actions. A human's actions count as signs of life."""
     gate = threading.Event()
 
     class Hanging(Going):
@@ -154,7 +152,7 @@ def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
         def over() -> bool:
             if len(arm.commanded) == 75 and leader.held:
                 assert watchdog.barks == []
-                leader.held = False  # from here on, nobody moves it but the silent policy
+                leader.held = False  # from here on, only the silent policy controls the robot
             return bool(watchdog.barks)
 
         report = run_loop(arm, player, hz=HZ, until=over, watchdog=watchdog)
@@ -236,7 +234,7 @@ def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything
 def test_a_recorded_frame_is_the_policys_or_an_operators_or_a_safe_one(
     tmp_path: Path, mode: Any, *, relative: bool
 ) -> None:
-    """The operator's action is within the bounds, beyond them, or missing, one after the other."""
+    """The operator's action is within the limits, beyond them, or missing, one after the other."""
 
     class Still(Agent):
         contract = Contract(action=ActionSpec(dim=2, delta=relative))

@@ -1,5 +1,5 @@
-"""Limits of speed, acceleration and jerk, where they come from, and the slow ways from and to
-rest.
+"""Limits of speed, acceleration and jerk, their sources, and the slow motions from and to the rest
+pose.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ def run(checked: Guard, *positions: float) -> None:
 
 def test_speeding_up_is_limited_and_braking_is_not() -> None:
     limits = MotionLimits(velocity=1.0, acceleration=10.0)
-    # braking, and away in the other direction from rest.
+    # braking, and starting in the other direction from rest.
     run(guard(limits), 0, 0.0039, 0.0078, 0.0078, 0.0039)
     for positions, said, cause in (
         ((0, 0.0041), "expected acceleration of at most 10 .*, got 10.25", "dynamics"),
-        # Turns round at once.
+        # An immediate reversal.
         ((0, 0.0030, 0.0060, 0.0030), "acceleration of at most 10 .*, got -15", "dynamics"),
         ((0, 0.021), "expected velocity of at most 1 .*, got 1.05", "max_step"),
     ):
@@ -121,7 +121,7 @@ def test_limits_need_the_rate_and_as_many_numbers_as_an_action_has() -> None:
 
 
 class Arm:
-    """Executes exactly what it is commanded."""
+    """An arm that executes its commands exactly."""
 
     simulated = True
 
@@ -140,7 +140,7 @@ class Arm:
 
 
 class Line(Agent):
-    """Moves at a constant speed from where it was first asked, in chunks."""
+    """A policy that moves at a constant speed from its first observed position, in chunks."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
 
@@ -177,7 +177,8 @@ def test_the_first_action_is_eased_in_from_the_measured_pose_and_the_plan_follow
     for order, limit in ((1, 4.0), (2, 80.0), (3, 16000.0)):
         assert np.abs(np.diff(path[: len(path) - 1], order)).max() * 200**order <= limit * 1.01
     assert np.isclose(path[-1], rows[-1])
-    assert np.isclose(path[-30:], rows[-30:], atol=1e-6).all()  # each row is executed, none skipped
+    # each row is executed, and none is skipped
+    assert np.isclose(path[-30:], rows[-30:], atol=1e-6).all()
 
 
 def test_a_first_action_that_is_far_away_is_refused_with_the_distance() -> None:
@@ -227,7 +228,7 @@ def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
     )
     limits = MotionLimits.read(tmp_path / "arm.yaml")
     assert limits.joints == ("pan", "lift")
-    assert limits.velocity == (2.0, 2.5)  # the stricter of the file and the URDF
+    assert limits.velocity == (2.0, 2.5)  # the stricter limit of the file and the URDF
     assert limits.acceleration == (8, math.inf)
     assert limits.low == (-1.5, -1.0)
     checked = guard(limits)
@@ -266,7 +267,7 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
 def test_the_tip_of_any_chain_is_where_its_transforms_put_it(
     tmp_path: Path, seed: int, unit: str
 ) -> None:
-    """Joints of all kinds with axes in any direction, in the order from the tip to the base."""
+    """Joints of all kinds with axes in any direction, listed in order from the tip to the base."""
     random = np.random.default_rng(seed)
     kinds = random.permutation(["revolute", "continuous", "prismatic", "fixed", "revolute"])
     elements: list[str] = []
@@ -275,7 +276,7 @@ def test_the_tip_of_any_chain_is_where_its_transforms_put_it(
     for number, kind in enumerate(kinds):
         offset, rpy, axis = random.uniform(-3, 3, (3, 3))
         axis_element = f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
-        if number == seed % 5:  # URDF's default
+        if number == seed % 5:  # the default of URDF
             axis, axis_element = np.array([1.0, 0.0, 0.0]), ""
         elements.append(
             f'<joint name="joint{number}" type="{kind}"><parent link="link{number + 1}"/>'
@@ -343,11 +344,11 @@ def test_a_dataset_gives_the_limits_of_its_demonstrations(tmp_path: Path) -> Non
     pq.write_table(pa.table(columns), tmp_path / "data/chunk-000/file-000.parquet")
     limits = MotionLimits.read(tmp_path)
     assert limits.joints == ("a.pos", "b.pos")
-    # Twice that of the path, without a jump between.
+    # Twice the speed of the path, without a jump between the episodes.
     assert limits.velocity == pytest.approx((1.3, math.inf), rel=0.01)
     assert limits.acceleration == pytest.approx((2.0, math.inf), rel=0.01)
     assert limits.low == pytest.approx((-0.1, 0), abs=0.01)
     last = None
     checked = Guard(limits=limits, hz=30)
-    for action in episodes[0]:  # the soft start accepts the demonstrations themselves
+    for action in episodes[0]:  # the soft start also accepts the demonstrations
         last = checked(action, last)

@@ -1,5 +1,5 @@
-"""Every plan within half of the limits is executed within a bounded time, from wherever the arm
-stands before it.
+"""Each plan within half of the limits is executed within a bounded time, from any initial pose of
+the arm.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, Pla
 from vlagents_ray.interface import SAFE
 from vlagents_ray.robot import Guard, MotionLimits
 
-SPEED, ACCELERATION, JERK = 1.5, 15.0, 600.0  # those of docs/guard.md
+SPEED, ACCELERATION, JERK = 1.5, 15.0, 600.0  # the limits in docs/guard.md
 RUN_S = 4.0
-RUNS = 25  # a test; four seeds make 100
+RUNS = 25  # runs per test; four seeds make 100
 
 
 class Swinging(Agent):
-    """A plan of one joint, a sine at a share of the strictest limit; row k of it is the same in
-    each answer.
+    """A policy that plans a sine for one joint, at a share of the strictest limit. Row k of the
+    plan is the same in each answer.
     """
 
     contract: Contract | None = None
@@ -67,11 +67,11 @@ def executed(
     """Return the share of a run's ticks that were rows of the plan, and the number of rejected
     actions.
 
-    With chunks of a stated length, each answer comes within a tick.
+    With a given `chunk` length, each answer arrives within a tick.
     """
     hz = float(random.choice([10, 30, 50, 100]))
     policy = Swinging(random, hz, share, delta=delta, chunk=chunk)
-    # Where the first row is, a row before it, between rows, and ahead of it.
+    # Initial poses at the first row, one row before it, between rows, and ahead of the first row.
     pose = np.float32(policy.pose(random.choice([0.0, -1.0, -0.5, 0.3])))
     guard = Guard(
         policy.contract,
@@ -120,7 +120,7 @@ def test_a_plan_within_half_of_the_limits_is_executed(
     for _ in range(RUNS):
         rows, refused = executed(random, "open_loop", share, soft_start_s, delta=delta)
         assert refused == 0
-        assert rows > 0.5, "the ease-in is over within half of the run"
+        assert rows > 0.5, "the ease-in must end within half of the run"
 
 
 @pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
@@ -135,8 +135,8 @@ def test_answers_during_the_ease_in_do_not_keep_the_robot_from_moving(delta: boo
 @pytest.mark.parametrize(
     ("mode", "chunk", "at_least"),
     [
-        # The shorter the chunks, the lower the speed at which the ramp can end exactly at each last
-        # row.
+        # With shorter chunks, the ramp must be able to end exactly at each last row, which limits
+        # its speed.
         ("open_loop", 1, 0.15),
         ("open_loop", 2, 0.25),
         ("open_loop", 3, 0.3),

@@ -1,4 +1,4 @@
-"""The control loop: its schedule, what it does when things go wrong, and what it reports."""
+"""The control loop: its schedule, its behaviour after faults, and its reports."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HZ = 200.0
 
 
 class Going(Agent):
-    """Absolute targets that grow by 0.01 a tick."""
+    """A policy with absolute targets that grow by 0.01 per tick."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False, low=-1.0, high=1.0))
 
@@ -60,8 +60,8 @@ class Going(Agent):
 
 
 def set_limit(watchdog: Watchdog, name: str, silent_s: float) -> None:
-    """Of a watchdog that runs. A busy machine keeps a loop from a short one's sign of life until
-    it is wanted.
+    """Change a limit of a running watchdog. With a short limit from the start, a busy machine could
+    delay the loop's sign of life.
     """
     with watchdog._changed:
         watchdog._limits[name] = silent_s
@@ -69,7 +69,7 @@ def set_limit(watchdog: Watchdog, name: str, silent_s: float) -> None:
 
 
 class Hanging(Going):
-    """Returns its fourth action once the watchdog has stopped the robot."""
+    """A policy whose fourth action returns only after the watchdog has stopped the robot."""
 
     def __init__(self) -> None:
         super().__init__(done_at=5)
@@ -88,7 +88,7 @@ class Hanging(Going):
 
 
 class Watched(SimulatedRobot):
-    """Keeps what it was commanded."""
+    """A robot that stores its commands."""
 
     def __init__(self, contract: Contract | None = None) -> None:
         super().__init__(contract)
@@ -113,7 +113,7 @@ def test_a_robot_that_must_not_move_is_stopped_and_goes_on_by_itself_with_a_new_
             asked.append(len(robot.commanded))
             return Act(np.tile(super().act(obs).action, (50, 1)))
 
-    def until() -> bool:  # before each tick
+    def until() -> bool:  # called before each tick
         ticks.append(len(ticks))
         robot.holds = "the camera hangs" if 5 <= len(ticks) < 15 else None
         return len(ticks) > 20
@@ -121,10 +121,10 @@ def test_a_robot_that_must_not_move_is_stopped_and_goes_on_by_itself_with_a_new_
     ticks: list[int] = []
     report = run_loop(robot, ChunkPlayer(Asked()), hz=HZ, until=until)
     assert (report.safe, report.reasons) == ({"robot": 10}, {"robot": "the camera hangs"})
-    assert robot.stops == 2  # as it began to hold, and at the end
+    assert robot.stops == 2  # when it began to hold, and at the end
     assert len(robot.commanded) == 10
     assert asked[0] == 0
-    assert len(asked) >= 2, "the plan from before was dropped"
+    assert len(asked) >= 2, "the earlier plan was dropped"
 
 
 def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
@@ -138,7 +138,7 @@ def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
     assert time.perf_counter() - begun >= ticks[-1] / HZ
     assert min(pacer.late_s) >= 0
     told = jitter([0.0001, 0.0001, 0.003], missed=1)
-    assert told["on_time"] == 0.5, "a missed tick counts as one that was late"
+    assert told["on_time"] == 0.5, "a missed tick counts as late"
     assert told["p50_ms"] == pytest.approx(0.1)
     assert told["max_ms"] == pytest.approx(3.0)
 
@@ -159,13 +159,13 @@ def test_the_process_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch, *, froze
             assert not gc.isenabled()
             assert done
             assert len(gc.get_objects()) < len(heap), (
-                "a collection within the loop would go through all of them"
+                "a collection within the loop would scan all of them"
             )
         after = settings()
         assert (after[0], *after[2:]) == (before[0], *before[2:])
         assert (gc.get_freeze_count() >= before[1]) if frozen else (gc.get_freeze_count() == 0)
     finally:
-        gc.freeze()  # as conftest.py has it
+        gc.freeze()  # like in conftest.py
 
 
 @pytest.mark.parametrize("real_time", [False, True])
@@ -174,7 +174,8 @@ def test_where_threads_have_no_priorities_the_loop_does_without(
 ) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.delattr(os, "sched_getscheduler")
-    monkeypatch.setattr(os, "getpriority", lambda *_: os.kill(2**22 + 1, 0))  # no such process
+    # there is no such process
+    monkeypatch.setattr(os, "getpriority", lambda *_: os.kill(2**22 + 1, 0))
     with undisturbed(real_time=real_time) as done:
         assert "no priority (only on Linux)" in done
 
@@ -192,7 +193,7 @@ def test_a_slow_tick_costs_the_ticks_until_the_end_that_it_covers(
     slow_at: int, ticks: int, missed: int
 ) -> None:
     report = run_loop(Watched(Going.contract), Going(slow_at=slow_at), hz=HZ, seconds=ticks / HZ)
-    assert report.jitter["missed"] >= missed  # the next one begins late, but in its time
+    assert report.jitter["missed"] >= missed  # the next tick begins late, but within its period
     assert report.jitter["ticks"] + report.jitter["missed"] == ticks
 
 
@@ -253,7 +254,8 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
         Bounded(), PlayerSettings(deadline_s=30.0, safe=np.full(2, 9.0)), check=guard
     )
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
-    assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]  # neither what is planned nor the 9
+    # neither the rest of the plan nor the 9
+    assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]
     assert report.safe_ticks == 3
     run_loop(robot, player, hz=HZ, seconds=0.05, options=LoopOptions(guard=guard))
     with pytest.raises(ConfigError, match="got both; leave one out"):
@@ -309,19 +311,19 @@ def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_ag
     ticks = [round(100 * value) for value in robot.commanded]
     applied = [tick for tick in ticks if at_bark[0] + 1 < tick < at_bark[0] + 19]
     assert applied == []
-    assert ticks[-1] >= at_bark[0] + 25  # and goes on then
+    assert ticks[-1] >= at_bark[0] + 25  # and the loop continues
     assert report.safe["stopped"] >= 17
     assert "no signal from the server" in report.reasons["stopped"]
 
 
 class Hardware(Watched):
-    """As far as the loop knows."""
+    """A robot that the loop treats as real hardware."""
 
     simulated = False
 
 
 class Silenced(Going):
-    """A server that is silent from its sixth action on until the test ends that."""
+    """A policy whose server is silent from the sixth action until the test ends the silence."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
     silent = True
@@ -343,18 +345,18 @@ def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_
     kind: type[Watched], restart: Any
 ) -> None:
     robot, agent = kind(Going.contract), Silenced()
-    told: list[tuple[bool, int]] = []  # whether a restart was granted, and at which tick
+    told: list[tuple[bool, int]] = []  # whether a restart was accepted, and at which tick
     barked_at: list[int] = []
 
     def bark(_: str) -> None:
         robot.stop()
         barked_at.append(agent.tick)
-        watchdog._limits["server"] = 1e3  # on a busy machine it would bark again
+        watchdog._limits["server"] = 1e3  # on a busy machine it would trigger again
 
     watchdog = Watchdog(bark, {"server": 60.0})
 
     def over() -> bool:
-        if agent.tick == 5:  # what comes next is silence
+        if agent.tick == 5:  # the silence begins with the next tick
             set_limit(watchdog, "server", 0.1)
         since = agent.tick - barked_at[0] if barked_at else 0
         if since == 10:
@@ -370,7 +372,7 @@ def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_
     )
     ticks = [round(100 * value) for value in robot.commanded]
     again = min(tick for tick in ticks if tick > barked_at[0] + 2)
-    assert told[0][0] is False  # while it was silent
+    assert told[0][0] is False  # during the silence
     assert told[1][0] is True
     assert ticks[-1] >= barked_at[0] + 75
     if restart == "auto" or kind is Watched:
@@ -378,7 +380,7 @@ def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_
     else:
         assert again >= told[1][1] - 1
         assert report.safe["stopped"] >= 20
-    # Nothing of what it returned meanwhile was executed.
+    # No action from the time of the stop was executed.
     assert agent.interrupts >= again - barked_at[0] - 3
     assert len(watchdog.barks) == 1
 
@@ -476,7 +478,7 @@ def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where
     agent = Still()
 
     def bark(_: str) -> None:
-        moved._joints = moved._target = np.full(2, -0.9, np.float32)  # by hand
+        moved._joints = moved._target = np.full(2, -0.9, np.float32)  # moved by hand
         watchdog._limits["server"] = 1e3
         agent.silent = False
 
@@ -516,7 +518,7 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(
             try:
                 raise Failure
             except Failure as error:
-                kept = error  # a cycle: the error's traceback, this frame, the error
+                kept = error  # a reference cycle of the error, its traceback and this frame
                 living.add(kept)
             most = max(most, len(living))
             act = super().act(obs)
@@ -525,7 +527,7 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(
     report = run_loop(Watched(Going.contract), Failing(), hz=1000, seconds=1.0)
     ticks = report.jitter["ticks"]
     assert ticks + report.jitter["missed"] == 1000
-    assert most <= 60  # 50 ticks, which are collected together, and those of a collection
+    assert most <= 60  # 50 ticks, which are collected together, and the ticks during a collection
     assert len(report.safe) == len(report.reasons) == 1
     assert report.safe_ticks == ticks
     pacer = Pacer(1000)

@@ -1,5 +1,5 @@
-"""Every entry point that moves an arm compares policy and arm before the first motion: misfits
-by entry points.
+"""Each entry point that moves an arm compares policy and arm before the first motion: all misfits
+at all entry points.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Policy(Agent):
 
 
 class Arm:
-    """An arm that counts what moves it; the command line makes it by name."""
+    """An arm that counts its motions; the command line creates it by name."""
 
     contract = Contract(**RIGHT)
     joint_names = ("pan", "lift")

@@ -1,5 +1,5 @@
-"""Limits of motion for both kinds of actions, one arm and two: no accepted sequence exceeds
-them, from the first on.
+"""Motion limits for both kinds of actions and for one or two arms: no accepted sequence exceeds
+them, from its first action.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ URDF = """<robot name="arm"><joint name="pan" type="revolute"><parent link="base
 
 
 def spec_of(delta: bool, arms: int | None) -> ActionSpec:
-    """Return actions of two joints and a gripper for each arm."""
+    """Return the specification of actions with two joints and a gripper for each arm."""
     names = None if arms is None else tuple(f"arm{i}" for i in range(arms))
     dim = 3 * (arms or 1)
     return ActionSpec(
@@ -48,7 +48,7 @@ def spec_of(delta: bool, arms: int | None) -> ActionSpec:
 
 
 def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
-    """Return the motion that actions command from rest, (T + 3, D); deltas are summed up."""
+    """Return the commanded motion from rest, (T + 3, D). Relative actions are summed up."""
     rows = np.array(actions, np.float64)
     deltas = spec.delta_columns(rows.shape[1])
     rows[:, deltas] = np.cumsum(rows[:, deltas], axis=0)
@@ -58,7 +58,7 @@ def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
 
 
 def require_within(path: np.ndarray, limits: MotionLimits, hz: float = HZ) -> None:
-    """Raise if a path speeds up beyond the limits; braking is always allowed."""
+    """Fail if a path accelerates beyond the limits. Braking is always allowed."""
     speeds = np.diff(path, axis=0)
     for before, now, change_before in zip(
         speeds[1:-1], speeds[2:], np.diff(speeds, axis=0)[:-1], strict=True
@@ -69,7 +69,7 @@ def require_within(path: np.ndarray, limits: MotionLimits, hz: float = HZ) -> No
         assert (
             brakes | (np.abs(change) * hz**2 <= np.asarray(limits.acceleration) * 1.001 + 1e-2)
         ).all()
-        # A tick at rest ends the deceleration before it.
+        # A tick at rest ends the preceding deceleration.
         rested = ~before.any()
         jerk = np.abs(change if rested else change - change_before) * hz**3
         assert (brakes | (jerk <= np.asarray(limits.jerk) * 1.001 + 1.0)).all()
@@ -132,7 +132,7 @@ def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_
         commands = [still if delta else pose]
         runs, moved = [commands], 0
         for tick in range(200):
-            if tick in (3, 80):  # the robot stands
+            if tick in (3, 80):  # the robot stands still
                 player.interrupt()
                 commands = [still if delta else pose]
                 runs.append(commands)
@@ -144,10 +144,10 @@ def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_
     for commands in runs:
         require_within(path_of(spec, commands), LIMITS)
     if step * HZ <= SPEED:
-        assert moved == 200, "a plan within the limits is executed"
+        assert moved == 200, "a plan within the limits must be executed"
     else:
         assert player._plan.executed < 5, (
-            "of a plan beyond the limits, only the slow way to its first row is"
+            "for a plan beyond the limits, only the slow motion to its first row is executed"
         )
 
 
@@ -217,10 +217,10 @@ def test_the_distance_of_the_first_action_is_limited_by_first_alone_if_it_is_giv
             guard.ease_in(zero, np.array([0, 1.01 * accepted], np.float32))
 
 
-# Each key of a file has an effect, or is an error.
+# Each key of a limits file has an effect, or is an error.
 
 EFFECTS: dict[str, tuple[dict[str, object], list[list[float]]]] = {
-    # the smallest file with a key, and a sequence of actions that it rejects
+    # the smallest file with this key, and a sequence of actions that it rejects
     "low": ({"low": 0.0}, [[-0.1]]),
     "high": ({"high": [1.0]}, [[1.1]]),
     "velocity": ({"velocity": 1.0}, [[0], [0.03]]),
@@ -249,7 +249,7 @@ def written(folder: Path, document: dict[str, object]) -> Path:
 
 def test_the_table_of_effects_has_each_key_of_a_file() -> None:
     named = {field.name for field in fields(MotionLimits)} - {"chain"} | {"urdf", "tip"}
-    # These two are not of a sequence of actions; see the tests of each.
+    # "first" and "rest" do not apply to a sequence of actions; each has its own tests.
     assert {*EFFECTS, "first", "rest"} == named
 
 
@@ -344,11 +344,11 @@ def test_limits_that_do_not_fit_the_actions_are_an_error_before_the_first_one(
         Guard(Contract(action=spec_of(delta=False, arms=None)), limits=limits, hz=HZ)
 
 
-# Limits from a dataset accept its demonstrations.
+# Limits derived from a dataset accept its demonstrations.
 
 
 def recorded(root: Path, spec: ActionSpec | None, episodes: list[np.ndarray]) -> Path:
-    """Write a dataset of episodes, (T, D) each."""
+    """Write a dataset with these episodes, (T, D) each."""
     dataset = Dataset(root, HZ, durable=False)
     for actions in episodes:
         episode = dataset.begin("stack", spec)
@@ -377,7 +377,7 @@ def demonstrations(spec: ActionSpec, seed: int) -> list[np.ndarray]:
 
 
 def require_accepted(guard: Guard, actions: np.ndarray) -> None:
-    """Raise `InvalidAction` unless a guard accepts all rows of an episode, (T, D)."""
+    """Fail unless a guard accepts all rows of an episode, (T, D)."""
     last = None
     for action in actions:
         last = guard(action, last)

@@ -1,4 +1,4 @@
-"""A robot with a planner: what the policy gets while the planner is punctual, late and down, in
+"""A robot with a planner: the policy's observations while the planner is punctual, late or down, in
 virtual time.
 """
 
@@ -32,13 +32,13 @@ PERIOD_S = 0.1  # period of the robot's ticks
 
 
 class Planner(Agent):
-    """Answers request n with the subtask "n", when it is let."""
+    """A planner that answers request n with the subtask "n" when the test permits it."""
 
     contract = Contract(action=ActionSpec(dim=2))
     reads_slo = True
 
     def __init__(self) -> None:
-        self.infos: list[dict[str, Any]] = []  # infos of the observations of its requests
+        self.infos: list[dict[str, Any]] = []  # infos of the observations in its requests
         self.options: dict[str, Any] = {}
         self.instruction: str | None = None
         self.failure: Exception | None = None
@@ -46,7 +46,7 @@ class Planner(Agent):
         self.slo: dict[str, Any] = {"load": 0.1, "in_time": True}
         self.done = False
         self.closed = False
-        self.gate = threading.Semaphore(1)  # the first answer is what the robot waits for
+        self.gate = threading.Semaphore(1)  # the robot waits for the first answer
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.instruction, self.options = instruction, kwargs
@@ -91,7 +91,7 @@ class Ticks:
         self._ticks = 0
 
     def run(self, seconds: float) -> Obs:
-        """Let the time pass, and return the last observation."""
+        """Let time pass, and return the last observation."""
         for _ in range(round(seconds / PERIOD_S)):
             self._ticks += 1
             self._clock.now = self._begun_s + round(self._ticks * PERIOD_S, 6)
@@ -99,7 +99,7 @@ class Ticks:
         return obs
 
     def answer(self) -> None:
-        """Let the planner answer, and wait until its answer can be taken."""
+        """Permit one answer of the planner, and wait until the robot can read it."""
         caller = self.robot._caller
         assert caller is not None
         self.planner.gate.release()
@@ -131,13 +131,13 @@ def test_each_observation_has_the_newest_subtask_and_its_age(ticks: Ticks) -> No
     assert obs.info[SUBTASK] == "0"
     assert obs.info[GOAL].tolist() == [0, 0]
     assert obs.info[SUBTASK_AGE] == pytest.approx(500)
-    assert len(ticks.planner.infos) == 1, "the next request is not due yet"
+    assert len(ticks.planner.infos) == 1, "the next request should not be due yet"
 
     ticks.run(0.6)
     ticks.answer()
     obs = ticks.run(0.1)
     assert (obs.info[SUBTASK], obs.info[GOAL].tolist()) == ("1", [1, 1])
-    # It was computed from the observation at 1.0 s, and now is 1.2 s.
+    # The subtask was computed from the observation at 1.0 s, and it is now 1.2 s.
     assert obs.info[SUBTASK_AGE] == pytest.approx(200)
     assert not hasattr(ticks.robot, "holds")
 
@@ -151,7 +151,7 @@ def test_a_request_states_how_long_the_planner_has_and_how_punctual_it_was(ticks
     wait_for(lambda: len(ticks.planner.infos) == 4)
     *_, last = ticks.planner.infos
     assert (last[SLACK], last[DEADLINE], last[TICKS]) == (1000.0, 3000.0, [1, 0])
-    assert last[FURTHER_MODEL] is True, "the policy's server counts the robot"
+    assert last[FURTHER_MODEL] is True, "the robot is counted only by the policy's server"
     assert "captured_at" in last
     figures = ticks.robot.planner_timeliness
     assert (figures.ticks, figures.starved) == (3, 0)
@@ -163,13 +163,13 @@ def test_a_late_planner_leaves_the_last_subtask_and_is_not_asked_twice(ticks: Ti
     assert obs.info[SUBTASK] == "0"
     assert not hasattr(ticks.robot, "holds")
     figures = ticks.robot.planner_timeliness
-    # The first answer was in time; at 2 s the second one was missing.
+    # The first answer was in time; at 2 s the second answer was missing.
     assert (figures.ticks, figures.starved) == (2, 1)
 
     ticks.answer()
     obs = ticks.run(0.1)
     assert obs.info[SUBTASK] == "1"
-    # Its observation is that of 1.0 s.
+    # The subtask comes from the observation at 1.0 s.
     assert obs.info[SUBTASK_AGE] == pytest.approx(2000)
 
 
@@ -209,7 +209,7 @@ def test_a_planner_that_is_down_is_named_with_its_error_and_asked_again(
     obs = ticks.run(0.1)
     assert obs.info[SUBTASK] == "4"
     assert not hasattr(ticks.robot, "holds")
-    assert ticks.planner.infos[-1][TICKS] == [4, 3], "no replica has counted the earlier ones"
+    assert ticks.planner.infos[-1][TICKS] == [4, 3], "no replica has counted the earlier ticks"
 
 
 def test_an_answer_without_a_text_as_its_subtask_is_not_used(
@@ -251,7 +251,9 @@ def test_the_same_robot_begins_another_episode(clock: Clock) -> None:
         with robot:
             assert robot.task_done
             assert SUBTASK in robot.observe().info
-    assert SUBTASK not in robot.observe().info, "outside of an episode it is the robot alone"
+    assert SUBTASK not in robot.observe().info, (
+        "outside of an episode the wrapper passes the robot's observations unchanged"
+    )
 
 
 @pytest.mark.parametrize(
@@ -272,7 +274,7 @@ def test_wrong_numbers_are_refused(settings: dict[str, float], message: str) -> 
 
 
 class Follower(Agent):
-    """Acts on the goal that it sees."""
+    """A policy that acts on the goal in its observation."""
 
     contract = Contract(action=ActionSpec(dim=2, delta=False))
 
@@ -285,7 +287,7 @@ class Follower(Agent):
 
 
 def test_the_control_loop_holds_the_robot_for_an_old_subtask_and_goes_on() -> None:
-    """In real time: the planner is silent from its second request on, and answers again after the
+    """In real time, the planner is silent from its second request, and answers again after the
     robot has held for some ticks.
     """
     planner, arm = Planner(), Arm()

@@ -1,5 +1,5 @@
-"""Recordings in LeRobot's format: what was seen and done, whatever becomes of the disk or the
-process.
+"""Recordings in LeRobot's format: observations and actions are kept, whatever happens to the disk
+or the process.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def info(root: Path) -> dict:
 
 
 def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
-    for _ in range(2):  # the second time the dataset is opened again
+    for _ in range(2):  # the second pass opens the dataset again
         with Recorder(tmp_path, FPS) as recorder, recorder.episode("look"):
             for i in range(4):
                 views = {"left/wrist": 0, "left_wrist": 200, "front": 100}
@@ -78,7 +78,7 @@ def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
 def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(
     tmp_path: Path,
 ) -> None:
-    for _ in range(2):  # the second time the dataset is opened again
+    for _ in range(2):  # the second pass opens the dataset again
         record(tmp_path, 3)
     about = DatasetContract.from_json(info(tmp_path)[INFO])
     assert about.state == ("joints", "left/force", "gripper")
@@ -137,7 +137,8 @@ def test_an_episode_holds_what_was_seen_and_done(tmp_path: Path) -> None:
         "left/force_0",
         "gripper",
     ]
-    assert features["observation.images.left_wrist"]["shape"] == [34, 48, 3]  # made even
+    # rounded up to even numbers
+    assert features["observation.images.left_wrist"]["shape"] == [34, 48, 3]
     assert not (tmp_path / "unfinished").exists() or not any((tmp_path / "unfinished").iterdir())
 
 

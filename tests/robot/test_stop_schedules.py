@@ -1,5 +1,5 @@
-"""No command begins after a stop on another thread, however the threads of the loop and of the
-stop take turns.
+"""No command begins after a stop on another thread, for any interleaving of the loop's thread and
+the stop's thread.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from vlagents_ray.robot import LoopOptions, Watchdog, loop, run_loop
 from vlagents_ray.robot.loop import Restart
 
 HZ = 1000.0
-EVENT_AT = 4  # the observation of the tick at which the robot is stopped
-AFTER = 4  # observations until the end of a run
-LIMIT_S = 60.0  # a wait that ends by this has failed
+EVENT_AT = 4  # the observation in whose tick the robot is stopped
+AFTER = 4  # number of observations until the end of a run
+LIMIT_S = 60.0  # time limit after which a wait has failed
 
 Tracer = Callable[[FrameType, str, Any], Any]
 STOPPER = {
@@ -36,13 +36,13 @@ STOPPER = {
 
 
 class Arm:
-    """A robot that writes the trace of its calls."""
+    """A robot that records a trace of its calls."""
 
     def __init__(self) -> None:
         self.trace: list[str] = []
         self.observations = 0
         self.hangs = threading.Event()
-        self.released: threading.Event | None = None  # makes the next command hang
+        self.released: threading.Event | None = None  # if set, the next command waits for it
 
     def observe(self) -> Obs:
         self.observations += 1
@@ -62,7 +62,7 @@ class Arm:
 
 
 class Standing(Agent):
-    """A policy whose plan is dropped by `interrupt`."""
+    """A policy whose plan `interrupt` drops."""
 
     contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False))
 
@@ -77,14 +77,14 @@ class Standing(Agent):
 
 
 class UnwatchedWatchdog(Watchdog):
-    """A watchdog without a thread, so that the test decides when it finds a silence."""
+    """A watchdog without a thread, so that the test decides when it detects silence."""
 
     def start(self) -> None: ...
 
     def close(self) -> None: ...
 
     def find_silence(self) -> None:
-        """Do as the thread of a watchdog whose camera was silent for too long, and is no longer."""
+        """Simulate the thread of a watchdog that detects a silent camera, which then continues."""
         self._heard_at["camera"] = -1e9
         reason, _ = self.overdue()
         assert reason is not None
@@ -93,7 +93,7 @@ class UnwatchedWatchdog(Watchdog):
 
 
 class Run:
-    """A run of the loop with a watchdog, which writes its stops as "dog"."""
+    """A run of the loop with a watchdog, which records its stops as "dog"."""
 
     def __init__(self) -> None:
         self.arm = Arm()
@@ -122,7 +122,7 @@ class Run:
         def over() -> bool:
             if "dog" in arm.trace and not stopped_at:
                 stopped_at.append(arm.observations)
-            if self.stopper is not None and not stopped_at:  # the machine has yet to run its thread
+            if self.stopper is not None and not stopped_at:  # the stopping thread has not run yet
                 return False
             return arm.observations > (stopped_at[0] if stopped_at else 2 * EVENT_AT) + AFTER
 
@@ -140,10 +140,10 @@ class Run:
             assert not self.stopper.is_alive()
 
     def require_stopped(self, restart: Restart) -> None:
-        """Require that the watchdog's stop is followed by no command, or by none of the plan of
-        before.
+        """Check that no command follows the watchdog's stop, or after an automatic restart no
+        command of the old plan.
 
-        The loop may see the stop before the watchdog's thread calls its own, but only after the
+        The loop may notice the stop before the watchdog's thread calls `stop`, but only after the
         last command.
         """
         calls_before = self.arm.trace[: self.arm.trace.index("dog")]
@@ -152,7 +152,7 @@ class Run:
         if "apply" in after:
             assert restart == "auto", after
             assert "interrupt" in after[: after.index("apply")], after
-        assert "stop" in after, "the loop has seen the stop"
+        assert "stop" in after, "the loop must notice the stop"
 
 
 def tracer_of(codes: set[CodeType], happens: Callable[[FrameType], None]) -> Tracer:
@@ -185,7 +185,9 @@ def wait_until(holds: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a stop wait for a command of a thread that the machine does not run."""
+    """Let a stop wait longer for a command, since a busy machine may not run the command's
+    thread.
+    """
     monkeypatch.setattr(control_module, "COMMAND_S", LIMIT_S, raising=False)
 
 
@@ -214,7 +216,7 @@ def test_no_command_follows_a_stop_at_any_line_of_the_loop(
             run.drive(restart)
         finally:
             sys.settrace(before)
-        if run.stopper is None:  # a tick has fewer lines
+        if run.stopper is None:  # a tick has fewer lines than `point`
             assert point > 20
             return
         run.require_stopped(restart)
@@ -239,7 +241,7 @@ def test_no_command_follows_a_stop_whose_thread_waits_at_any_line(
             seen_before = run.arm.observations
             wait_until(lambda: run.arm.observations > seen_before + 2)
 
-        ended: list[int] = []  # the observations after the end of the stop
+        ended: list[int] = []  # number of observations after the end of the stop
 
         def over(run: Run = run, ended: list[int] = ended, happens: Any = happens) -> bool:
             if run.stopper is None:
@@ -277,7 +279,9 @@ def test_a_stop_does_not_wait_for_a_command_that_hangs(source: str) -> None:
     run.drive("manual", over)
     thread.join()
     hung = run.arm.trace.index("dog") - 1
-    assert run.arm.trace[hung : hung + 4] == ["apply", "dog", "applied", "stop"], "again, at once"
+    assert run.arm.trace[hung : hung + 4] == ["apply", "dog", "applied", "stop"], (
+        "the stop is repeated directly after the command"
+    )
     assert "apply" not in run.arm.trace[hung + 1 :]
 
 
@@ -285,7 +289,7 @@ def test_a_stop_within_a_command_is_repeated_after_it() -> None:
     run = Run()
     apply = run.arm.apply
 
-    def trips(action: np.ndarray) -> None:  # as a signal handler of the loop's thread does
+    def trips(action: np.ndarray) -> None:  # like a signal handler on the loop's thread
         if run.arm.observations == EVENT_AT:
             run.dog.trip("a signal")
         apply(action)

@@ -1,4 +1,4 @@
-"""After any stop nothing is applied: a property of the trace of calls, for each source of stops
+"""After any stop no command is applied: a property of the trace of calls, for each source of stops
 and each setting.
 """
 
@@ -35,21 +35,23 @@ from vlagents_ray.robot import Guard, LoopOptions, MotionLimits, Watchdog, run_l
 from vlagents_ray.robot.record import Recorder
 
 HZ = 200.0
-EVENT_AT = 6  # the observation at which the robot is stopped
-MOTION = MotionLimits(velocity=20.0, acceleration=2000.0, jerk=2e6)  # deltas have no rest pose
+EVENT_AT = 6  # the observation in whose tick the robot is stopped
+# relative actions have no rest pose
+MOTION = MotionLimits(velocity=20.0, acceleration=2000.0, jerk=2e6)
 REST = replace(MOTION, rest=(-0.5, -0.5))
-WAY_TO_REST = -0.05  # targets below it are on the way to the rest pose; the policy's are above 0
+# targets below it belong to the motion to the rest pose; the policy's are above 0
+WAY_TO_REST = -0.05
 
 
 class Arm:
-    """A robot that writes the trace of its commands, and lets something happen at a moment of
-    it.
+    """A robot that records a trace of its commands, and calls a function of the test at a given
+    moment.
     """
 
     def __init__(self) -> None:
         self.trace: list[str] = []
         self.holds: str | None = None
-        self.at_rest_way = False  # whether the robot is on the way to the rest pose
+        self.at_rest_way = False  # whether the robot is moving to the rest pose
         self.observations = 0
         self.moment: Callable[[], bool] = lambda: False
         self.in_observe: Callable[[], None] | None = None
@@ -79,7 +81,7 @@ class Arm:
 
 
 class Policy(Agent):
-    """Commands close to the present pose, in chunks."""
+    """A policy that commands positions close to the current pose, in chunks."""
 
     def __init__(self, *, relative: bool) -> None:
         self._contract = Contract(action=ActionSpec(dim=2, space="joint", delta=relative), chunk=4)
@@ -96,7 +98,7 @@ class Policy(Agent):
 
 @dataclass
 class Run:
-    """One run of the control loop, which something stops."""
+    """A run of the control loop, which an event stops."""
 
     arm: Arm
     policy: Policy
@@ -126,12 +128,12 @@ def stopped_and_broken(run: Run) -> None:
 
 
 def silence(run: Run) -> None:
-    """Be silent until the watchdog has stopped the robot."""
+    """Block until the watchdog has stopped the robot."""
     while "stop" not in run.arm.trace[run.arm.trace.index("EVENT") :]:
         time.sleep(0.001)
 
 
-# Each makes what happens in `observe`, given the run.
+# For each source of a stop, a function that returns the event to call in `observe`.
 IN_OBSERVE: dict[str, Callable[[Run], Callable[[], None]]] = {
     "a stop from afar": lambda run: lambda: run.command("stop"),
     "a pause from afar": lambda run: lambda: run.command("pause"),
@@ -175,7 +177,8 @@ def occurs(source: str, setting: tuple[str, bool, Mode, bool, bool]) -> bool:
     moment, _, mode, led, _ = setting
     if source == "a pause from afar":
         return not led  # by design it does not interrupt an operator
-    # On the way to rest no policy is queried; in the others its error arrives at a later tick.
+    # On the way to rest no policy is called; in the other modes the policy's error arrives at a
+    # later tick.
     return source not in IN_POLICY or (moment == "driven" and mode == "open_loop" and not led)
 
 
@@ -232,13 +235,13 @@ def test_nothing_is_applied_after_a_stop(
 def require_still(arm: Arm) -> None:
     [event] = [number for number, entry in enumerate(arm.trace) if entry == "EVENT"]
     after = arm.trace[event + 1 :]
-    assert "apply" in arm.trace[:event] or arm.in_apply is None, "the robot moved before"
+    assert "apply" in arm.trace[:event] or arm.in_apply is None, "the robot must have moved before"
     assert "apply" not in after
     assert "stop" in after
 
 
 class Person(Operator):
-    """An operator who presses stop, or closes the page, at a moment of the trial."""
+    """An operator who presses stop or closes the page at a given moment of the trial."""
 
     def __init__(self, arm: Arm, stops: Callable[[], bool]) -> None:
         self._arm, self._stops = arm, stops
@@ -297,7 +300,7 @@ def test_nothing_is_applied_after_a_stop_of_a_blind_trial(
 
     def stops() -> bool:
         if source == "the robot's own reason" or not arm.moment():
-            page._asked_at = time.monotonic()  # an open page sends requests
+            page._asked_at = time.monotonic()  # like an open page, which sends requests
             return page.stops()
         if "EVENT" not in arm.trace:
             arm.trace.append("EVENT")
@@ -319,18 +322,19 @@ def test_nothing_is_applied_after_a_stop_of_a_blind_trial(
 def test_a_trial_counts_no_step_of_the_way_to_rest(tmp_path: Path) -> None:
     arm = Arm()
     blind_trial(tmp_path, arm, Person(arm, lambda: False), Policy(relative=False), "open_loop")
-    assert arm.trace.count("apply") > MAX_STEPS, "it went to rest"
+    assert arm.trace.count("apply") > MAX_STEPS, "the robot moved to its rest pose"
 
 
 class Numbered(Agent):
-    """Chunks of three rows from the present pose on; the second column is the number of the
-    chunk.
+    """A policy with chunks of three rows that begin at the current pose. The second column is the
+    chunk's number.
     """
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
         self.chunks = 0
-        self.begins: dict[int, Callable[[], object]] = {}  # what happens while a chunk is computed
+        # events that happen while a chunk is computed
+        self.begins: dict[int, Callable[[], object]] = {}
 
     @property
     def contract(self) -> Contract:
@@ -357,9 +361,9 @@ def test_a_stop_in_the_tick_in_which_a_chunk_begins_drops_that_chunk(
     dog = Watchdog(lambda _: arm.stop(), {"loop": 60.0})
     policy.begins[chunk] = lambda: on_a_thread(lambda: dog.trip("a person is in the way"))
     stopped_at: list[int] = []
-    before: int | None = None  # commands before the restart
+    before: int | None = None  # number of commands before the restart
 
-    def over() -> bool:  # some commands later; a busy machine may begin the chunk late
+    def over() -> bool:  # true some commands later; a busy machine may begin the chunk late
         nonlocal before
         if dog.control.stopped and not stopped_at:
             stopped_at.append(arm.observations)
@@ -372,11 +376,13 @@ def test_a_stop_in_the_tick_in_which_a_chunk_begins_drops_that_chunk(
         run_loop(arm, player, hz=HZ, watchdog=dog, until=over)
     assert before is not None
     stop = arm.trace.index("stop")
-    if arm.trace[:stop].count("apply") < before:  # the command of that moment ended after the stop
+    if arm.trace[:stop].count("apply") < before:  # the command at that moment ended after the stop
         assert arm.trace[stop : stop + 3] == ["stop", "apply", "stop"]
         assert arm.trace[: stop + 2].count("apply") == before
     assert not applied[:before] or max(applied[:before]) < chunk
-    assert min(applied[before:]) > chunk, "the chunk of before the stop is not executed after it"
+    assert min(applied[before:]) > chunk, (
+        "a chunk from before the stop must not be executed after it"
+    )
 
 
 def test_a_stop_of_one_robot_leaves_the_loop_of_another_running() -> None:
@@ -411,7 +417,7 @@ def test_a_stop_of_one_robot_leaves_the_loop_of_another_running() -> None:
     ended.set()
     other.join()
     assert "apply" not in arms[0].trace[arms[0].trace.index("stop") :]
-    assert arms[1].trace.index("stop") == len(arms[1].trace) - 1, "at the end alone"
+    assert arms[1].trace.index("stop") == len(arms[1].trace) - 1, "only at the end"
 
 
 def test_after_a_lost_leader_and_a_stop_a_restart_alone_moves_nothing() -> None:
@@ -436,7 +442,7 @@ def test_after_a_lost_leader_and_a_stop_a_restart_alone_moves_nothing() -> None:
             assert dog.restart()
         elif arm.observations == EVENT_AT + 9:
             assert "apply" not in arm.trace[arm.trace.index("stop") :], (
-                "the pause of the lost leader lasts"
+                "the pause of the lost leader must last"
             )
             lost.clear()
             leader.wants = lambda: False

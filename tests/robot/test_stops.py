@@ -1,4 +1,4 @@
-"""Stops, pauses and marks: what moves the robot again, and what never does."""
+"""Stops, pauses and marks: the actions that let the robot move again, and those that never do."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vlagents_ray.robot.watchdog import Watchdog
 
 
 class Arm:
-    """A robot that notes at which tick it was told what."""
+    """A robot that records its calls by tick."""
 
     def __init__(self, *, simulated: bool) -> None:
         self.simulated = simulated
@@ -39,7 +39,7 @@ class Arm:
 
 
 class Commanding(Agent):
-    """A policy whose answers bring commands, at the ticks of `told`."""
+    """A policy whose answers contain the commands in `told`, by tick."""
 
     def __init__(self, inbox: CommandInbox, told: dict[int, str]) -> None:
         self._inbox, self._told, self._asked = inbox, told, 0
@@ -54,7 +54,7 @@ class Commanding(Agent):
 
 
 def applied(arm: Arm) -> list[int]:
-    # The first observation is that of the reset.
+    # The first observation belongs to the reset.
     return [tick - 1 for tick, did in arm.did if did == "apply"]
 
 
@@ -115,7 +115,7 @@ def test_a_stop_from_the_page_is_over_when_a_person_restarts(
         return again.ticks > 8
 
     run_loop(again, agent, hz=200, watchdog=dog, until=over, options=LoopOptions(commands=inbox))
-    assert applied(again)[0] == 5, "not a tick before the restart"
+    assert applied(again)[0] == 5, "no tick before the restart"
 
 
 @pytest.mark.parametrize("stop", ["trip", "bark"])

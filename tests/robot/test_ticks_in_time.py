@@ -25,7 +25,7 @@ HZ = 10.0
 
 
 class VirtualTime(SimulatedTime):
-    """In place of the module `time`, with the time of day."""
+    """A stand-in for the module `time`, including the time of day."""
 
     time = SimulatedTime.monotonic
 
@@ -39,13 +39,15 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> VirtualTime:
 
 
 class Slow(Agent):
-    """Answers with `rows` rows after `answer_s` of virtual time; adds up what requests report."""
+    """A policy that returns `rows` rows after `answer_s` of virtual time, and sums up the reports
+    in requests.
+    """
 
     contract = Contract(action=ActionSpec(dim=1, delta=False, low=-1.0, high=1.0))
 
     def __init__(self, clock: VirtualTime, answer_s: float, rows: int = 4) -> None:
         self._clock, self._answer_s, self._rows = clock, answer_s, rows
-        self.times = RobotTimes()  # as a server keeps them
+        self.times = RobotTimes()  # the same sums as in a server
 
     def act(self, obs: Obs) -> Act:
         report = RobotReport.of(obs.info)
@@ -56,7 +58,7 @@ class Slow(Agent):
 
 
 class Arm(SimulatedRobot):
-    """Keeps the times of its commands."""
+    """An arm that records the times of its commands."""
 
     def __init__(self, clock: VirtualTime) -> None:
         super().__init__(Slow.contract)
@@ -76,7 +78,8 @@ def ran(clock: VirtualTime, agent: Agent, seconds: float) -> tuple[LoopReport, A
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [
-        # Each chunk costs a tick, the one after its request; so do those that the end cuts short.
+        # Each chunk costs the tick after its request, even if the end of the run cuts the chunk
+        # short.
         (4.0, TimeShare(40, 8, 250.0, 400.0, 400.0)),
         (3.7, TimeShare(37, 8, 250.0, 400.0, 400.0)),
         (3.6, TimeShare(36, 7, 250.0, 400.0, 400.0)),
@@ -87,7 +90,9 @@ def test_ticks_that_a_loop_missed_while_it_waited_are_starved(
 ) -> None:
     report, arm = ran(clock, ChunkPlayer(Slow(clock, 0.25)), seconds)
     assert report.timeliness.time_share == pytest.approx(expected, abs=1.0)
-    assert len(arm.commanded) == expected.ticks - expected.starved, "as the robot sees it"
+    assert len(arm.commanded) == expected.ticks - expected.starved, (
+        "the robot's commands must give the same count"
+    )
     assert report.jitter["missed"] == expected.starved
 
 
@@ -104,7 +109,7 @@ def test_loop_player_and_server_count_the_same(
         assert counted.ticks == report.jitter["ticks"] + report.jitter["missed"] == 50
         assert counted.ticks - counted.starved == len(arm.commanded)
 
-        # The server knows of the ticks until the last request.
+        # The server knows the ticks until the last request.
         caller = player._caller
         assert caller is not None
         wait_for(lambda: not caller.busy)
@@ -115,8 +120,8 @@ def test_loop_player_and_server_count_the_same(
 
 
 class EntryPoints:
-    """The programs that drive a robot for 40 ticks, with answers of 4 rows after 2.5 ticks; each
-    returns the ticks and the starved ones that it tells.
+    """The programs that drive a robot for 40 ticks, with answers of 4 rows after 2.5 ticks. Each
+    method returns the reported numbers of ticks and of starved ticks.
     """
 
     def __init__(
@@ -181,7 +186,7 @@ def test_all_entry_points_tell_the_same_ticks(
     entry_point: str,
 ) -> None:
     programs = EntryPoints(clock, tmp_path, monkeypatch, capsys)
-    # The reset waits for the first 4 rows; each further chunk costs a tick, and begins every 5.
+    # The reset waits for the first 4 rows. Each further chunk, every 5 ticks, costs one tick.
     assert getattr(programs, entry_point)() == (40, 7)
 
 

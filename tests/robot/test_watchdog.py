@@ -1,4 +1,4 @@
-"""The watchdog: which silence stops a robot, and for how long."""
+"""The watchdog: which silence stops a robot, and when it may move again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from vlagents_ray import ConfigError
 from vlagents_ray.robot import Watchdog
 
-BARK_S = 30.0  # generous: a watchdog that never barks is what fails
+BARK_S = 30.0  # a generous limit, since a watchdog that never triggers is the failure
 
 
 class Barks:
@@ -34,7 +34,7 @@ def test_what_was_stopped_stays_so_until_a_restart_after_the_silence() -> None:
     with watchdog:
         barks.next()
         assert watchdog.control.stopped
-        assert not watchdog.restart()  # while it is silent
+        assert not watchdog.restart()  # during the silence
         watchdog._limits["server"] = 60.0
         watchdog.heard("server")
         assert watchdog.control.stopped
@@ -48,7 +48,7 @@ def test_what_is_heard_often_enough_is_left_alone() -> None:
         for _ in range(10):
             watchdog.heard("server")
             time.sleep(0.01)
-        assert barks.next() == "loop"  # a hanging control loop
+        assert barks.next() == "loop"  # the control loop hangs
     assert [bark.partition(":")[0] for bark in watchdog.barks] == ["loop"]
 
 

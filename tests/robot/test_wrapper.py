@@ -1,6 +1,4 @@
-"""Robots around other robots: each wrapper has all attributes of the inner robot, by one
-mechanism.
-"""
+"""Wrappers of robots: each wrapper has all attributes of the inner robot, through one mechanism."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ from vlagents_ray.robot.wrapper import RobotWrapper
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
 WRAPPERS: list[type[RobotWrapper]] = [RobotWrapper, WatchedRobot, RobotWithPlanner]
-OPTIONAL = {  # those that the package reads, and one that it does not know
+OPTIONAL = {  # attributes that the package reads, and one that it does not know
     "simulated": True,
     "holds": "the wrist camera hangs",
     "contract": Contract(action=ActionSpec(dim=2)),
@@ -57,7 +55,7 @@ class Arm:
 
 
 def wrapped_by(wrapper: type[RobotWrapper], robot: Robot) -> RobotWrapper:
-    """Return a robot in a wrapper that does nothing yet."""
+    """Return a robot in a wrapper that changes nothing yet."""
     if wrapper is RobotWithPlanner:
         return RobotWithPlanner(robot, Agent())
     return wrapper(robot)
@@ -93,7 +91,7 @@ def test_a_wrapper_calls_its_robot_and_can_be_copied(wrapper: type[RobotWrapper]
     assert arm.calls == ["observe", "apply", "stop", "close"]
     copied = copy.deepcopy(wrapped)
     copied.stop()
-    assert arm.calls[-1] == "close", "the copy has a robot of its own"
+    assert arm.calls[-1] == "close", "the copy has a separate robot"
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
@@ -112,7 +110,7 @@ def test_the_watchdog_of_a_wrapped_robot_also_watches_the_robots_own_sources(
 
 
 def classes_that_name_robots() -> Iterator[tuple[str, ast.ClassDef]]:
-    """Those of the modules with the word Robot: any other one needs no parsing."""
+    """Return the classes of modules that contain the word Robot; other modules need no parsing."""
     for folder in ("vlagents_ray", "plugins", "examples", "benchmarks"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             source = path.read_text(encoding="utf-8")
@@ -124,7 +122,7 @@ def classes_that_name_robots() -> Iterator[tuple[str, ast.ClassDef]]:
 
 
 def wraps_a_robot(node: ast.ClassDef) -> bool:
-    """Return whether a class with the methods of a robot is made from a robot."""
+    """Return whether a class with the methods of a robot is constructed from a robot."""
     methods = {one.name: one for one in node.body if isinstance(one, ast.FunctionDef)}
     made = methods.get("__init__")
     takes = (

@@ -1,4 +1,4 @@
-"""What is kept of an episode, and where it lies."""
+"""The recordings of an episode, and their places."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> N
 
 
 class Pushed(ToZero):
-    """Answers with chunks of two rows, each of a further version of the weights."""
+    """A policy that returns chunks of two rows, each from a newer version of the weights."""
 
     def __init__(self) -> None:
         super().__init__(chunk=2)
@@ -105,7 +105,7 @@ class Pushed(ToZero):
 
 
 def versions(config: EvalConfig, make: Callable[[], Agent]) -> list[int]:
-    """Of the weights that chose the actions of the only episode."""
+    """Return the versions of the weights that chose the actions of the only episode."""
     results = play(config, make)
     found = Trajectory.load(results.out / str(results.cases[0].episodes[0].trajectory)).versions
     assert found is not None

@@ -1,5 +1,5 @@
-"""Disks that take no more: one sentence with the cure, and nothing recorded is lost; the code
-beside the results.
+"""Full or read-only disks: the error is one sentence with the cure, and no recorded result is lost.
+Also the copy of the program next to the results.
 """
 
 from __future__ import annotations
@@ -179,7 +179,8 @@ def one_sentence(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.hosts
-@pytest.mark.parametrize("size", ["64k", "300k", "600k"])  # nothing fits; some episodes do; most do
+# no episode fits; some episodes fit; most episodes fit
+@pytest.mark.parametrize("size", ["64k", "300k", "600k"])
 def test_a_full_disk_costs_nothing_that_was_recorded(
     size: str, config: Config, tmp_path: Path
 ) -> None:

@@ -1,4 +1,4 @@
-"""Results do not depend on the number of environments, whatever happens in one of them."""
+"""Results do not depend on the number of environments, even if one of them fails."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ NAME = f"{__name__}:Fragile"
 
 
 class PhysicsError(RuntimeError):
-    """As dm_control's."""
+    """An error with the name of dm_control's error."""
 
 
-EXPLOSIONS: dict[str, Exception] = {  # by which simulators tell that they diverged
+EXPLOSIONS: dict[str, Exception] = {  # Errors with which simulators report that they diverged.
     "MuJoCo": RuntimeError(
         "Nan, Inf or huge value in QACC at DOF 0. The simulation is unstable. Time = 0.0020."
     ),
@@ -50,7 +50,7 @@ TROUBLES = [
     *EXPLOSIONS,
 ]
 _OTHERS = itertools.count(10)
-_LIMIT = 1.0  # limit of an action; beyond it, the environment has its trouble
+_LIMIT = 1.0  # limit of an action, beyond which the environment fails
 
 
 class Fragile(EvalEnv):
@@ -104,7 +104,9 @@ class Fragile(EvalEnv):
 
 
 class InOneSimulator(SequentialBatch):
-    """Environments of one simulator, which raises for all of them what one of them raises."""
+    """Environments of one simulator. If one environment raises an error, the simulator raises it
+    for all of them.
+    """
 
     def step(self, acts: Any) -> Any:
         steps = super().step(acts)
@@ -121,8 +123,8 @@ class FragileTogether(Fragile):
 
 
 class Extreme(Agent):
-    """Exceeds the limit in the third step of each third episode, and always in another way if it
-    is `restless`.
+    """A policy that exceeds the limit in the third step of every third episode. If it is
+    `restless`, the action differs each time.
     """
 
     def __init__(self, restless: bool = False) -> None:
@@ -148,7 +150,9 @@ class Extreme(Agent):
 
 @pytest.fixture(autouse=True)
 def no_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for no signal after a failure, as none is sent here; test_in_process.py sends one."""
+    """Do not wait for a signal after a failure, since these tests send none; test_in_process.py
+    sends one.
+    """
     monkeypatch.setattr(evaluation, "SIGNAL_S", 0.0)
 
 
@@ -171,7 +175,7 @@ def run(config: Config, tmp_path: Any) -> Callable[..., Summary]:
 
 
 def outcomes(summary: Summary) -> dict[int, tuple[object, ...]]:
-    """Status, success and actions of each episode, by its number."""
+    """Return status, success and actions of each episode by number."""
     return {
         one.result.key.episode: (
             one.result.status,
@@ -197,7 +201,7 @@ def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(
 def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
     run: Callable[..., Summary], trouble: str
 ) -> None:
-    """After an error that is of one of the episodes, each is run alone."""
+    """After an error of one of several episodes, each episode is run alone."""
     alone = outcomes(run(trouble))
     together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=2)
     assert outcomes(together) == alone
@@ -234,7 +238,7 @@ def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of
         ("policy_error", 3, False)
     }
     assert all("diverged, and again under the same actions" in str(one.error) for one in failed)
-    assert len(summary.results.cases[0].attempts) == 3, "the first attempt at each"
+    assert len(summary.results.cases[0].attempts) == 3, "the first attempts at both"
 
 
 def test_a_simulation_that_diverges_under_other_actions_is_lost_and_bounds_stand_beside_the_rate(

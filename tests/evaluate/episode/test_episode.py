@@ -27,7 +27,9 @@ KEY = EpisodeKey("script", 3, 11, "0")
 
 
 class Script(EvalEnv):
-    """Succeeds in the states whose numbers are in `solved`; keeps the actions it was given."""
+    """An environment that succeeds in the states whose numbers are in `solved`, and stores its
+    actions.
+    """
 
     max_steps = 6
 
@@ -69,7 +71,7 @@ class Script(EvalEnv):
 
 
 class Chunks(Agent):
-    """Answers with the given actions, one after another; remembers what it was asked."""
+    """A policy that returns the given actions one after another, and stores its observations."""
 
     def __init__(self, *answers: Any) -> None:
         self.answers: Iterator[Any] = iter(answers)
@@ -105,7 +107,7 @@ def test_a_chunk_or_its_first_rows_are_executed_without_asking_again(
 
 
 class Endless(Script):
-    """Forgets its step limit."""
+    """An environment that ignores its step limit."""
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         return (*super().step(act)[:3], False, {"success": False})
@@ -114,9 +116,9 @@ class Endless(Script):
 @pytest.mark.parametrize(
     ("env", "answers", "steps", "ending"),
     [
-        # After its rows.
+        # The policy is done after the rows of its chunk.
         (Script(), [ROW, Act(np.asarray(CHUNK, np.float32), done=True)], 4, "policy_done"),
-        (Script(terminates_at=2), [CHUNK], 2, "terminated"),  # within a chunk
+        (Script(terminates_at=2), [CHUNK], 2, "terminated"),  # the episode ends within a chunk
         (Script(), [ROW] * 6, 6, "truncated"),
         (Endless(), [ROW] * 9, 6, "truncated"),
     ],
@@ -244,8 +246,8 @@ FRONT = {"front": np.zeros((4, 4, 3), np.uint8)}
 
 
 class Stated(Script):
-    """Returns `after` from the second step on, or `before` from its reset; its contract states
-    what it gives.
+    """An environment whose `step` returns `after` from the second step, and whose `reset` returns
+    `before`; its contract declares its usual observations.
     """
 
     def __init__(
@@ -316,8 +318,8 @@ def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(
 ) -> None:
     with pytest.raises(EnvFailed, match=f"env step: .*{said}"):
         run_episode(Stated(after=(obs, 0.0, False, False, SOLVED)), Chunks(*[ROW] * 6), KEY)
-    # A first observation that does not fit would not fit at a second attempt; a number that is not
-    # finite might.
+    # A first observation of a wrong shape would be wrong again at a second attempt, but a number
+    # that is not finite might be correct.
     with pytest.raises(
         EnvFailed if said == "finite.*got NaN" else ContractMismatch, match=f"env reset: .*{said}"
     ):
@@ -360,7 +362,7 @@ def test_what_a_step_returns_is_never_guessed(answer: Any, said: str) -> None:
 
 
 def test_an_action_that_an_environment_refuses_at_its_reset_is_its_own_error() -> None:
-    """No policy has acted yet, so that the episode is repeated, and no other one ends."""
+    """No policy has acted yet, so the episode is repeated, and no other episode ends."""
 
     class RefusesItsOwn(Stated):
         def reset(self, **options: Any) -> Any:
@@ -405,7 +407,7 @@ def test_images_may_be_left_out_where_nobody_looks(images: Images, looked_at: li
 def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_side_was_busy() -> (
     None
 ):
-    """A server says how long a batch took, of which each answer has its part."""
+    """A server reports the duration of a batch, which is divided among the batch's answers."""
 
     class Served(Chunks):
         version = 4

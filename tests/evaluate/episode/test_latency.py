@@ -1,4 +1,4 @@
-"""Real-time mode: what is executed while the policy thinks."""
+"""Real-time mode: the actions that are executed while the policy computes."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER, Act, Agent, Obs
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
-CHUNK = np.array([[i, -1.0] for i in range(1, 7)], np.float32)  # rows 1 to 6, the gripper closed
+# rows 1 to 6, with the gripper closed
+CHUNK = np.array([[i, -1.0] for i in range(1, 7)], np.float32)
 
 
 def played(player: ChunkExecutor, latency_s: float, rows: np.ndarray = CHUNK) -> list[float]:
-    """The first component of each action that an answer leads to."""
+    """Return the first component of each action that is executed because of an answer."""
     return [float(tick.action[0]) for tick in player.ticks(rows, latency_s)]
 
 
@@ -39,16 +40,18 @@ def clock(**settings: Any) -> ClockConfig:
 @pytest.mark.parametrize(
     ("execute", "settings", "env", "answers"),
     [
-        # Rows in place of which the rest of the last chunk was executed are dropped.
+        # The first rows are dropped if the remaining rows of the last chunk were executed in their
+        # place.
         (4, {}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.1, [5, 2, 3, 4]), (0.2, [5, 6, 3, 4])]),
-        # Without alignment the answer begins with its first row.
+        # Without alignment, the new chunk is executed from its first row.
         (4, {"align": False}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.2, [5, 6, 1, 2, 3, 4])]),
-        # The rest is executed while the policy thinks; where it ends, relative actions stop.
+        # The remaining rows are executed while the policy computes. When they end, relative actions
+        # stop.
         (4, {}, RELATIVE, [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, 3, 4]), (0.3, [5, 6, 0, 3, 4])]),
-        # Where actions are absolute, the last one is held.
+        # Absolute actions hold the last one.
         (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.4, [5, 6, 6, 6, 3, 4])]),
-        # Where holding goes on moving, it is in place of the rows; before the first answer nothing
-        # moves.
+        # If holding continues a motion, the last action is repeated instead of the remaining rows.
+        # Before the first answer nothing moves.
         (
             None,
             {"meanwhile": "hold"},
@@ -163,7 +166,7 @@ def test_an_answer_later_than_the_rows_it_was_given_is_dropped() -> None:
     assert played(player, 0.0) == [1, 2]
     late = [float(tick.action[0]) for tick in player.ticks(10 + CHUNK, 0.3, {GIVEN: 2})]
     assert late == [3, 4, 5]
-    assert player.request_info()[LEFTOVER].shape == (1, 2), "the plan goes on"
+    assert player.request_info()[LEFTOVER].shape == (1, 2), "the plan continues"
     in_time = [float(tick.action[0]) for tick in player.ticks(10 + CHUNK, 0.1, {GIVEN: 2})]
     assert in_time == [6, 12]
 
@@ -205,7 +208,7 @@ def test_latency_lowers_success_and_repeats_exactly() -> None:
 
 
 class Endless(Line):
-    """An environment that no action solves, with the number of its steps."""
+    """An environment that no action solves, and that counts its steps."""
 
     max_steps = 60
     steps = 0
@@ -221,7 +224,7 @@ class Endless(Line):
 
 
 class Numbering(Agent):
-    """Returns rows that name the step of their observation and their number in the chunk."""
+    """A policy whose rows contain the step of their observation and their number in the chunk."""
 
     contract = Contract(action=ActionSpec(dim=1, delta=True))
 
@@ -236,8 +239,8 @@ class Numbering(Agent):
 def observed(
     rows: int, execute: int | None, timing: ClockConfig
 ) -> tuple[EpisodeResult, list[float]]:
-    """An episode, and the ages, ms, of the actions that an observer of the robot sees: one that is
-    no row, or is the row of the tick before again, is of none.
+    """Run an episode. Return it with the ages in ms of the actions that an observer of the robot
+    sees. An action that is not a row, or that repeats the row of the previous tick, has no age.
     """
     env = Endless()
     executed: list[float] = []
@@ -275,19 +278,19 @@ def test_ticks_in_time_are_those_that_an_observer_of_the_robot_sees(
 
 
 def test_ticks_in_time_of_known_episodes() -> None:
-    # First 2 ticks without a row, and 4 rows that are 200 to 500 ms old; while the policy thinks,
-    # the 2 rows that are left, at 600 and 700 ms. From then on each chunk gives 4 rows of 200 to
-    # 500 ms, the last two of them while the policy thinks.
+    # The first 2 ticks have no row. The next 4 rows are 200 to 500 ms old; while the policy
+    # computes, the 2 remaining rows are 600 and 700 ms old. After that, each chunk gives 4 rows of
+    # 200 to 500 ms, the last two of them while the policy computes.
     timing = ClockConfig(latency=0.2, neutral=[0])
     result, _ = observed(6, 4, timing)
     assert result.time_share == TimeShare(60, 2, 400.0, 500.0, 700.0)
 
-    # Each second tick waits for an answer.
+    # Every second tick waits for an answer.
     result, _ = observed(1, None, ClockConfig(latency=0.1, neutral=[0]))
     assert result.time_share == TimeShare(60, 30, 100.0, 100.0, 100.0)
     assert result.time_share.share == 0.5
 
-    # The first answer comes after the end.
+    # The first answer arrives after the end.
     result, _ = observed(4, None, ClockConfig(latency=9.0, neutral=[0]))
     assert result.time_share == TimeShare(60, 60, None, None, None)
 
@@ -295,7 +298,7 @@ def test_ticks_in_time_of_known_episodes() -> None:
 def test_measured_latency_is_what_the_policy_took() -> None:
     class Slow(ToZero):
         def act(self, obs: Obs) -> Act:
-            time.sleep(0.03)  # what is measured
+            time.sleep(0.03)  # the measured delay
             return super().act(obs)
 
     timing = ClockConfig(hz=100, neutral=[0])

@@ -1,4 +1,4 @@
-"""Episodes run together come out as those run alone."""
+"""Episodes that run together have the same results as episodes that run alone."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_results_are_those_of_episodes_played_alone(agent: Agent, execute: int |
     others = [Line() if on_line else Tabletop(**SIZE, max_steps=50) for _ in wanted]
     agent.initialize()
     expected = [run_episode(alone, copy.deepcopy(agent), key, execute=execute) for key in wanted]
-    # They do not end at one time.
+    # The episodes end at different times.
     assert len({result.steps for result in expected}) > (isinstance(agent, Scripted))
     with SequentialBatch(others) as env:
         assert untimed(together(env, agent, wanted, execute=execute)) == untimed(expected)
@@ -103,7 +103,7 @@ def test_a_remote_policy_is_asked_once_a_step_for_all_sessions(served: Replicas)
 
 
 class Odd(ToZero):
-    """Fails as told for one of the seeds."""
+    """A policy that fails in a given way for one of the seeds."""
 
     def __init__(self, seed: int, error: Exception | None = None) -> None:
         super().__init__()
@@ -142,7 +142,8 @@ def test_a_lost_session_stands_in_place_of_its_result_alone() -> None:
     ("change", "said"),
     [
         (lambda *_: 1 / 0, "ZeroDivisionError"),
-        (lambda _obs, *rest: (None, *rest), "env step: "),  # while they are put together
+        # fails while the observations are combined
+        (lambda _obs, *rest: (None, *rest), "env step: "),
         (lambda obs, *rest: (replace(obs, state={}), *rest), "state 'position' is missing"),
         (
             lambda *answer: (*answer[:4], {"success": "yes"}),

@@ -1,4 +1,6 @@
-"""An episode is rendered by its actions, and only if they repeat it."""
+"""An episode is rendered in a second pass by repeating its actions, and only if the second pass is
+identical.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ STEPS = 4
 
 
 class Altered(Line):
-    """After two steps something is not as in a `Line`."""
+    """An environment in which something differs from `Line` after two steps."""
 
     def __init__(self, what: str | None = None) -> None:
         super().__init__(camera=(4, 4))
@@ -51,7 +53,7 @@ class Altered(Line):
 
 
 def once(env: EvalEnv, left_out: int | None = None) -> PlayedEpisode:
-    """An episode of some steps, of which one is not rendered."""
+    """Return an episode of some steps, one of which is not rendered."""
     played = PlayedEpisode()
     played.add_observation(env.reset(seed=3)[0])
     for number in range(1, STEPS + 1):

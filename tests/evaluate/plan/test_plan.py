@@ -1,5 +1,5 @@
-"""Settings, cases and jobs: what is planned, under which keys, and in which order workers take
-it.
+"""Settings, cases and jobs: the planned episodes, their keys, and the order in which workers take
+them.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> 
 
     [case] = plan_cases(pushed("a"))
     assert (case.policy_id, case.policy_options) == ("policy@3", {}), (
-        "the policy is asked for no checkpoint"
+        "no checkpoint is requested from the policy"
     )
     assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
     with pytest.raises(ValueError, match="expected steps or pushed_weights, got both"):
@@ -76,9 +76,7 @@ def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
         {"checkpoint_step": 20},
     ]
     assert len({str(job.key) for job in jobs}) == 4
-    assert jobs[0].case.place == jobs[2].case.place, (
-        "checkpoints share the env that a worker has made"
-    )
+    assert jobs[0].case.place == jobs[2].case.place, "checkpoints share the environment of a worker"
 
 
 @pytest.mark.parametrize(
@@ -195,7 +193,7 @@ def test_workers_are_wanted_where_most_wait_for_each() -> None:
     kinds: Counter[str] = Counter()
     while (case := queue.needs_worker(kinds, kinds)) is not None:
         kinds[case.kind] += 1
-    assert kinds == {many[0].case.kind: 6, few[0].case.kind: 2}, "no more than there are episodes"
+    assert kinds == {many[0].case.kind: 6, few[0].case.kind: 2}, "no more workers than episodes"
     assert queue.needs_worker({many[0].case.kind: 6}, {}) == few[0].case
 
 
@@ -213,7 +211,7 @@ def test_episodes_side_by_side_are_of_one_case() -> None:
     queue = JobQueue(jobs)
     kind = jobs[0].case.kind
     assert queue.needs_worker({}, {kind: 3}) is not None, (
-        "ten episodes, three at a time, are for four workers"
+        "ten episodes, three at a time, need four workers"
     )
     assert queue.needs_worker({}, {kind: 4}) is None
     taken = [queue.take(kind, None, Counter()) for _ in range(4)]

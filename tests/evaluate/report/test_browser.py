@@ -1,4 +1,4 @@
-"""The report as a browser shows it."""
+"""The report in a browser."""
 
 from __future__ import annotations
 
@@ -88,7 +88,9 @@ EPISODES = (
 
 
 def choose(page: Page, number: int, value: str) -> None:
-    """In the table of episodes; 0: task, 1: policy, 2: outcome."""
+    """Select a value in a filter of the table of episodes. The filters are 0: task, 1: policy, 2:
+    outcome.
+    """
     page.value(
         "(() => { const bar = document.querySelector('.episodes').previousElementSibling;"
         f"const select = bar.querySelectorAll('select')[{number}]; select.value = '{value}';"
@@ -116,7 +118,7 @@ def test_episodes_are_filtered_and_sorted(page: Page, report: Path) -> None:
 def test_many_episodes_are_shown_a_page_at_a_time_and_sorted_as_one(
     page: Page, tmp_path: Path
 ) -> None:
-    results = record(runs(tmp_path, steps=[1000], episodes=140))  # 840
+    results = record(runs(tmp_path, steps=[1000], episodes=140))  # 840 episodes in total
     page.open(write_report(results, tmp_path / "report.html"), width=1400, scheme="light")
     assert page.value(f"{EPISODES}.length") == 500
     page.value("document.querySelectorAll('.episodes .sort')[4].click()")
@@ -145,7 +147,7 @@ def test_videos_of_the_table_play_one_after_another(page: Page, report: Path) ->
     )
     width, below = page.value(ready)
     assert width == 48
-    assert below <= -50  # px left free below the picture, for the controls
+    assert below <= -50  # px below the picture that stay free for the controls
     first, said = page.value(playing), page.value(words)
     page.value("document.querySelectorAll('.viewer button')[1].click()")
     page.value(ready)
@@ -165,5 +167,5 @@ def test_it_prints_with_its_settings_unfolded(page: Page, report: Path) -> None:
     assert 2 <= pages <= 30
     page.value("dispatchEvent(new Event('beforeprint'))")
     assert page.value("document.querySelectorAll('details.printed:not([open])').length") == 0
-    # tracebacks, lists.
+    # tracebacks and lists stay folded
     assert page.value("document.querySelectorAll('details:not([open])').length") > 0

@@ -1,4 +1,4 @@
-"""Comparisons over whole families: the chance of any wrong decision, and episodes of several
+"""Comparisons over whole families: the chance of any wrong decision, and evaluations with several
 clocks.
 """
 
@@ -78,8 +78,8 @@ def _equal_policies(number: int, *, sweep: bool, random: np.random.Generator) ->
 def test_equal_policies_are_told_apart_in_five_percent_of_evaluations_at_most(
     number: int, most_pairs: int, most_compared: int, sweep: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On either side of each constant, as the pairs that are shown are chosen by their outcomes
-    on one of them.
+    """The parameters cover both sides of each constant. With more policies, the shown pairs depend
+    on the outcomes.
     """
     monkeypatch.setattr(success, "MOST_PAIRS", most_pairs)
     monkeypatch.setattr(success, "MOST_COMPARED", most_compared)
@@ -112,8 +112,8 @@ def test_the_page_decides_by_the_adjusted_p_values(monkeypatch: pytest.MonkeyPat
             )
 
 
-# Of 11 episodes that wait and 13 in real time, these are solved: no rate of one clock is one of
-# both.
+# Numbers of solved episodes out of 11 synchronous and 13 real-time ones, chosen so that no rate of
+# one clock equals a rate over both.
 WAITING, LIVE = 11, 13
 SOLVED = {
     ("learner", "waiting"): 10,
@@ -158,13 +158,13 @@ def _numbers(value: object) -> Iterator[float]:
 
 
 def _numbers_of_text(text: str) -> Iterator[float]:
-    """Return the percentages of a page or a terminal, as shares."""
+    """Return the percentages in a page or a terminal output, as shares."""
     for percent in re.findall(r"\d+\.\d(?!\d)|\d+(?=%)", text):
         yield float(percent) / 100
 
 
 def _outputs(results: Results) -> dict[str, list[float]]:
-    """Return the numbers of every output that has success rates."""
+    """Return the numbers in each output with success rates."""
     summary = summarize(results)
     console = Console(file=StringIO(), width=200)
     print_summary(console, summary)
@@ -180,7 +180,7 @@ def _outputs(results: Results) -> dict[str, list[float]]:
 
 
 def _pooled() -> dict[str, float]:
-    """Return the numbers that only episodes of both clocks together have."""
+    """Return the numbers that only appear if episodes of both clocks are pooled."""
     both = WAITING + LIVE
     learner, base = (SOLVED[name, "waiting"] + SOLVED[name, "live"] for name in ("learner", "base"))
     rates = {"learner": learner / both, "base": base / both}
@@ -205,11 +205,11 @@ def test_no_output_pools_episodes_of_two_clocks(
         for name, value in forbidden.items():
             digits = 3 if in_percent else 9
             equal = [number for number in numbers if round(number, digits) == round(value, digits)]
-            assert not equal, f"{output} has the pooled {name}, {value:.4f}"
+            assert not equal, f"{output} contains the pooled {name}, {value:.4f}"
         expected = SOLVED["learner", "waiting"] / WAITING
         found = any(round(number, 2) == round(expected, 2) for number in numbers)
         assert found or output == "report --json", (
-            f"{output} has no rate of one clock, {expected:.3f}"
+            f"{output} lacks the rate of one clock, {expected:.3f}"
         )
     a, b = results.policy_ids[0], results.policy_ids[-1]
     with pytest.raises(ConfigError, match="several clocks"):
@@ -219,7 +219,7 @@ def test_no_output_pools_episodes_of_two_clocks(
 def test_episodes_in_real_time_change_nothing_of_those_that_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The best policy, the pairs that are compared and their p-values are of one clock."""
+    """The best policy, the compared pairs and their p-values come from episodes of one clock."""
     monkeypatch.setattr(success, "MOST_COMPARED", 2)
 
     def synchronous_parts(live_solved: dict[str, int]) -> list[object]:

@@ -1,5 +1,5 @@
-"""A running evaluation: in a document of the results as they are recorded, in a terminal, and in
-a log.
+"""The progress of a running evaluation, in a document of its recorded results, in a terminal, and
+in a log.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def read(document: ResultsDocument) -> dict[str, Any]:
-    """The document, as a browser gets it."""
+    """Return the document as a browser receives it."""
     found: dict[str, Any] = json.loads(json.dumps(document.read(), allow_nan=False))
     return found["evaluation"]
 
@@ -136,7 +136,8 @@ def test_failures_come_newest_first_with_what_went_wrong(
     ]
     assert said["failed"] == 3
     [case] = [one for one in said["cases"] if one["done"]]
-    assert (case["done"], case["episodes"]) == (4, 3)  # what infrastructure lost is in no rate
+    # episodes that infrastructure lost are in no rate
+    assert (case["done"], case["episodes"]) == (4, 3)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_a_training_waits_between_its_versions_and_has_a_learning_curve(tmp_path
 def test_videos_are_found_by_number_alone(tmp_path: Path) -> None:
     record(runs(tmp_path, episodes=2), videos=True)
     document = ProgressDocument(tmp_path)
-    assert document.video(0) is None  # nobody has read a document that names it
+    assert document.video(0) is None  # no document that names the video has been read yet
     failures = read(document)["failures"]
     assert HOSTILE in failures[0]["instruction"]
     for one in failures:
@@ -203,7 +204,7 @@ def test_videos_are_found_by_number_alone(tmp_path: Path) -> None:
     assert path is not None
     path.unlink()
     assert document.video(number) is None
-    path.symlink_to("/etc/hostname")  # as in a folder that somebody else has made
+    path.symlink_to("/etc/hostname")  # as in a folder that another user created
     assert document.video(number) is None
 
 
@@ -214,7 +215,7 @@ def test_the_results_are_read_for_a_share_of_the_time_at_most(
     monkeypatch.setattr(results_document, "_EVERY_S", 1e9)
     played.play(played.jobs[0], True)
     assert document.read() is before
-    played.end("complete")  # which nobody should miss
+    played.end("complete")  # the end must always be shown
     assert document.read() is not before
 
 
@@ -250,7 +251,7 @@ def test_cases_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) ->
 def test_a_folder_that_another_process_writes_says_how_its_last_run_stands(tmp_path: Path) -> None:
     followed = ResultsDocument(tmp_path)
     assert read(followed)["state"] == "starting"
-    (tmp_path / "results.db").touch()  # it is just being made
+    (tmp_path / "results.db").touch()  # the file is just being created
     assert read(followed)["state"] == "starting"
     (tmp_path / "results.db").unlink()
     one = Played(tmp_path, ProgressDocument(tmp_path))

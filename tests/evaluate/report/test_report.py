@@ -27,13 +27,13 @@ from vlagents_ray.evaluate.results.store import Store
 
 
 class Read(HTMLParser):
-    """The elements of a page, and its text; a tag that is not closed is an error."""
+    """The elements of a page, and its text; an unclosed tag is an error."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.text: list[str] = []
-        self.sections: dict[str, list[str]] = {}  # their texts, by heading
+        self.sections: dict[str, list[str]] = {}  # the texts of sections, by heading
         self._open: list[str] = []
         self.feed(path.read_text())
         self.close()
@@ -59,7 +59,7 @@ class Read(HTMLParser):
         return [attributes for tag, attributes in self.elements if tag == name]
 
     def section(self, heading: str) -> str:
-        """The words from a heading to the next one."""
+        """Return the words from a heading to the next one."""
         return " ".join(" ".join(self.sections[heading]).split())
 
     @property
@@ -96,7 +96,7 @@ def test_nothing_is_fetched_from_anywhere(page: Read) -> None:
 def test_what_policies_and_simulators_say_is_text(page: Read) -> None:
     assert len(page.all("script")) == 1
     assert all("onerror" not in attributes for attributes in page.all("img"))
-    # instruction, policy error, failure, protocol.
+    # in the instruction, the policy error, the failure and the protocol.
     assert page.words.count(" ".join(HOSTILE.split())) >= 4
 
 
@@ -109,7 +109,7 @@ def test_names_are_text_wherever_they_are_shown(page: Read, tmp_path: Path) -> N
     tags = [tag for tag, _ in read.elements]
     assert tags == [tag for tag, _ in page.elements]
     assert not any(name.startswith("on") for _, attributes in read.elements for name in attributes)
-    for shown in (read.all("figure"), read.all("div")):  # in attributes too
+    for shown in (read.all("figure"), read.all("div")):  # attributes are checked, too
         assert any(HOSTILE in str(value) for attributes in shown for value in attributes.values())
 
 
@@ -222,7 +222,9 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
 def test_the_headline_of_two_policies_is_their_difference(
     better: int, verdict: str, tmp_path: Path
 ) -> None:
-    """The rate of the better one was chosen by its size, and says nothing about the other."""
+    """The rate of the better policy would be selected for its size, and says nothing about the
+    other.
+    """
     policies = [
         {"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate("ab", 1)
     ]
@@ -251,7 +253,7 @@ def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_com
     monkeypatch.setattr(success, "MOST_COMPARED", 20)
     results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
     words = page_of(results).section("Comparison")
-    assert "45 pairs of so many checkpoints are left out" in words  # of 55
+    assert "45 pairs of so many checkpoints are left out" in words  # of 55 pairs
     assert "further pairs" not in words
     for step in range(200, 2000, 200):
         assert f"learner@{step + 200} learner@{step}" in words
@@ -284,7 +286,7 @@ def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     fewer = runs(tmp_path, episodes=4, resume=True, accept_changes=True)
     with Store(resolve(fewer)):
         page = page_of(Results.load(tmp_path))
-    assert page.text.count("(solved)") == 3 * 3 * 2  # policy_ids, tasks, episodes
+    assert page.text.count("(solved)") == 3 * 3 * 2  # policy ids, tasks, episodes
     assert "In brackets: the episode is beyond the point" in page.words
 
 
@@ -300,7 +302,8 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
     assert "base (no steps)" in words
     assert "training step" in words
     assert "version of the weights" not in words
-    assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
+    # in the table of numbers, where it has no step
+    assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)
     words = page.section("Comparison")
     first = [
         words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")
@@ -309,9 +312,9 @@ def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning
         words.index(pair)
         for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")
     ]
-    assert first == sorted(first), "consecutive checkpoints, and the later one is A"
+    assert first == sorted(first), "consecutive checkpoints come first, with the later one as A"
     assert max(first) < min(others)
-    assert others[0] == min(others), "the best against the baseline"
+    assert others[0] == min(others), "then the best checkpoint against the baseline"
 
 
 def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(
@@ -323,7 +326,8 @@ def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(
     unfolded = words[: words.index("further pairs")]
     for step in range(200, 2000, 200):
         assert f"learner@{step + 200} learner@{step}" in unfolded
-    assert len(re.findall(r"learner@\d+ base", unfolded)) == 1 + 1  # and by suite
+    # once in total, and once by suite
+    assert len(re.findall(r"learner@\d+ base", unfolded)) == 1 + 1
 
 
 def test_cases_that_stopped_early_have_intervals_of_another_name(tmp_path: Path) -> None:
@@ -386,12 +390,12 @@ def test_differences_share_an_axis_that_holds_them_all(bounds: list[tuple[float,
     ]
     axis = difference_glyph(0.0, (0.0, 0.0), limit, decided=True).axis
     assert axis == f"M{ends[0]:g} 8H{ends[2]:g}M{ends[1]:.1f} 2V14", (
-        "from the left label to the right one, with 0"
+        "labels from left to right, including 0"
     )
 
 
 def test_a_small_difference_is_seen_beside_its_dot() -> None:
-    """An interval of +4 to +15 points, on its axis, reaches beyond the dot of its estimate."""
+    """The interval of +4 to +15 points must be drawn longer than the dot of its estimate."""
     interval = (0.04, 0.15)
     glyph = difference_glyph(0.095, interval, difference_limit([interval]), decided=True)
     assert glyph.range is not None

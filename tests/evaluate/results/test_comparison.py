@@ -17,7 +17,7 @@ from vlagents_ray.evaluate.results.statistics import Pairs
 
 
 def solved_by(**seeds: set[int]) -> Any:
-    """An outcome: who solves which seeds, by policy."""
+    """Return an outcome function from the seeds that each policy solves."""
     return lambda case, seed: 5 if seed in seeds[case.policy.name] else None
 
 
@@ -37,7 +37,7 @@ def test_what_infrastructure_lost_is_in_no_pair(tmp_path: Path) -> None:
         runs(tmp_path, episodes=5, steps=[]), solved_by(learner=set(), base={0, 1}), troubles=True
     )
     first = compare(results, "learner", "base").total.strata[0]
-    # Of seed 1 there is but base's; the policy's error of seed 0 counts.
+    # Seed 1 has only base's episode; the policy's error with seed 0 counts as a failure.
     assert first == Pairs(only_b=1, neither=3)
 
 
@@ -70,7 +70,7 @@ def test_a_comparison_as_json_has_every_line(tmp_path: Path) -> None:
 
 
 def folder(out: Path, name: str, **suite: Any) -> Results:
-    """One policy in one env."""
+    """Return the settings of one policy in one environment."""
     settings = {
         "policies": [{"name": name, "url": "http://localhost:1"}],
         "suites": [{"envs": [LINE], "episodes": 4} | suite],
@@ -126,7 +126,7 @@ def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) ->
 
 
 def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
-    """Also where no task is in both folders, so that their rates would be added up."""
+    """This also holds if no task is in both folders, whose rates would otherwise be added up."""
 
     def played(by: str, env: str, checkpoint: str, weights: str) -> Results:
         results = folder(tmp_path / by, "pi0", envs=[env])
@@ -138,7 +138,7 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
     first = played("first", LINE, "runs/last", "a")
     assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).policy_ids == ["pi0"]
     another = played("another", OTHER_LINE, "runs/best", "b")
-    assert combined([first, another]).policy_ids == ["pi0"]  # the page names both
+    assert combined([first, another]).policy_ids == ["pi0"]  # the page names both folders
     other = combined([first, played("later", OTHER_LINE, "runs/last", "b")])
     assert other.policy_ids == ["pi0 (first)", "pi0 (later)"]
     assert ("pi0 (later)", "b") in configuration(other).checkpoints

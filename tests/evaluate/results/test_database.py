@@ -1,4 +1,4 @@
-"""results.db, as it is written, as others read it, and where nothing can be written."""
+"""results.db: writing, reading by other programs, and errors of storage."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ os._exit(9)
 
 @pytest.fixture(scope="module", autouse=True)
 def commits_reach_the_disk() -> None:
-    """As they do outside of tests."""
+    """Restore the sync of commits, which the other tests disable."""
 
 
 def begun(config: EvalConfig) -> Store:
-    """A store with an episode in it."""
+    """Return a store with an episode in it."""
     store = Store(resolve(config))
     store.begin_run({})
     store.record(EpisodeResult(plan_jobs(plan_cases(config))[0].key, "done", True, True), 1)
@@ -61,7 +61,7 @@ def begun(config: EvalConfig) -> Store:
 
 
 def kill_in(config: EvalConfig) -> None:
-    """Have a process record an episode and die."""
+    """Let a process record an episode and die."""
     command = [sys.executable, "-c", KILLED, config.model_dump_json()]
     assert (
         subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": PYTHONPATH}).returncode
@@ -156,7 +156,7 @@ FOREIGN = 'x") VALUES (1); DROP TABLE episodes; --'
         (table, "")
         for table in ("runs", "policies", "cases", "episodes", "attempts", "workers", "tracked")
     ]
-    + [("episodes", " AS (1)")],  # generated
+    + [("episodes", " AS (1)")],  # a generated column
 )
 def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
     config: Config, table: str, kind: str

@@ -1,4 +1,6 @@
-"""Early stopping: honest whenever one looks, and decided by outcomes alone."""
+"""Early stopping: the error rate holds at any number of looks, and only outcomes decide when to
+stop.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,7 @@ def test_nothing_is_known_without_episodes() -> None:
 def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(rate: float) -> None:
     streams, length, error_rate = 2000, 400, 0.05
     counts = np.cumsum(np.random.default_rng(5).random((streams, length)) < rate, axis=1)
-    # Bounds depend on counts alone: each pair that occurs is computed once.
+    # The bounds depend only on counts, so each pair of counts is computed once.
     missed = np.zeros(streams, bool)
     for n in range(1, length + 1):
         here = counts[:, n - 1]
@@ -79,7 +81,7 @@ def test_the_true_rate_is_missed_no_more_often_than_is_said_whenever_one_looks(r
     ]
     looks = np.array([not low <= rate <= high for low, high in fixed]).reshape(100, -1).any(axis=1)
     assert looks.mean() > error_rate, (
-        "an interval for one look is missed more often, or the test shows nothing"
+        "intervals for one look must fail more often for the test to be meaningful"
     )
 
 
@@ -127,7 +129,9 @@ def test_where_a_case_stops_does_not_depend_on_the_order_in_which_episodes_arriv
         found.add((stopping.at, tuple(stopping.counts(one.key) for one in outcomes)))
     [(at, counted)] = found
     assert at is not None
-    assert counted == (True,) * at + (False,) * (60 - at), "the planned order is that of the seeds"
+    assert counted == (True,) * at + (False,) * (60 - at), (
+        "the planned order is the order of the seeds"
+    )
 
 
 def test_a_rule_has_an_end() -> None:
@@ -163,7 +167,7 @@ class TestOnACluster:
         for (at, counted), case in zip(found[0], summary.results.cases, strict=True):
             assert at is not None
             assert at == len(counted) < 40
-            assert len(case.episodes) >= at, "what was played beyond is kept"
+            assert len(case.episodes) >= at, "episodes beyond the stop are kept"
 
 
 def test_what_a_stopped_case_says_holds_and_resuming_plays_nothing(config: Config) -> None:

@@ -67,9 +67,8 @@ def test_mcnemar_is_the_binomial_test_of_what_only_one_solved(only_a: int, only_
     assert mcnemar(only_a, only_b) == pytest.approx(want, rel=1e-9)
 
 
-# From the paper that `mcnemar` names, table 3: airway hyper-responsiveness before and after stem
-# case transplantation,
-# 1 and 7 discordant pairs.
+# From table 3 of the paper cited by `mcnemar`: airway hyper-responsiveness before and after stem
+# cell transplantation, with 1 and 7 discordant pairs.
 def test_mcnemar_agrees_with_published_values() -> None:
     assert mcnemar(1, 7) == pytest.approx(0.070, abs=5e-4)
     assert mcnemar(1, 7, mid=True) == pytest.approx(0.039, abs=5e-4)
@@ -89,7 +88,7 @@ def test_mid_p_is_symmetric_and_no_larger(only_a: int, only_b: int) -> None:
 
 def test_thousands_of_episodes_do_not_overflow() -> None:
     assert 0.0 < mcnemar(4000, 4200) < 0.05
-    assert mcnemar(0, 5000) == 0.0  # 2^-4999 is less than any float
+    assert mcnemar(0, 5000) == 0.0  # 2^-4999 is smaller than any float
 
 
 def test_mcnemar_rejects_a_true_hypothesis_no_more_often_than_it_says() -> None:
@@ -98,7 +97,7 @@ def test_mcnemar_rejects_a_true_hypothesis_no_more_often_than_it_says() -> None:
     assert np.mean(p[only_a] < 0.05) < 0.05
 
 
-# Chances of both, only A, only B, neither.
+# Probabilities of both, only A, only B, and neither.
 ALIKE, APART = [[0.5, 0.1, 0.1, 0.3]] * 2, [[0.2, 0.2, 0.1, 0.5], [0.7, 0.15, 0.05, 0.1]]
 FAR = [[0.02, 0.9, 0.0, 0.08]]
 
@@ -115,7 +114,7 @@ def test_the_interval_covers_the_difference_at_least_about_as_often_as_it_says(
         strata = [Pairs(*map(int, rng.multinomial(episodes, one))) for one in chances]
         low, high = difference_interval(strata)
         covered += low <= true <= high
-    assert covered / 200 > 0.915  # 0.95 less two and a quarter standard deviations of 200 trials
+    assert covered / 200 > 0.915  # 0.95 minus two and a quarter standard deviations of 200 trials
 
 
 def test_the_interval_is_narrower_for_knowing_the_tasks() -> None:
@@ -152,7 +151,8 @@ def test_thousands_of_episodes_narrow_the_interval() -> None:
 
 
 def test_holm_agrees_with_a_worked_example() -> None:
-    # Sorted 0.005, 0.01, 0.03, 0.04 times 4, 3, 2, 1, and never less than the one before.
+    # The sorted values 0.005, 0.01, 0.03, 0.04 times 4, 3, 2, 1, and never less than the value
+    # before.
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([]) == []
 

@@ -92,7 +92,7 @@ def test_results_are_not_touched_without_resume(config: Config) -> None:
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun: bool) -> None:
     with Store(resolve(config())) as store:
-        if begun:  # and ended by a wrong setting
+        if begun:  # and a wrong setting ended the run
             store.begin_run({})
             store.record_attempt(
                 planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False
@@ -240,7 +240,7 @@ def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None
 def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) -> None:
     with Store(resolve(config())) as store:
         store.begin_run({})
-        for job in planned(config())[::2]:  # those that happened to come back first
+        for job in planned(config())[::2]:  # every second job finished first
             store.record(done(job.key), attempts=1)
     with pytest.raises(ConfigError, match=r"plan: .*episodes was 6, is 3"):
         Store(resolve(config(episodes=3, resume=True)))
@@ -285,12 +285,12 @@ def test_an_episode_of_another_checkpoint_or_of_other_weights_is_not_added(
         store.begin_run({})
         with pytest.raises(ConfigError, match=said):
             store.record(replace(done(third), **other), attempts=1)
-        store.record(done(third), attempts=1)  # of a server that does not tell
+        store.record(done(third), attempts=1)  # from a server that reports no weights
     assert [one.weights for one in recorded(config())] == [known.get("weights")] * 2 + [None]
 
 
 def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
-    """Its server may have been replaced between two of them."""
+    """The server may have been replaced between two tasks."""
     settings = config(envs=[LINE, OTHER_LINE], episodes=1)
     first, second = (job.key for job in planned(settings))
     other = replace(done(second), checkpoint="runs/last", weights="b")
@@ -303,14 +303,15 @@ def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
                 store.record(other, attempts=1)
     with Store(resolve(again)) as store:
         store.begin_run({})
-        store.record(replace(other, checkpoint="runs/other"), attempts=1)  # chosen by its task
+        # a checkpoint that the task selects
+        store.record(replace(other, checkpoint="runs/other"), attempts=1)
 
 
 def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config: Config) -> None:
     said = {"policy": "act", "checkpoint": "a"}
     with Store(resolve(config())) as store:
         store.begin_run({})
-        store.note_policy("policy", said)  # of a server that tells no weights
+        store.note_policy("policy", said)  # a server that reports no weights
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": None}})
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": "c0ffee"}})
         with pytest.raises(

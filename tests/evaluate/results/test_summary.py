@@ -30,7 +30,9 @@ Config = Callable[..., EvalConfig]
 
 @pytest.fixture
 def summary(config: Config) -> Summary:
-    """Two envs with 3 planned episodes each: one finished but for a lost episode, one begun."""
+    """Return the summary of two environments with 3 planned episodes each: one finished except for
+    a lost episode, the other begun.
+    """
     settings = config(
         envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1"
     )
@@ -109,7 +111,7 @@ def test_the_total_counts_all_envs(summary: Summary) -> None:
     assert total.policy_ms == 3.0
     assert summary.transports == ["http", "websocket"]
     assert summary.steps_per_second == pytest.approx(18 / summary.wall_seconds)
-    assert (summary.env_busy, summary.policy_busy) == (None, None), "no episode says it"
+    assert (summary.env_busy, summary.policy_busy) == (None, None), "no episode reports it"
 
 
 def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None:
@@ -166,7 +168,7 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
 
 
 def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: Any) -> Summary:
-    """The summary of an evaluation whose suites had these outcomes."""
+    """Return the summary of an evaluation with these outcomes by suite."""
     with Store(resolve(settings)) as store:
         store.begin_run(versions())
         for job in plan_jobs(store.cases):
@@ -189,7 +191,7 @@ def printed(summary: Summary) -> str:
 def in_real_time(
     out: Path, outcomes: dict[str, list[bool]], envs: Sequence[str] = (LINE,), **fields: Any
 ) -> tuple[Summary, str]:
-    """The summary of suites of which only "waits" is synchronous, and what is printed of it."""
+    """Return the summary of suites of which only "waits" is synchronous, and its printed text."""
     suites = [
         {"name": name, "envs": list(envs), "episodes": len(solved)}
         | ({} if name == "waits" else {"clock": {"latency": 0.2}})
@@ -207,7 +209,9 @@ def test_a_case_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path
     waits, moves, smaller = summary.results.cases
     assert synchronous_twin(summary.results, moves) is waits
     assert synchronous_twin(summary.results, waits) is None
-    assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
+    assert synchronous_twin(summary.results, smaller) is None, (
+        "the suite differs in more than its clock"
+    )
     assert [case["gap_to_synchronous"] for case in summary.to_json()["cases"]] == [
         None,
         -0.75,
@@ -268,7 +272,8 @@ def test_a_case_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_
 
 
 def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:
-    # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
+    # Two of the six synchronous episodes have no pair: the rates differ by -60 points, the pairs by
+    # -50.
     outcomes = {"waits": [True] * 3 + [False] + [True] * 2, "moves on": [True] + [False] * 3}
     summary, text = in_real_time(tmp_path, outcomes, [LINE, OTHER_LINE])
     assert [case["gap_to_synchronous"] for case in summary.to_json()["cases"]] == [
@@ -292,8 +297,8 @@ def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Pa
     page = write_report(summary.results, tmp_path / "report.html").read_text()
     assert ">50.0" not in page
     assert "solved, synchronous" in page
-    assert ">100.0" in page, "of the episodes that waited"
-    assert ">0.0" in page, "of those in real time"
+    assert ">100.0" in page, "the rate of synchronous episodes"
+    assert ">0.0" in page, "the rate of real-time episodes"
 
 
 def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
@@ -305,7 +310,7 @@ def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     assert alike.totals[0].success_once.rate == 1.0
     with Store(resolve(settings)) as store:
         store.begin_run({})
-        # One task is solved at once, the other every second time.
+        # One task is always solved, the other in every second episode.
         for job in plan_jobs(store.cases):
             success = job.case.env == LINE or bool(job.key.episode % 2)
             if job.case.env == OTHER_LINE or job.key.episode < 12:
@@ -322,7 +327,7 @@ def test_cases_that_stopped_after_different_numbers_have_no_rate_in_common(
     assert total["success_once"]["confidence_sequence"] == [0.0, 1.0]
     assert "have no common rate" in printed(summary)
     page = write_report(summary.results, tmp_path / "report.html").read_text()
-    assert "50.0 to 100.0 %" in page  # from task to task, as the headline
+    assert "50.0 to 100.0 %" in page  # range of the tasks' rates, in the headline
     pooled = 100 * (first.stopped_at + 20) / (first.stopped_at + 40)
     assert f"{pooled:.1f}" not in page
 

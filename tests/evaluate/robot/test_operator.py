@@ -1,4 +1,4 @@
-"""The operator's page: what it answers, to whom, and a whole evaluation over it; and the
+"""The operator's page: its answers, its access control, and a whole evaluation with it; and the
 operator at a terminal.
 """
 
@@ -30,7 +30,7 @@ from vlagents_ray.images.jpeg_png import decode
 
 
 class Person:
-    """A person at the page, over HTTP; `read` is all that they were shown."""
+    """A person at the page, over HTTP; `read` has all texts that they were shown."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -84,10 +84,10 @@ def operator() -> Iterator[PageOperator]:
 
 
 def watch_to_the_end(person: Person) -> None:
-    """Poll as an open page does: the operator waits for one that is open to show how the
-    evaluation ended.
+    """Poll like an open page: the operator waits until an open page has shown the end of the
+    evaluation.
     """
-    with contextlib.suppress(OSError):  # it has ended already
+    with contextlib.suppress(OSError):  # the server has already ended
         while person.state()["phase"] != "end":
             time.sleep(0.01)
 
@@ -111,7 +111,7 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(
         assert person.answer("ready", scene) == 200
         verdict = person.until("verdict")
         assert verdict["ending"] == "the trial is over"
-        assert person.answer("repeat", verdict) == 400, "it wants a reason"
+        assert person.answer("repeat", verdict) == 400, "the answer requires a reason"
         earned = ["the cup is on the plate"]
         assert (
             person.answer(
@@ -137,7 +137,9 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(
     ],
 )
 def test_an_open_page_says_how_the_evaluation_ended(error: BaseException | None, said: str) -> None:
-    """Before the server is gone: afterwards, an end and a lost connection look the same."""
+    """The page must show the end before the server stops, since later an end looks like a lost
+    connection.
+    """
     read: list[dict[str, Any]] = []
 
     def watch(person: Person) -> None:
@@ -171,9 +173,9 @@ def test_an_answer_counts_for_the_question_that_was_shown(
     assert person.post(b"{}") == 400
     assert person.post(b" " * 20_000) == 413
     assert person.post(b"{}", "text/plain") == 415, (
-        "what a form of another site can send without being asked"
+        "a form of another site can send this content type without a preflight request"
     )
-    assert arm.applied == 0, "and nothing moved"
+    assert arm.applied == 0, "the robot did not move"
     assert person.answer("end", scene) == 200
     run.join()
     assert isinstance(run.error, TrialsInterrupted)
@@ -208,7 +210,7 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     run = Evaluation(config, operator, arm := Arm())
     assert person.answer("ready", person.until("scene")) == 200
     playing = person.until("playing")
-    begun = time.monotonic()  # of the page's last question
+    begun = time.monotonic()  # time of the page's last request
     wait_for(lambda: arm.applied > 10)
     if how == "stop":
         assert person.answer("stop", playing) == 200
@@ -230,7 +232,7 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
 
 @pytest.fixture
 def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """What is written there is typed at this process's terminal."""
+    """Yield a descriptor; text written to it is typed at this process's terminal."""
     main, terminal = pty.openpty()
     with os.fdopen(terminal) as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
@@ -242,10 +244,10 @@ def test_enter_stops_a_trial_once(keyboard: int) -> None:
     person = TerminalOperator()
     assert not person.stops()
     os.write(keyboard, b"stop")
-    assert not person.stops(), "the line has no end yet"
+    assert not person.stops(), "the line is not complete"
     os.write(keyboard, b"\n")
     assert person.stops()
-    assert not person.stops(), "it is read, and no answer to the next question"
+    assert not person.stops(), "the line is consumed, and does not answer the next question"
 
 
 def test_lines_of_a_pipe_are_left_for_the_questions(

@@ -33,7 +33,7 @@ def until(page: Page, expression: str, want: object) -> None:
 
 
 def require_tidy(page: Page, width: int) -> None:
-    """It fits the window, and what is shown has no policy in it."""
+    """Check that the page fits the window, and that it does not contain a policy's name."""
     assert page.value("document.documentElement.scrollWidth") <= width
     text = page.value("document.documentElement.outerHTML")
     assert not any(name in text for name in NAMES)
@@ -94,6 +94,6 @@ def test_a_scene_is_set_played_and_judged(
     outside = [url for url in page.asked if not url.startswith((operator.url, "data:"))]
     assert outside == []
     said = [one for one in page.said if "400" not in one]
-    # The page may ask for one more image while the evaluation, and with it the page's server, ends.
+    # The page may request one more image while the evaluation ends, and with it the page's server.
     said = [one for one in said if not ("/now/camera/" in one and "ERR_CONNECTION_REFUSED" in one)]
-    assert said == [], "beside the answers that were refused"
+    assert said == [], "except for the rejected answers"

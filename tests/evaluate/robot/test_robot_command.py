@@ -1,4 +1,6 @@
-"""`vlagents-ray eval --robot`: policies that it serves itself, and a person at its terminal."""
+"""`vlagents-ray eval --robot` with policies that the command serves itself, and an operator at its
+terminal.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ _ASKS = re.compile(r"(Enter when the scene is ready.*?|verdict \(.*?\)|note): $"
 
 
 def write_plan(file: Path) -> None:
-    """Two policies of different chunks; one on a socket whose address tells nothing."""
+    """Write a plan with two policies of different chunks; the address of one is a socket that does
+    not identify it.
+    """
     policies = [
         {"name": name, "source": "noop", "config": {"action_dim": 2, "chunk": chunk}}
         for chunk, name in enumerate(NAMES, start=3)
@@ -46,14 +50,14 @@ def write_plan(file: Path) -> None:
 
 
 class Terminal:
-    """The command with a person who types when asked; `read` is all that was printed."""
+    """The command with a person who types answers; `read` has all of its output."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
         self.read = b""
 
     def asked(self) -> str:
-        """What is asked next; "" when the command has ended."""
+        """Return the next question; "" when the command has ended."""
         question = b""
         assert self.process.stdout is not None
         while byte := self.process.stdout.read(1):
@@ -111,7 +115,7 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
     plan, out = tmp_path / "plan.yaml", tmp_path / "out"
     write_plan(plan)
     with evaluating(plan, out) as terminal:
-        for answer in ("", "s", "", ""):  # one trial, and the beginning of the next
+        for answer in ("", "s", "", ""):  # one complete trial, and the beginning of the next
             assert terminal.asked()
             require_blind(terminal, out)
             terminal.type(answer)
@@ -125,7 +129,7 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
             terminal.type(next(verdicts) if question.startswith("verdict") else "")
         assert terminal.process.wait() == 0
     assert b"repeated: the evaluation ended before the verdict" in terminal.read
-    assert all(name.encode() in terminal.read for name in NAMES), "the table at the end"
+    assert all(name.encode() in terminal.read for name in NAMES), "the table of results at the end"
     results = Results.load(out)
     config = EvalConfig.model_validate(results.runs[-1].config)
     order = [trial.job.key for trial in schedule(plan_cases(config), b"the key of the plan")]

@@ -1,5 +1,5 @@
-"""Trials on a simulated arm with a scripted person: what they see, what is recorded, and what
-comes out.
+"""Trials on a simulated arm with a scripted operator: the texts that they see, the recordings, and
+the results.
 """
 
 from __future__ import annotations
@@ -72,19 +72,19 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     with captured_output() as output, caplog.at_level(logging.DEBUG):
         person = ScriptedPerson(judged("sf"), look)
         summary = evaluate_on_robot(config, person, agent_factory=Policies(Talkative))
-    assert looks == 3 * 8, "ready, verdict and note of each trial"
+    assert looks == 3 * 8, "questions for ready, verdict and note in each trial"
     assert (tmp_path / "out" / "recordings" / "trial0008-1" / "meta" / "info.json").is_file()
     lines = [
         json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()
     ]
     assert hidden.stat().st_mode & 0o777 == 0o600
     assert len({len(line) for line in hidden.read_bytes().splitlines()}) == 1, (
-        "the size of the file tells nothing"
+        "the size of the file does not reveal the policy"
     )
     shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "hidden"}
     assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
-    assert found.policy_ids == list(NAMES), "and then it is told"
+    assert found.policy_ids == list(NAMES), "at the end the policies are revealed"
     assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
     assert {one.result.weights for case in found.of(NAMES[0]) for one in case.episodes} == {
         f"digest-of-{NAMES[0]}"
@@ -103,7 +103,7 @@ class Talkative(Reaching):
 
 
 class VirtualTime(SimulatedTime):
-    """In place of the module `time`, with the time of day."""
+    """A stand-in for the module `time`, including the time of day."""
 
     time = SimulatedTime.monotonic
 
@@ -116,7 +116,7 @@ def test_a_trial_has_the_ticks_in_time_and_the_ages_of_its_actions(
         monkeypatch.setattr(f"vlagents_ray.{module}.time", clock)
 
     class Slow(Reaching):
-        """Answers with four rows after two and a half ticks."""
+        """A policy that returns four rows after two and a half ticks."""
 
         def act(self, obs: Obs) -> Act:
             clock.now += 0.25
@@ -129,8 +129,8 @@ def test_a_trial_has_the_ticks_in_time_and_the_ages_of_its_actions(
     )
     summary = evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies(Slow))
 
-    # The reset waits for the first chunk: rows of 250, 350, 450 and 550 ms. Each later chunk costs
-    # a tick, the one after its request, and its rows have 250, 250, 300 and 400 ms.
+    # The reset waits for the first chunk, whose rows are 250, 350, 450 and 550 ms old. Each later
+    # chunk costs the tick after its request, and its rows are 250, 250, 300 and 400 ms old.
     ages_ms = [250.0, 350.0, 450.0, 550.0, *[250.0, 250.0, 300.0, 400.0] * 2]
     expected = TimeShare.from_ages(14, 2, ages_ms)
     for case in summary.results.cases:
@@ -154,9 +154,9 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
             trial.job.case.policy_id for trial in schedule(plan_cases(config), key.read_bytes())
         ]
         assert policies.made[:2] == sorted(NAMES), (
-            "each is rehearsed, in an order that tells nothing"
+            "each policy is rehearsed, in an order that reveals nothing"
         )
-        assert policies.made[2:] == drawn, "who has the key draws the same"
+        assert policies.made[2:] == drawn, "the key reproduces the order"
         orders.add(key.read_bytes())
     assert len(orders) == 2
 
@@ -229,7 +229,7 @@ def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_pol
     order = names_by_trial(config)
     assert policies.made[2:] == [order[0], order[1], order[1], *order[2:]]
     assert any("joint 3 is too hot" in line for line in person.printed), (
-        "the person is told what to mend"
+        "the operator is shown what to fix"
     )
     assert arm.stops >= 5
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
@@ -243,7 +243,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
 ) -> None:
     class Losing(Reaching):
         def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-            self.lost = len(policies.made) == 4  # in the second trial
+            self.lost = len(policies.made) == 4  # the server is lost in the second trial
             return self._lose("reset") or super().reset(obs, instruction, **kwargs)
 
         def act(self, obs: Obs) -> Act:
@@ -252,7 +252,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
 
         def _lose(self, here: str) -> None:
             if self.lost and here == where and (here == "reset" or self.acts > 1):
-                raise ConnectionLost(f"{URLS[self.name]} went away")
+                raise ConnectionLost(f"{URLS[self.name]} is unavailable")
 
     policies = Policies(Losing)
     config = plan(
@@ -266,7 +266,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     assert told.strip() == f"repeated: it could not be run ({code})"
     [attempt] = [attempt for case in summary.results.cases for attempt in case.attempts]
     assert attempt.cause == "policy"
-    assert ".example" in attempt.error, "what was hidden is told at the end"
+    assert ".example" in attempt.error, "the hidden policies are revealed at the end"
     assert summary.total.episodes == 2
 
 
@@ -361,7 +361,7 @@ def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
 
 def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     config, policies = plan(tmp_path / "out"), Policies()
-    lines = ["", "s", "", "", "s", "", ""]  # the third trial is run, and never judged
+    lines = ["", "s", "", "", "s", "", ""]  # the third trial runs, but gets no verdict
     with pytest.raises(TrialsInterrupted, match="after 2 of 8"):
         evaluate_on_robot(config, ScriptedPerson(typed(lines)), agent_factory=policies)
     assert not (tmp_path / "out" / "results.db").exists()
@@ -435,7 +435,9 @@ def test_a_hidden_line_that_a_killed_process_left_incomplete_before_its_first_tr
 
 
 def test_a_hidden_line_without_its_line_in_the_log_is_of_no_trial(tmp_path: Path) -> None:
-    """The process can be killed after it has written the one, and before the other."""
+    """The process may be killed after it has written the hidden line, but before the line in the
+    log.
+    """
     config = plan(tmp_path / "out", resume=True)
     with pytest.raises(TrialsInterrupted):
         evaluate_on_robot(config, ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
@@ -564,9 +566,9 @@ def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path:
     evaluate_on_robot(
         config, ScriptedPerson(typed(lines), keep), robot=Flashing(), agent_factory=Policies()
     )
-    assert len(pictures) == 8, "at every question but the first"
+    assert len(pictures) == 8, "at each question except the first"
     assert list(dict.fromkeys(pictures)) == [pictures[0], pictures[3]]
-    assert pictures[3:] == [pictures[3]] * 5, "the second policy is not asked for another start"
+    assert pictures[3:] == [pictures[3]] * 5, "the second policy gets the same initial scene"
 
 
 def test_a_plan_on_a_robot_is_not_taken_for_a_simulation(tmp_path: Path) -> None:

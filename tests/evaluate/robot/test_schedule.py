@@ -1,4 +1,4 @@
-"""The order of trials: balanced, and drawn by the key alone."""
+"""The order of trials, which is balanced and depends only on the key."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def orders_by_task(trials: list[Trial]) -> dict[str, list[list[str]]]:
 
 
 def imbalance(orders: list[list[str]]) -> int:
-    """Return by how much two policies differ at most in how often they are first, second, and so
+    """Return the largest difference between policies in how often they are first, second, and so
     on.
     """
     names = sorted(orders[0])
@@ -82,7 +82,9 @@ def test_every_policy_plays_every_scene_once(
 def test_each_place_is_had_equally_often_whatever_the_shape_of_the_plan(
     key: bytes, policies: int, episodes: int, seeds: int, tasks: int
 ) -> None:
-    """In each task and in the whole plan, also with one episode of many seeds, or of many tasks."""
+    """The order is balanced in each task and in the whole plan, even with one episode for many
+    seeds or many tasks.
+    """
     trials = drawn(
         key,
         policies,
@@ -97,7 +99,7 @@ def test_each_place_is_had_equally_often_whatever_the_shape_of_the_plan(
         for first in range(0, len(orders) - policies + 1, policies):
             square = orders[first : first + policies]
             assert imbalance(square) == 0, (
-                "a Latin square, so that a task that stops early is balanced"
+                "each block must be a Latin square, so that a task that stops early is balanced"
             )
 
 
@@ -114,8 +116,8 @@ def test_the_key_decides_whatever_order_the_plan_names_policies_in(
 
 
 def test_the_draw_is_the_one_of_earlier_evaluations() -> None:
-    """With the key of an evaluation its order can be reproduced later, so that a change of the
-    draw is a break.
+    """The key of an evaluation reproduces its order later, so a change of the draw would be a
+    breaking change.
     """
     found = [name for env, _, name in order(drawn(b"a published key", 3, 4, [0])) if env == "cups"]
     assert found == [
@@ -128,7 +130,9 @@ def test_the_draw_is_the_one_of_earlier_evaluations() -> None:
 
 def test_every_order_is_about_equally_likely_over_keys() -> None:
     first = Counter(order(drawn(f"key number {n}".encode(), 2, 1, [0]))[0][2] for n in range(400))
-    assert 160 < first["p0"] < 240, "within four standard deviations of a fair coin"
+    assert 160 < first["p0"] < 240, (
+        "expected a value within four standard deviations of a fair coin"
+    )
 
 
 def test_a_pair_has_the_key_of_the_same_scene() -> None:

@@ -1,4 +1,4 @@
-"""Where workers are placed, what they are given, and the last of what a process wrote."""
+"""The placement of workers, their environment, and the last output of their processes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from vlagents_ray.evaluate.workers.rollout import Rollout
 
 
 def filled(replicas: dict[str, int], workers: int) -> Counter[str | None]:
-    """Where so many workers go, one after the other."""
+    """Return the number of workers per node, when `workers` are placed one after the other."""
     there: Counter[str | None] = Counter()
     for _ in range(workers):
         there[fewest(replicas, there)] += 1
@@ -77,7 +77,9 @@ def test_gpus_are_not_hidden_from_their_owner_nor_where_the_user_says_otherwise_
 
 
 def test_the_key_of_a_server_is_in_no_runtime_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ray logs those, where every user can read them. It comes with a worker's first call."""
+    """Ray logs runtime environments, and every user can read these logs. The key is sent with a
+    worker's first call.
+    """
     monkeypatch.setenv(KEY_VARIABLE, "vlr_x")
     assert "vlr_x" not in str(runtime_env(case()))
     credentials = Credentials()
@@ -112,10 +114,11 @@ def test_a_process_knows_the_files_that_it_writes_to(tmp_path: Path) -> None:
 def test_another_node_reads_its_own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "log").write_text("from there")
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
-    monkeypatch.setattr(cluster, "TIMEOUT_S", 120.0)  # a busy machine starts the process that reads
+    # a busy machine takes long to start the process that reads
+    monkeypatch.setattr(cluster, "TIMEOUT_S", 120.0)
     [node] = ray.nodes()
     reads = []
-    # Not in this process.
+    # This function must not be called in this process.
     monkeypatch.setattr(cluster, "tail", lambda paths: reads.append(paths) or f"{os.getpid()}")
     assert tail_at(node["NodeManagerHostname"], [str(tmp_path / "log")]) != str(os.getpid())
     assert reads == []

@@ -1,6 +1,4 @@
-"""The pool of workers: nodes that are lost, fewer workers than it wants, and reports that come
-together.
-"""
+"""The pool of workers: lost nodes, fewer workers than wanted, and reports that arrive together."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ def lost() -> None:
 
 @ray.remote(num_cpus=0)
 class Process:
-    """Of a worker, whatever it runs."""
+    """The process of a worker, whatever it runs."""
 
 
 def worker(config: EvalConfig, starting: Any = None, **known: Any) -> WorkerHandle:
@@ -70,7 +68,7 @@ def test_workers_play_on_while_there_is_no_room_for_all(
     settings = config(workers=2, place_timeout_s=0.2)
     job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
     waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
-    # Nobody asks how it gets on.
+    # The pool does not query this worker's progress.
     playing = worker(settings, jobs=(job,), heartbeat_at=math.inf, queried_at=math.inf)
     reports: list[tuple[Job, Report]] = []
     with WorkerPool(resolve(settings), ToZero) as short:
@@ -106,10 +104,10 @@ def test_a_host_that_does_not_answer_is_waited_for_once(
 def test_no_log_is_looked_for_once_the_head_is_gone_too(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray's calls would block, and Slurm kills a cancelled job before its evaluation has written
-    a summary.
+    """Ray's calls would block, and Slurm would kill a cancelled job before its evaluation has
+    written a summary.
     """
-    monkeypatch.setattr(pool, "tail_at", lambda *_: pytest.fail("asked a cluster that is gone"))
+    monkeypatch.setattr(pool, "tail_at", lambda *_: pytest.fail("called a cluster that has ended"))
     monkeypatch.setattr(pool, "head_is_gone", lambda: True)
     failure = Failure("worker", EnvFailed.code, "the worker died")
     with WorkerPool(resolve(config()), ToZero) as watched:
@@ -136,7 +134,7 @@ def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.M
 def test_who_kills_workers_of_a_ray_that_was_left_meanwhile_starts_no_other_ray(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[str] = []  # anything, which Ray takes for a wish to be started
+    asked: list[str] = []  # any call, which would make Ray start
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "kill", asked.append)
     pool._kill(["one"])

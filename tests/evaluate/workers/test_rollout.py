@@ -133,7 +133,7 @@ def seeds_by_outcome(config: Config, chunk: int) -> dict[bool, list[int]]:
 def rendered(
     worker: Rollout, *seeds: int, env: str = SPARING_LINE
 ) -> tuple[list[int], list[Report]]:
-    """How many images each episode took, and the reports."""
+    """Return the number of images that each episode rendered, and the reports."""
     images, reports = [], []
     for seed in seeds:
         before = SparingLine.rendered
@@ -146,7 +146,7 @@ def rendered(
 def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(
     config: Config, kept: str
 ) -> None:
-    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is run again for
+    """The policy uses observations 1, 4, 7 and 10 of 11. A failed episode is run again to render
     all of them.
     """
     seeds = seeds_by_outcome(config, chunk=3)

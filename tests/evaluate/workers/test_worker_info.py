@@ -1,4 +1,4 @@
-"""What workers know of where they are, in a cluster that says that it has a GPU."""
+"""The information of workers about their node, in a cluster that claims to have a GPU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ray
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[str]:
-    """Ray's id of its node."""
+    """Start Ray, and return Ray's id of this node."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
         with joined("local", num_cpus=2, num_gpus=1, logging_level="ERROR"):
