@@ -15,12 +15,23 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from vlagents_ray.errors import Overloaded, PolicyUnavailable, TooManyRequests
+from vlagents_ray.errors import Overloaded, PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import AGE_MS, IN_TIME
 
 KEPT_AGES = 10_000  # the number of ages that are kept: 1,000 s at 10 Hz
-# After these errors no replica has counted the ticks that the request reported.
-_REJECTED = (TooManyRequests, Overloaded, PolicyUnavailable)
+# After these errors no replica has executed the request, which may be sent again.
+_NOT_EXECUTED = (TooManyRequests, Overloaded, PolicyUnavailable, UnknownSession)
+
+
+def counts_ticks(error: Exception | None) -> bool:
+    """Return whether a replica counts the ticks that a request reports.
+
+    It counts them when it answers the request. Clients report them again otherwise.
+
+    Args:
+        error: The error with which it answers; None if it answers with an action.
+    """
+    return not isinstance(error, _NOT_EXECUTED)
 
 
 class TimeShare(NamedTuple):
@@ -98,7 +109,7 @@ class Timeliness:
         """Report the ticks of the last request again with the next one, if no replica has counted
         them, as this error of the request shows.
         """
-        if isinstance(error, _REJECTED):
+        if not counts_ticks(error):
             self._reported = self._reported_before
 
     @property

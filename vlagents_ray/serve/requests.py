@@ -30,6 +30,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
+from vlagents_ray.chunking.timeliness import counts_ticks
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DecodedFiles, Priority, Reply, Request
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
     from vlagents_ray.serve.access.charges import Charge
     from vlagents_ray.serve.engine.admission import MessageAdmission
+    from vlagents_ray.serve.engine.intake import ReceivedReport
 
 logger = logging.getLogger(__name__)
 
@@ -268,6 +270,7 @@ class IncomingMessage:
         "observed",
         "receiver",
         "replies",
+        "reports",
         "sender",
         "size",
         "transport",
@@ -285,6 +288,8 @@ class IncomingMessage:
         self.kinds: list[tuple[str, str]] = [(op, priority)]  # operation and priority by request
         self.arrived = self.decoded_at = time.perf_counter()  # s
         self.replies: list[Reply] = []  # complete when the message is delivered
+        # The robots' reports in unanswered requests, by their index.
+        self.reports: dict[int, ReceivedReport] = {}
         self.receiver: Receiver  # set by `expect`
         self.sender: Receiver | None = None  # see `expect`
         # Admission that is released before the delivery.
@@ -338,9 +343,14 @@ class IncomingMessage:
                 return
             self.replies[index] = reply
             self._missing -= 1
-            if self._missing:
-                return
+            is_complete = self._missing == 0
+            report = self.reports.pop(index, None)
 
+        # Not when it arrives: a request that is not executed is sent again, with the same report.
+        if report is not None and counts_ticks(reply.error):
+            report.count()
+        if not is_complete:
+            return
         if self.sender is None:
             self.receiver.deliver(self)
         else:

@@ -24,7 +24,7 @@ from starlette.testclient import TestClient
 
 from vlagents_ray.abilities import Observes
 from vlagents_ray.errors import InvalidObservation, OutcomeUnknown, PolicyFailed, PolicyUnavailable
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import TICKS, Act, Agent, Obs
 from vlagents_ray.protocol.messages import MessageLimits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -129,6 +129,47 @@ def hang(engine: Engine, op: str) -> queue.SimpleQueue[Reply]:
         replies = put(engine, "bad", op)
     wait_for(lambda: engine.calls.under_way)
     return replies
+
+
+def act_with_report() -> Request:
+    return Request("act", Obs(info={TICKS: [5, 2]}))
+
+
+def test_the_ticks_of_a_request_behind_a_hung_call_count_once_with_the_answer_that_it_gets_later(
+    engine: Engine, agent: Hanging, clock: Clock
+) -> None:
+    """They counted at its arrival, and again when it was sent again, as its error asks."""
+    engine.stats.enable()
+    ask(engine, "bad", "reset", hangs_at="act")
+    ask(engine, "good", "reset")
+    hung = asked(engine, "bad", act_with_report())
+    wait_for(lambda: engine.calls.under_way)
+    behind = asked(engine, "good", act_with_report())
+    clock.now += 1000.0
+    engine.notice_hung()
+    assert isinstance(hung.get(timeout=10).error, OutcomeUnknown)
+    assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
+    # Those of the hung call, which is not sent again.
+    assert engine.stats.collect().ticks == {"robot": 5}
+
+    agent.over.set()
+    wait_for(lambda: not engine.calls.under_way)
+    engine.notice_hung()
+    assert answered(engine, "good", act_with_report()).error is None
+    assert engine.stats.collect().ticks == {"robot": 5}
+    assert sorted(times.ticks for times in engine.sessions.times()) == [5, 5]
+
+
+def test_the_ticks_of_an_act_that_is_checked_twice_count_once(engine: Engine) -> None:
+    """An act is checked again after a search for its session."""
+    ask(engine, "good", "reset")
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    act = pending("good", act_with_report(), replies.put)
+    act.reserved = engine.intake.reserve(act)
+    engine.intake.retry(act)
+    assert replies.get(timeout=10).error is None
+    [times] = engine.sessions.times()
+    assert (times.ticks, times.starved) == (5, 2)
 
 
 OPS = ["reset", "act", "observe", "export"]

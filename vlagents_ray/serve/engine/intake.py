@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from vlagents_ray.errors import (
@@ -31,6 +31,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.engine.background_calls import BackgroundCalls
+from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.parts import EngineParts
 from vlagents_ray.serve.engine.responses import public_error
 from vlagents_ray.serve.in_time import RobotReport, RobotTimes
@@ -44,6 +45,22 @@ from vlagents_ray.slo import Slo
 
 # Operations after which a connection does not have the request's session.
 _USE_NO_SESSION = ("close", *BACKGROUND_OPS)
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedReport:
+    """What a robot reports with a request that is not answered yet."""
+
+    report: RobotReport
+    times: RobotTimes  # of the robot's session
+    priority: str
+    stats: MetricsBuffer
+    clock: Callable[[], float]
+
+    def count(self) -> None:
+        """Add the report to the session and to the metrics."""
+        self.times.add(self.report, self.clock())
+        self.stats.report(self.priority, self.report)
 
 
 class Intake:
@@ -187,9 +204,7 @@ class Intake:
     def _record_report(
         self, session: Session[LoadedModel], pending: PendingRequest, info: Mapping[str, Any]
     ) -> None:
-        """Read the slack of an act's robot, and record the robot's report in its session and in the
-        metrics.
-        """
+        """Read the slack of an act's robot, and its report, which is counted with the answer."""
         slack_s = stated_slack_s(info)
         if slack_s is not None:
             pending.needed = min(pending.arrived + slack_s, pending.deadline)
@@ -201,8 +216,9 @@ class Intake:
             times = session.times = RobotTimes()
         times.priority = pending.priority
         times.target_share = session.plan.share
-        times.add(report, self._clock())
-        self._stats.report(pending.priority.name.lower(), report)
+        pending.message.reports[pending.index] = ReceivedReport(
+            report, times, pending.priority.name.lower(), self._stats, self._clock
+        )
 
     def _open(self, pending: PendingRequest) -> Opening:
         """Check a reset, and reserve an episode of its session."""
