@@ -1,4 +1,4 @@
-"""The check of a robot: five sound arms pass, twenty faults are found before harm."""
+"""Tests of the check of a robot: five sound arms pass, and twenty faults are found before harm."""
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -18,12 +18,14 @@ from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedOperator
 from vlagents_ray_robot.testing import check_robot
 
 pytestmark = pytest.mark.sim
-HARM = 0.35  # rad, about 20°: no joint may have been farther from its rest pose
+HARM = 0.35  # maximum distance of a joint from its rest pose, rad (about 20°)
 
 
 @contextmanager
 def watched(arm: MujocoArm) -> Iterator[list[float]]:
-    """Yield a list that has, at the end, how far any joint was from its first pose, rad."""
+    """Yield a list that contains, at the end, the maximum distance of any joint from its first
+    pose, rad.
+    """
     start, most = arm.joints(), [0.0]
     step = arm._mujoco.mj_step
 
@@ -53,7 +55,8 @@ def test_a_sound_arm_passes(name: str) -> None:
     with closing(simulated_arm(name)) as arm:
         report = checked(arm, arm)
     assert not report.findings, report.lines()
-    gripper = {"gripper"} if name in ("ur5e", "xarm7") else set()  # these files have none
+    # The files of these arms have no gripper.
+    gripper = {"gripper"} if name in ("ur5e", "xarm7") else set()
     assert set(report.passed) == set(CHECKS) - gripper
     assert set(report.skipped) == gripper
 
@@ -67,7 +70,7 @@ def test_a_sound_arm_with_relative_actions_passes() -> None:
 def test_a_fault_is_found_before_harm(fault: Fault) -> None:
     with closing(simulated_arm(fault.arm, **fault.options)) as arm, watched(arm) as most:
         report = checked(arm, fault.kind(arm))
-        arm.clock.sleep(1.0)  # it is at rest
+        arm.clock.sleep(1.0)  # the arm comes to rest
         arm.joints()
     assert {finding.check for finding in report.findings} == {fault.check}, report.lines()
     assert {finding.when == "before any motion" for finding in report.findings} == {fault.at_rest}
@@ -79,7 +82,7 @@ def test_a_fault_is_found_before_harm(fault: Fault) -> None:
 
 
 class Reluctant(SimulatedOperator):
-    """Agrees to the first motions only."""
+    """Agrees only to the first motions."""
 
     def __init__(self, arm: MujocoArm, motions: int) -> None:
         super().__init__(arm)
@@ -92,7 +95,7 @@ class Reluctant(SimulatedOperator):
 
 
 class Blind(SimulatedOperator):
-    """Cannot tell the pose of the hand, nor what moves."""
+    """Can tell neither the pose of the hand nor which joint moves."""
 
     def saw_joint(self, name: str, side: int) -> bool | None:
         return None
@@ -120,7 +123,7 @@ def test_what_nobody_saw_is_not_checked() -> None:
 
 
 class Counting(FaultyArm):
-    """A sound arm, of which commands are counted."""
+    """A sound arm that counts its commands."""
 
     commands = 0
 

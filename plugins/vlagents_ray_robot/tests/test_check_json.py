@@ -1,4 +1,4 @@
-"""`vlagents-ray robot check --json`: one document, and nothing else, on stdout."""
+"""Tests that `vlagents-ray robot check --json` prints only one JSON document on stdout."""
 
 from __future__ import annotations
 

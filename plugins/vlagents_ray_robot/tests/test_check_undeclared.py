@@ -1,5 +1,5 @@
-"""The check of a robot that declares nothing, and what is found without a person and without a
-contract.
+"""Tests of the check of a robot that declares nothing, and of the checks that need no operator and
+no contract.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Repeating(Own):
 
 
 class InPlace(Own):
-    """Writes each new picture into the array that it returned before."""
+    """Writes each new picture into the same array."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ def test_the_status_tells_a_check_that_checked_nothing_from_a_passed_one(
     status: int,
 ) -> None:
     monkeypatch.setitem(sys.modules, "own_arm", sys.modules[__name__])
-    monkeypatch.setattr("sys.stdin", io.StringIO())  # no person answers
+    monkeypatch.setattr("sys.stdin", io.StringIO())  # no operator answers
     page = tmp_path / "own.html"
     assert main([f"own_arm:{kind}", "--out", str(page), "--hz", "200"]) == status
     lines = capsys.readouterr().out.splitlines()

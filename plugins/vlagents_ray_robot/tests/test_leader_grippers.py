@@ -1,4 +1,4 @@
-"""A leader changes no gripper on its own, for both kinds of actions."""
+"""Tests that a leader does not move a gripper by itself, for absolute and relative actions."""
 
 from __future__ import annotations
 

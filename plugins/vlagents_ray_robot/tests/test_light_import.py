@@ -1,6 +1,4 @@
-"""The plug-in is as light as the robot's install: none of its modules imports more than that
-has.
-"""
+"""Tests that no module of the plug-in imports a package that the light install of a robot lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot of LeRobot in a Python without LeRobot."""
+"""Tests of a robot of LeRobot in a Python without LeRobot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arms in MuJoCo: names, files, units, and a stop."""
+"""Tests of arms in MuJoCo: names, files, units, and a stop."""
 
 import os
 import subprocess
@@ -93,7 +93,7 @@ def test_a_wrong_model_is_an_error_with_its_cure(
 
 def test_the_module_chooses_the_renderer_before_a_package_of_models_imports_mujoco() -> None:
     script = "import os, vlagents_ray_robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
-    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}  # no display
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}  # there is no display
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
     )

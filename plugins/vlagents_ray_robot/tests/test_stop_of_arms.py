@@ -1,4 +1,4 @@
-"""The contract of `stop` for every arm: at rest where it is, with its grasp, whatever sensor is
+"""Tests of `stop` for every arm: the arm rests where it is and keeps its grasp, whichever sensor is
 broken.
 """
 
@@ -24,8 +24,9 @@ from vlagents_ray_robot.ros import RosRobot
 from vlagents_ray_robot.ros.robot import settings_from
 
 MOTORS = ("shoulder", "elbow", "gripper")
-POSE = np.array([12.0, -3.0, 31.0], np.float32)  # the fingers stand at an object, 31 % open
-GRASP = 2.0  # the gripper's goal
+# The fingers touch an object, at an opening of 31 %.
+POSE = np.array([12.0, -3.0, 31.0], np.float32)
+GRASP = 2.0  # the goal of the gripper
 
 
 class Bus:
@@ -36,7 +37,7 @@ class Bus:
         self.pose = POSE
         self.goals: dict[str, float] = {}
         self.inside = 0
-        self.shared = False  # two transfers at once
+        self.shared = False  # whether two transfers ran at the same time
         self.slow: Callable[[], object] = lambda: None
 
     def sync_read(self, name: str) -> dict[str, float]:
@@ -63,7 +64,7 @@ class Bus:
 
 
 class FakeFollower:
-    """An arm as LeRobot's `SOFollower`: the bus is read first, then each camera."""
+    """An arm like LeRobot's `SOFollower`: the bus is read first, then each camera."""
 
     observation_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS} | {
         "wrist": (4, 4, 3)
@@ -122,7 +123,7 @@ def test_a_lerobot_arm_stops_where_it_is_and_keeps_its_grasp(kind: str, broken: 
     robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
     follower.camera_broken = "camera" in broken
     follower.wire.broken = "encoders" in broken
-    for _ in range(3):  # it may be called repeatedly
+    for _ in range(3):  # `stop` may be called repeatedly
         robot.stop()
         assert follower.wire.goals == {"shoulder": 12.0, "elbow": -3.0, "gripper": GRASP}
 
@@ -141,7 +142,9 @@ def test_a_lerobot_arm_that_was_neither_seen_nor_commanded_stays_as_it_is(
 
 
 class FakeTwoArms:
-    """Two arms as LeRobot's `BiSOFollower` has them: each with a bus, the left one first."""
+    """Two arms like those of LeRobot's `BiSOFollower`: each has a bus, and the left arm is
+    first.
+    """
 
     def __init__(self, **settings: Any) -> None:
         self.left_arm = FakeFollower(**settings)
@@ -217,7 +220,7 @@ def test_two_lerobot_arms_stop_where_they_are_and_not_where_they_were_seen() -> 
     robot = robot_of(follower)
     robot.observe()
     robot.apply(np.array([20.0, 5.0, GRASP, 21.0, 6.0, GRASP], np.float32))
-    follower.right_arm.wire.pose = POSE + 4.0  # the loop hangs, and the arm moves on
+    follower.right_arm.wire.pose = POSE + 4.0  # the loop hangs, and the arm moves further
     robot.stop()
     assert follower.left_arm.wire.goals == {"shoulder": 12.0, "elbow": -3.0, "gripper": GRASP}
     assert follower.right_arm.wire.goals == {"shoulder": 16.0, "elbow": 1.0, "gripper": GRASP}
@@ -244,7 +247,7 @@ def test_a_stop_from_another_thread_does_not_share_the_bus_with_the_loop() -> No
     robot = robot_of(follower)
     robot.observe()
     over = threading.Event()
-    follower.wire.slow = lambda: time.sleep(0)  # another thread may run here
+    follower.wire.slow = lambda: time.sleep(0)  # lets the other thread run here
 
     def stop() -> None:
         while not over.is_set():
@@ -300,7 +303,7 @@ FINGER = "/finger"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 ARRAY = "std_msgs/msg/Float64MultiArray"
 STATE = "sensor_msgs/msg/JointState"
-ROS_TOPICS: dict[str, dict[str, Any]] = {  # the topic of the actions
+ROS_TOPICS: dict[str, dict[str, Any]] = {  # settings of the topic of the actions
     "trajectory": {"type": TRAJECTORY, "names": list(MOTORS), "stop": "joints"},
     "joint state": {"type": STATE, "names": list(MOTORS), "stop": "joints"},
     "numbers in the order of the state": {"type": ARRAY, "numbers": 3, "stop": "joints"},
@@ -352,7 +355,7 @@ def test_a_robot_behind_topics_without_a_recent_pose_stays_as_it_is() -> None:
     with robot:
         robot.observe()
         robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
-        wire.connections = 2  # all messages are from before a loss
+        wire.connections = 2  # all messages arrived before the loss of the connection
         robot.observe()
         robot.stop()
         assert len(wire.published) == 1

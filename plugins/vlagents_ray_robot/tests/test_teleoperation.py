@@ -1,4 +1,6 @@
-"""What a human moves a robot with: keys of a terminal, a SpaceMouse."""
+"""Tests of the devices with which an operator moves a robot: the keys of a terminal, and a
+SpaceMouse.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 class Terminal:
-    """A terminal at which the test types."""
+    """A terminal into which the test types."""
 
     def __init__(self) -> None:
         self._ours, self.its = pty.openpty()
@@ -76,7 +78,7 @@ def test_keys_move_along_their_axes_while_they_are_pressed(
         assert device.engaged()
         assert device.axes().tolist() == [1, -1, 0, 0, 0, 0]
         clock.now = 0.15
-        terminal.type("s")  # the other way at once
+        terminal.type("s")  # the opposite direction, immediately
         device.engaged()
         assert device.axes().tolist() == [-1, -1, 0, 0, 0, 0]
         clock.now = 0.25
@@ -182,7 +184,7 @@ def test_absolute_targets_begin_where_the_robot_stands_and_stay_within_the_bound
 
 
 class Obedient:
-    """An arm that is where it was commanded to be, and may hold."""
+    """An arm that reaches each command immediately, and may hold."""
 
     def __init__(self) -> None:
         self.joints = np.zeros(3, np.float32)
@@ -254,7 +256,7 @@ def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(
 
 
 class Mouse:
-    """A SpaceMouse of pyspacemouse 2.1, which has a report for each `read` until there are none."""
+    """A SpaceMouse of pyspacemouse 2.1, which returns one report per `read` until none are left."""
 
     def __init__(self) -> None:
         self.reports: list[dict[str, Any]] = []

@@ -20,8 +20,8 @@ from vlagents_ray.validation import check_observation
 
 CHECKS = {  # in the order in which they run
     "observation": "observations fit the contract",
-    "clock": "time stamps are of now and do not go back",
-    "rate": "observe returns within a part of a tick, and gives new readings at the control rate",
+    "clock": "time stamps are current and never go back",
+    "rate": "observe returns within half a tick, and returns new readings at the control rate",
     "units": (
         "joints are in the unit of the contract, positions in m, openings in [0, 1], "
         "quaternions of length 1"
@@ -29,33 +29,33 @@ CHECKS = {  # in the order in which they run
     "limits": "the arm is within its limits",
     "stop": "stop returns at once, twice and from another thread, and ends a motion",
     "cameras": "names, colours and orientation of the cameras are right, and no picture is frozen",
-    "place": "the hand is where its pose says",
+    "place": "the hand is at the pose that the robot reports",
     "blocking": "apply does not wait for the motion",
     "meaning": (
-        "the command of the present pose moves nothing: targets are absolute, as the "
-        "contract states, or deltas"
+        "a command to the present pose moves nothing: actions are absolute or relative, as the "
+        "contract declares"
     ),
-    "order": "each number of an action moves its own joint, and it alone",
-    "sign": "each joint moves to the side of its command",
+    "order": "each number of an action moves its own joint and no other",
+    "sign": "each joint moves in the direction of its command",
     "size": "each joint moves as far as its command",
     "latency": "a motion is measured soon after its command",
     "pose": "the pose of the hand turns and moves about the axis of each joint",
     "commands": "each single command is executed",
-    "gripper": "the gripper closes when it is told to close",
+    "gripper": "the gripper closes when it is commanded to close",
 }
 _STEPS = {"rad": 0.05, "deg": 3.0, "m": 0.01}  # the size of a small move, by unit of the joints
 _OTHER_STEP = 3.0  # the size of a small move in LeRobot's units, per cent of the range
 _RAMP_S = 0.4  # the time of a small move
 _HOLD_S = 1.0  # the time after a small move within which it must be measured
-# An arm that is farther from its target than this number of small moves is stopped at once.
+# An arm that is further from its target than this number of small moves is stopped immediately.
 _RUNAWAY = 3
-_STOP_S = 0.1  # longest call of `stop`
-# Range of the difference from an observation's time stamp to the present, as SKEW_S of the chunk
-# player, s.
+_STOP_S = 0.1  # maximum time of a call of `stop`
+# Range of the difference from an observation's time stamp to the present, s; the same as SKEW_S of
+# the chunk player.
 _SKEW_S = (-1.0, 0.1)
-_FROZEN_S = 1.0  # the time within which each camera must give a new picture
-_MOST_M = 5.0  # a position that is farther away is in millimetres
-_RED = 40  # where the card is, red must exceed green and blue by this much of 255
+_FROZEN_S = 1.0  # the time within which each camera must return a new picture
+_MOST_M = 5.0  # a position further away is assumed to be in millimetres
+_RED = 40  # the amount by which red must exceed green and blue where the card is, of 255
 _DECLARE = "the robot's contract does not declare what this check needs"
 
 
@@ -63,13 +63,13 @@ class Operator:
     """The person at the robot, who answers questions at the terminal; a subclass may answer in
     another way.
 
-    The answer None means that the operator cannot tell; then the check is listed as not made.
+    The answer None means that the operator cannot tell; the check is then listed as skipped.
 
     Args:
         move: Whether the robot may move; otherwise the operator agrees to no motion.
     """
 
-    may_move = True  # whether the operator is asked to agree at all
+    may_move = True  # whether the operator is asked to agree to motions
 
     def __init__(self, *, move: bool = True) -> None:
         self.may_move = move
@@ -86,7 +86,7 @@ class Operator:
             camera: The camera; None to take the card away.
 
         Returns:
-            Whether it is done; False if there is no card.
+            Whether the operator has done this; False if there is no card.
         """
         request = "Take the card away"
         if camera is not None:
@@ -117,7 +117,7 @@ class Operator:
             f"{x} m in front of the base, {y} m to its left, {z} m above it, with the "
             f"quaternion xyzw {quaternion}"
         )
-        return _ask(f"Is the hand of arm {arm + 1} there: {pose_text}?")
+        return _ask(f"Is the hand of arm {arm + 1} at this pose: {pose_text}?")
 
 
 def _ask(question: str) -> bool | None:
@@ -151,10 +151,10 @@ class RobotReport:
 
     findings: list[Finding] = field(default_factory=list)
     passed: list[str] = field(default_factory=list)  # keys of CHECKS
-    skipped: dict[str, str] = field(default_factory=dict)  # by key of CHECKS: the reason
+    skipped: dict[str, str] = field(default_factory=dict)  # the reason by key of CHECKS
     figures: dict[str, float] = field(default_factory=dict)  # measurements; the names have units
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 by title
-    # The declarations that the check of the motion needs and the robot lacks; "" if there are none.
+    # The missing declarations without which the motion cannot be checked; "" if there are none.
     undeclared: str = ""
     robot: str = ""  # the name of the robot
     at: float = field(default_factory=time.time)  # s since 1970
@@ -176,7 +176,7 @@ class RobotReport:
         return "nothing found in any check"
 
     def lines(self) -> list[str]:
-        """Return the report as lines of text, of which the last one is the verdict."""
+        """Return the report as lines of text; the last line is the verdict."""
         names_by_reason: dict[str, list[str]] = {}
         for name, reason in self.skipped.items():
             names_by_reason.setdefault(reason, []).append(name)
@@ -225,8 +225,8 @@ def examine(
     latency_s: float = 0.4,
     clock: Any = time,
 ) -> RobotReport:
-    """Check a robot, first at rest, then with small moves of one joint at a time, each after the
-    operator has agreed.
+    """Check a robot, first at rest, then with small moves of one joint at a time; the operator
+    agrees to each move.
 
     A finding at rest prevents all motion; a finding in motion stops the robot and ends the check.
 
@@ -240,7 +240,7 @@ def examine(
         clock: The module `time`, or the `SimulatedClock` of a simulated robot.
 
     Returns:
-        The findings, and the checks that passed or were not made.
+        The findings, and the checks that passed or were skipped.
     """
     contract = contract or contract_of(robot)
     period_s = 1 / (hz or contract.control_hz or 50.0)
@@ -286,9 +286,9 @@ class _Suite:
     _motion: str = ""  # the present motion; empty at rest
     _stamp_s: float = -np.inf  # the last time stamp, s since 1970
     _stamps_are_right: bool = True
-    _observe_s: list[float] = field(default_factory=list)  # times of the calls of `observe`
-    _apply_s: list[float] = field(default_factory=list)  # times of the calls of `apply`
-    _lags_s: list[float] = field(default_factory=list)  # times from a command to its motion
+    _observe_s: list[float] = field(default_factory=list)  # durations of the calls of `observe`, s
+    _apply_s: list[float] = field(default_factory=list)  # durations of the calls of `apply`, s
+    _lags_s: list[float] = field(default_factory=list)  # times from a command to its motion, s
     _command: np.ndarray = field(default_factory=lambda: np.zeros(0))  # the last action
     _layout: _Layout | None = None
 
@@ -321,11 +321,11 @@ class _Suite:
 
         names = getattr(self._robot, "joint_names", ())
         for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
-            cure = "give actions and state the contract's order of joints"
+            cure = "use the contract's order of joints in actions and in the state"
             self.find(
                 "order",
                 f"{ours!r} as joint {number} of the arm",
-                f"{theirs!r}, as the contract states",
+                f"{theirs!r}, as the contract declares",
                 cure,
             )
 
@@ -345,7 +345,7 @@ class _Suite:
                 "rate",
                 f"{median_ms:.3g} ms for observe",
                 limit,
-                "read cameras and bus in threads of their own",
+                "read the cameras and the bus in separate threads",
             )
 
         self._check_units(last_obs)
@@ -356,8 +356,8 @@ class _Suite:
         self._check_place(last_obs)
 
     def in_motion(self) -> None:
-        """Move one joint at a time, then the grippers, unless there is a finding or a reason
-        against it.
+        """Move one joint at a time, then the grippers, unless a finding or another reason forbids
+        motion.
         """
         layout = self._layout
         if self.report.findings:
@@ -365,7 +365,7 @@ class _Suite:
         if layout is None or self._contract.action.relative is None:
             self.skip_others(_DECLARE)
             return
-        if not self._ask_to_move("the command of the present pose, at which nothing should move"):
+        if not self._ask_to_move("a command to the present pose, which should move nothing"):
             return
 
         self._check_meaning(layout)
@@ -384,7 +384,7 @@ class _Suite:
         self._check_grippers(layout)
 
     def skip_others(self, reason: str) -> None:
-        """List all checks without a result as not made, for this reason."""
+        """List all checks without a result as skipped, for this reason."""
         done = {*self.report.passed, *(finding.check for finding in self.report.findings)}
         for name in CHECKS:
             if name not in done:
@@ -428,7 +428,7 @@ class _Suite:
                 if back_s > 0:
                     got = f"a time stamp {back_s:.3g} s before the last one"
                 else:
-                    got = f"one {ahead_s:+.3g} s off"
+                    got = f"a time stamp that is {ahead_s:+.3g} s off"
                 cure = (
                     "use time.time() of this machine when the first sensor is read, or "
                     "synchronize the clocks"
@@ -455,7 +455,7 @@ class _Suite:
         for name, values in obs.state.items():
             spec = (self._contract.state or {}).get(name)
             unit = spec.unit if spec else None
-            base_name = name.rpartition("/")[2]  # without the name of the arm
+            base_name = name.rpartition("/")[2]  # the name of the part without the name of the arm
 
             if base_name == "joints" and unit in (None, "rad"):
                 largest = np.abs(values).max()
@@ -474,14 +474,16 @@ class _Suite:
                 length = np.linalg.norm(values[3:])
                 if abs(length - 1) > 0.01:
                     got = f"a quaternion of length {length:.3g} in {name!r}"
-                    self.find("units", got, "1", "give position and then quaternion xyzw")
+                    self.find(
+                        "units", got, "1", "return the position, followed by the quaternion xyzw"
+                    )
 
         if obs.gripper is not None and not 0 <= obs.gripper <= 1:
             self.find(
                 "units",
                 f"a gripper of {obs.gripper:.3g}",
                 "[0, 1], 1 = open",
-                "scale it by its closed and open",
+                "scale the opening with the values of the closed and the open gripper",
             )
 
         self._pass("units")
@@ -506,7 +508,7 @@ class _Suite:
                     "limits",
                     f"{name} at {measured:.4g}",
                     f"[{low:.4g}, {high:.4g}]",
-                    "give the limits of this arm, in the order and unit of its joints",
+                    "declare the limits of this arm, in the order and unit of its joints",
                 )
                 break
 
@@ -544,7 +546,7 @@ class _Suite:
                     "stop",
                     f"{took_s:.3g} s for stop{occasion}",
                     f"at most {_STOP_S} s",
-                    "send it and return",
+                    "send the stop and return",
                 )
                 return
 
@@ -574,7 +576,12 @@ class _Suite:
                 "the camera hangs, or observe returns a stored picture: restart it, and read each "
                 "frame once; a simulated robot declares `simulated = True`"
             )
-            self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
+            self.find(
+                "cameras",
+                got,
+                "new pictures, which differ at least in the noise of the sensor",
+                cure,
+            )
 
     def _check_new_dates(self) -> None:
         """Find a sensor whose time stamps do not advance; a simulation may render one picture
@@ -585,7 +592,7 @@ class _Suite:
         while self._observe().info[CAPTURED] < began_at:
             if self._clock.monotonic() - began_s > _FROZEN_S:
                 reason = getattr(self._robot, "holds", None)
-                got = reason or f"nothing newer than {_FROZEN_S:g} s from a sensor"
+                got = reason or f"no reading of a sensor that is newer than {_FROZEN_S:g} s"
                 self.find(
                     "cameras", got, "new pictures and states", "restart the driver of this sensor"
                 )
@@ -635,19 +642,19 @@ class _Suite:
         if card is None and other_cameras:
             self.find(
                 "cameras",
-                f"the card of {camera!r} in {other_cameras[0]!r}",
+                f"the card for {camera!r} in {other_cameras[0]!r}",
                 want,
                 "exchange the names of the cameras",
             )
         elif card is None:
-            cure = "the camera hangs or gives old pictures; restart it, and read each frame once"
+            cure = "the camera hangs or returns old pictures; restart it, and read each frame once"
             self.find("cameras", f"no change in {camera!r}, a frozen picture", want, cure)
         elif not card.red:
             self.find(
                 "cameras",
                 f"a blue card in {camera!r}",
                 want,
-                "give RGB: image[..., ::-1] of OpenCV's BGR",
+                "return RGB: image[..., ::-1] of OpenCV's BGR",
             )
         elif card.x > 0.5 or card.y > 0.5:
             got = (
@@ -662,7 +669,7 @@ class _Suite:
             )
 
     def _check_place(self, obs: Obs) -> None:
-        """Check that the operator sees each hand at its pose."""
+        """Check that the operator sees each hand at its reported pose."""
         for number, arm in enumerate(self._contract.action.arms or ("",)):
             pose = obs.state.get(arm_part(arm, "tquat"))
             sees: bool | None = None
@@ -676,9 +683,9 @@ class _Suite:
             elif not sees and not self.report.findings:
                 position = np.round(pose[:3], 2)
                 quaternion = np.round(pose[3:], 2)
-                got = f"the hand at {position} m with the quaternion {quaternion}, as it is not"
+                got = f"the hand at {position} m with the quaternion {quaternion}, where it is not"
                 cure = (
-                    "give the pose in the frame of the arm's base, x forwards and z up, and the "
+                    "return the pose in the frame of the arm's base, x forwards and z up, and the "
                     "quaternion as xyzw"
                 )
                 self.find("place", got, "the pose that the operator sees", cure)
@@ -700,7 +707,7 @@ class _Suite:
         return action
 
     def _check_meaning(self, layout: _Layout) -> None:
-        """Check that the command of the present pose moves nothing."""
+        """Check that a command to the present pose moves nothing."""
         obs = self._observe()
         start = layout.measured(obs)
         self._apply(self._hold_command(layout, obs))
@@ -709,13 +716,13 @@ class _Suite:
             moved = layout.measured(self._observe()) - start
             if np.abs(moved).max() > _RUNAWAY * layout.step:
                 joint = int(np.argmax(np.abs(moved)))
-                got = f"a motion of {layout.names[joint]} by {moved[joint]:+.3g} and more"
+                got = f"a motion of {layout.names[joint]} by {moved[joint]:+.3g} or more"
                 other_meaning = "absolute targets" if layout.relative else "deltas"
                 cure = (
-                    f"the arm takes {other_meaning}, or other units: correct apply, or "
+                    f"the arm expects {other_meaning}, or other units: correct apply, or "
                     "action.delta of the contract"
                 )
-                self.find("meaning", got, "none at the command of the present pose", cure)
+                self.find("meaning", got, "no motion at a command to the present pose", cure)
 
     def _ramp(self, layout: _Layout, joint: int, change: float) -> list[tuple[float, np.ndarray]]:
         """Move a joint within `_RAMP_S`, and measure it until the motion is over.
@@ -766,7 +773,7 @@ class _Suite:
             self.report.skipped |= {"order": reason, "sign": reason}
         if saw is False:
             cure = "correct the order or the sign of the joints, in observe and in apply"
-            got = f"another joint, or another side, when {name} was commanded"
+            got = f"another joint, or another direction, when {name} was commanded to move"
             self.find("order", got, f"{name} alone, {change:+g}", cure)
 
         # The joint's lag: from the middle of the commanded ramp to half of the measured change.
@@ -780,7 +787,7 @@ class _Suite:
         if lag_s > self._latency_s:
             got = f"{lag_s:.3g} s from the command of {name} to its measured motion"
             cure = (
-                "read the newest state, without a queue; if the arm itself is slow, give latency_s"
+                "read the newest state, without a queue; if the arm itself is slow, set latency_s"
             )
             self.find("latency", got, f"at most {self._latency_s} s", cure)
 
@@ -793,18 +800,20 @@ class _Suite:
             cure = (
                 "run the arm's own loop, and read it, at the control rate, or lower the rate (hz)"
             )
-            self.find("rate", got, f"one a tick, {1 / self._period_s:.3g} Hz", cure)
+            self.find("rate", got, f"one per tick, {1 / self._period_s:.3g} Hz", cure)
 
         self._judge_pose(layout, joint, before, after)
 
         self._ramp(layout, joint, -change)
         deviation = layout.measured(self._observe()) - base
         if np.abs(deviation).max() > layout.step / 2:
-            got = f"{np.abs(deviation).max():.3g} off after the way back of {name}"
+            got = f"a deviation of {np.abs(deviation).max():.3g} after {name} moved back"
             self.find("size", got, "the pose before", "check the arm's controller")
 
     def _judge_move(self, layout: _Layout, joint: int, change: float, moved: np.ndarray) -> None:
-        """Compare the measured changes of all joints, (D,), with the commanded change of one."""
+        """Compare the measured changes of all joints, (D,), with the commanded change of one
+        joint.
+        """
         name = layout.names[joint]
         moved_most = int(np.argmax(np.abs(moved)))
         ratio = float(moved[joint] / change)
@@ -818,7 +827,10 @@ class _Suite:
                 "commanded"
             )
             self.find(
-                "order", got, f"{name} alone", "give actions and state the same order of joints"
+                "order",
+                got,
+                f"{name} alone",
+                "use the same order of joints in actions and in the state",
             )
         elif ratio < 0:
             got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
@@ -830,12 +842,14 @@ class _Suite:
             )
         elif not 0.5 < ratio < 1.5:
             got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
-            cure = "check the units of both, and that each command is executed once"
+            cure = (
+                "check the units of commands and readings, and that each command is executed once"
+            )
             self.find("size", got, f"{change:+g}", cure)
 
     def _judge_pose(self, layout: _Layout, joint: int, before: Obs, after: Obs) -> None:
-        """Check that the pose turned by the joint's angle and moved about the same axis, as one
-        joint moves a hand.
+        """Check that the pose of the hand turned by the joint's angle, and moved about the joint's
+        axis.
         """
         key = layout.pose_of[joint]
         if key is None or layout.unit not in ("rad", "deg"):
@@ -845,7 +859,7 @@ class _Suite:
         path = after.state[key][:3] - before.state[key][:3]
         q0 = before.state[key][3:].astype(float)
         q1 = after.state[key][3:].astype(float)
-        # The quaternion of the turn: q1 times the inverse of q0.
+        # The quaternion of the rotation: q1 times the inverse of q0.
         axis = q0[3] * q1[:3] - q1[3] * q0[:3] - np.cross(q1[:3], q0[:3])
         sine = np.linalg.norm(axis)
         angle = 2 * np.arctan2(sine, abs(q1 @ q0))
@@ -864,7 +878,7 @@ class _Suite:
                 "correct the rotation of the pose, or the unit of the joints",
             )
 
-        # The other joints may give way by 1 mm and a sixth of the hand's path.
+        # The other joints may yield by 1 mm and a sixth of the hand's path.
         along = abs(float(path @ axis)) / max(1e-9, float(sine))
         if along > 0.001 + float(np.linalg.norm(path)) / 6:
             got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
@@ -872,7 +886,7 @@ class _Suite:
                 "pose",
                 got,
                 "a motion about the joint's axis",
-                "give the quaternion as xyzw, not as wxyz",
+                "return the quaternion as xyzw, not as wxyz",
             )
 
     def _check_single_commands(self, layout: _Layout, name: str) -> None:
@@ -884,11 +898,11 @@ class _Suite:
             self._apply(layout.changed(self._command, 0, change))
             self._clock.sleep(2 * self._latency_s)
             if abs(layout.measured(self._observe())[0] - before) < 0.4 * half:
-                got = f"no motion of {name} at command {number + 1} of 6 single ones"
+                got = f"no motion of {name} at command {number + 1} of 6 single commands"
                 self.find(
                     "commands",
                     got,
-                    "a motion at each",
+                    "a motion at each command",
                     "commands are dropped: check bus and network",
                 )
 
@@ -901,12 +915,12 @@ class _Suite:
 
         moved = abs(layout.measured(self._observe())[0] - before)
         if moved > layout.step / 2:
-            got = f"{name} went on by {moved:.3g} after stop"
+            got = f"{name} moved on by {moved:.3g} after stop"
             self.find(
                 "stop",
                 got,
                 "rest at once",
-                "make the measured pose the target in stop, and drop commands",
+                "in stop, make the measured pose the target, and drop queued commands",
             )
 
         self._command = self._hold_command(layout, self._observe())
@@ -916,7 +930,7 @@ class _Suite:
         spec = self._contract.action
         obs = self._observe()
         if not layout.grippers or obs.gripper is None or spec.gripper_closed is None:
-            self.report.skipped["gripper"] = "the contract states no gripper"
+            self.report.skipped["gripper"] = "the contract declares no gripper"
             return
         if not self._ask_to_move("closing and opening the gripper"):
             return
@@ -924,7 +938,7 @@ class _Suite:
         action = self._hold_command(layout, obs)
 
         def opening_after(goal: float | None) -> float:
-            """Command an opening, and return the measured one."""
+            """Command an opening, and return the measured opening."""
             action[layout.grippers] = goal
             self._apply(action)
             self._clock.sleep(2.0)
@@ -935,12 +949,14 @@ class _Suite:
 
         saw = None if self._operator is None else self._operator.saw_closing()
         if saw is None:
-            self.report.skipped["gripper"] = "the operator could not tell whether it closed"
+            self.report.skipped["gripper"] = (
+                "the operator could not tell whether the gripper closed"
+            )
         if after > before - 0.3 or saw is False:
             got = f"an opening of {before:.2g} before and {after:.2g} after the command to close"
             cure = (
-                "exchange gripper_open and gripper_closed of the contract, and give 1 for open "
-                "in observe"
+                "exchange gripper_open and gripper_closed of the contract, and return 1 for an "
+                "open gripper in observe"
             )
             self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
 
@@ -969,18 +985,18 @@ class _Layout:
     """The numbers of an action, and the parts of the state that measure them."""
 
     names: list[str]  # the names of the joints
-    limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
+    limits: np.ndarray  # limits of the joints, (D, 2); infinite if the robot has no `joint_limits`
     joints: list[int]  # the indices of the joints in an action
     grippers: list[int]  # the indices of the grippers in an action
     joint_parts: list[str]  # the parts of the state that together contain the joints
-    pose_of: list[str | None]  # for each joint, the part with the pose of its hand
+    pose_of: list[str | None]  # for each joint, the part with the pose of the hand of its arm
     unit: str  # unit of the joints
     relative: bool  # whether actions are relative
 
     @classmethod
     def find(cls, robot: Robot, contract: Contract, obs: Obs) -> _Layout | None:
         """Return the layout of a robot's actions; None if an action does not consist of the joints
-        of each arm, with its gripper after them.
+        of each arm, each followed by the arm's gripper.
         """
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
@@ -996,7 +1012,7 @@ class _Layout:
 
         grippers: list[int] = []
         if grippers_per_arm:
-            # The gripper is the last number of its arm.
+            # The gripper is the last number of an arm.
             arm_ends = np.cumsum(counts) + np.arange(1, len(joint_parts) + 1)
             grippers = [int(arm_end) - 1 for arm_end in arm_ends]
         joints = [index for index in range(action.dim) if index not in grippers]
@@ -1058,10 +1074,10 @@ class _Layout:
 class _Card:
     """A card in a picture."""
 
-    red: bool  # otherwise it is blue
-    x: float  # of its middle, in [0, 1] from the left
-    y: float  # y of its middle, in [0, 1] from the top
-    share: float  # share of all pixels
+    red: bool  # whether the card is red; otherwise it is blue
+    x: float  # x of the middle of the card, in [0, 1] from the left
+    y: float  # y of the middle of the card, in [0, 1] from the top
+    share: float  # the card's share of all pixels
 
 
 def _find_card(before: np.ndarray, after: np.ndarray) -> _Card | None:
@@ -1072,7 +1088,7 @@ def _find_card(before: np.ndarray, after: np.ndarray) -> _Card | None:
         after: The picture with the card, (H, W, 3) uint8.
 
     Returns:
-        The card; None if there is none.
+        The card; None if no card is found.
     """
     red, green, blue = np.moveaxis(after.astype(int), -1, 0)
     changed = np.abs(after.astype(int) - before).max(-1) > _RED
@@ -1093,7 +1109,7 @@ def _find_card(before: np.ndarray, after: np.ndarray) -> _Card | None:
 
 
 def arm_part(arm: str, name: str) -> str:
-    """Return the name of a part of the state for an arm; the name "" is for a robot with one
-    arm.
+    """Return the name of a part of the state of an arm; the arm's name is "" if the robot has only
+    one.
     """
     return f"{arm}/{name}" if arm else name

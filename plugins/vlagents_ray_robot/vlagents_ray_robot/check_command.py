@@ -1,11 +1,11 @@
-"""Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
+"""Checks a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
 joint by joint.
 
 Nothing moves without --move. With it, each motion begins only after the operator at the robot has
 agreed. A simulated arm, "mujoco:ARM", is checked without an operator.
 
-Exit status: 0 if no check found a violation, 1 if one did, 2 if the check could not run, 3 if the
-robot does not declare what the checks of its motion need.
+Exit status: 0 if no check found a violation, 1 if a check found one, 2 if the check could not run,
+3 if the robot lacks declarations that the checks of its motion need.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ def main(arguments: Sequence[str]) -> int:
 
     try:
         with contextlib.ExitStack() as stack:
-            # Standard output has only the document; questions to the operator go to standard error.
+            # Standard output has only the JSON document; questions to the operator go to standard
+            # error.
             if options.json:
                 stack.enter_context(contextlib.redirect_stdout(sys.stderr))
             report = _examine(options, stack)

@@ -28,8 +28,8 @@ class OneAtATime:
     """A bus of motors whose methods run one at a time.
 
     LeRobot's buses have no lock, and the watchdog's thread may stop a robot during a transfer of
-    the control loop. Each call is locked by itself, so that a stop waits for a transfer, but not
-    for the cameras that are read after it.
+    the control loop. Each call is locked separately, so that a stop waits for a transfer, but not
+    for the cameras that are read after the transfer.
 
     Args:
         bus: The bus of LeRobot.
@@ -54,30 +54,31 @@ class OneAtATime:
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """A part of a robot with a bus of its own, or the whole robot."""
+    """A part of a robot with its own bus, or the whole robot."""
 
     robot: Any  # LeRobot's robot of this part
-    motors: list[str]  # the names of its motors, without the prefix that two arms have
+    # The names of the arm's motors, without the prefix that they have on a robot with two arms.
+    motors: list[str]
     indices: list[int]  # the indices of these motors in an action
 
     @property
     def bus(self) -> Any:
-        """The bus of its motors; None if LeRobot drives them in another way."""
+        """The bus of the arm's motors; None if LeRobot drives them in another way."""
         return getattr(self.robot, "bus", None)
 
 
 class LeRobotRobot:
-    """Any robot that LeRobot drives, by the name that its configuration registers.
+    """A robot that LeRobot drives, selected by the name that its configuration registers.
 
     Joints stay in LeRobot's order and units, which its datasets and policies trained on them also
-    have. The part `joints`, (D,), of an observation has the same numbers as an action, including
-    the gripper. The motors whose name contains "gripper" keep their goal at a stop, so that they
-    do not drop what they hold.
+    have. The part `joints`, (D,), of an observation contains the same joints as an action,
+    including the gripper. The motors whose name contains "gripper" keep their goal at a stop, so
+    that they do not drop what they hold.
 
     Args:
         robot_type: The registered name, such as "so101_follower".
         unit: The unit of the joints; default: "deg" or "%" of the calibrated range, depending on
-            `use_degrees` of the configuration, or of those of its arms.
+            `use_degrees` in the configuration of the robot, or of its arms.
         settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and
             `cameras`.
 
@@ -101,7 +102,8 @@ class LeRobotRobot:
 
         for folder in (package, require("lerobot.cameras")):
             for module in pkgutil.iter_modules(folder.__path__):
-                # The import registers the module's configurations; it fails without the driver.
+                # The import registers the module's configurations; it fails if the driver is not
+                # installed.
                 with contextlib.suppress(ImportError):
                     importlib.import_module(f"{folder.__name__}.{module.name}")
         require("lerobot.utils.import_utils").register_third_party_plugins()
@@ -147,10 +149,9 @@ class LeRobotRobot:
 
     @functools.cached_property
     def _arms(self) -> list[_Arm]:
-        """The arms that have a bus; the whole robot if not all motors are on their buses.
-
-        LeRobot's robots with two arms have them as `left_arm` and `right_arm`, and the motors'
-        names have the prefixes "left_" and "right_".
+        """The arms that have a bus; the whole robot if not all motors are on these buses. LeRobot's
+        robots with two arms have the attributes `left_arm` and `right_arm`, and the motors' names
+        have the prefixes "left_" and "right_".
         """
         whole = [_Arm(self._robot, self.joint_names, list(range(len(self._keys))))]
         if hasattr(self._robot, "bus"):
@@ -168,7 +169,9 @@ class LeRobotRobot:
         return arms if sorted(on_buses) == whole[0].indices else whole
 
     def _configured_unit(self, config: Any) -> str:
-        """Return the unit of the joints by the configuration of the robot, or of its arms."""
+        """Return the unit of the joints according to the configuration of the robot, or of its
+        arms.
+        """
         units: dict[str, None] = {}
         for arm in self._arms:
             of_arm = config if arm.robot is self._robot else arm.robot.config
@@ -221,7 +224,7 @@ class LeRobotRobot:
         """The cameras, the joints and the actions, from LeRobot's features."""
         cameras = {}
         for name, shape in self._robot.observation_features.items():
-            if isinstance(shape, tuple):  # the feature of a camera
+            if isinstance(shape, tuple):  # The feature is that of a camera.
                 cameras[name] = CameraSpec(*shape[:2])
         return Contract(
             cameras=cameras,
@@ -253,9 +256,9 @@ class LeRobotRobot:
     def stop(self) -> None:
         """Make the measured positions the goal; torque stays on, so that the arm does not fall.
 
-        No camera is read. If there is no bus or it cannot be read, the goal is the pose of the last
-        observation. The grippers keep their goal. Each of several arms is stopped, even if another
-        one cannot be.
+        No camera is read. If there is no bus, or the bus cannot be read, the goal is the pose of
+        the last observation. The grippers keep their goal. Every arm is stopped, even if stopping
+        another arm fails.
 
         Raises:
             Exception: The motors of an arm cannot be reached, or the robot was commanded and no
@@ -307,7 +310,8 @@ class LeRobotRobot:
                 if self._measured is None:
                     raise
                 logger.warning(
-                    "stop: the motors' positions cannot be read (%s); the last ones are the goal",
+                    "stop: the motors' positions cannot be read (%s); the last known positions "
+                    "are the goal",
                     error,
                 )
 

@@ -26,7 +26,7 @@ from vlagents_ray_robot.check import Operator, arm_part
 # Set this before any import of mujoco, which reads it; packages of models import mujoco.
 if not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")
-_SETTLING_S = 1.0  # the time in which an arm comes to rest at the begin
+_SETTLING_S = 1.0  # the time in which an arm comes to rest at the beginning
 _GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
 # The prefix of the names that are added to a model, so that they differ from the model's names.
 _PREFIX = "vlagents_ray/"
@@ -37,7 +37,7 @@ _RED = (220, 20, 30)  # the colour of the card of `SimulatedOperator`, RGB
 
 @dataclass(frozen=True)
 class ArmModel:
-    """The facts about an arm that its model file does not contain."""
+    """The properties of an arm that its model file does not contain."""
 
     menagerie: str  # the folder of the model in the MuJoCo Menagerie
     # The rest pose of the joints without the gripper, rad; if empty, the file's first keyframe.
@@ -79,13 +79,15 @@ class SimulatedClock:
 
 @dataclass(slots=True)
 class _Drive:
-    """The actuators that one number of an action moves: of a joint, or of a gripper's fingers."""
+    """The actuators that one number of an action moves: those of a joint, or of a gripper's
+    fingers.
+    """
 
     name: str
     actuators: list[int] = field(default_factory=list)
-    # For each actuator: the lower limit of a joint, or the control of a closed gripper.
+    # For each actuator: the lower limit of a joint, or the control value of a closed gripper.
     low: list[float] = field(default_factory=list)
-    # For each actuator: the upper limit of a joint, or the control of an open gripper.
+    # For each actuator: the upper limit of a joint, or the control value of an open gripper.
     high: list[float] = field(default_factory=list)
     gripper: bool = False
 
@@ -98,20 +100,20 @@ class _Drive:
 class MujocoArm:
     """A simulated arm with a position controller, cameras, latency and measured joints.
 
-    An action has the target of each joint, rad, and after them the gripper's opening in [0, 1],
-    1 = open, for one arm after the other. An observation has the part `joints`, (D,) rad, and
-    `tquat`, (7,), the pose of the hand in the frame of the arm's base, m and quaternion xyzw; with
-    two arms `left/joints` and so on. `contract`, `joint_names`, `joint_limits` and `operator`
-    describe the arm to the loop and to the check of a robot. The physics advance with `clock`
-    whenever a method is called. `simulated` is True, so that a stop ends by itself.
+    For each arm, an action contains the target of each joint, rad, followed by the gripper's
+    opening in [0, 1], 1 = open. An observation has the part `joints`, (D,) rad, and `tquat`, (7,),
+    the pose of the hand in the frame of the arm's base, m and quaternion xyzw; with two arms these
+    are `left/joints` and so on. `contract`, `joint_names`, `joint_limits` and `operator` describe
+    the arm to the loop and to the check of a robot. The physics advance with `clock` whenever a
+    method is called. `simulated` is True, so that a stop ends by itself.
 
     Args:
         model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file.
             Names need the package `mujoco-menagerie`, which downloads a model at its first use, or
             finds it in the folder MENAGERIE_ROOT.
-        like: The name of an arm in `ARMS` with the rest pose, gripper and arms of the file.
-        cameras: Names of the cameras. "front" looks at the arm; the others are on the hands of the
-            arms, one after the other.
+        like: The name of an arm in `ARMS` whose rest pose, gripper and arms also apply to the file.
+        cameras: Names of the cameras. "front" looks at the arm; the others are mounted on the hands
+            of the arms in turn.
         size: Height and width of the pictures, px.
         fps: The rate of the cameras, Hz.
         delta: Whether actions are relative to the joints' last targets.
@@ -148,9 +150,10 @@ class MujocoArm:
         self.arms = arm_model.arms or ("",)
 
         self._latency_s = latency_s
-        # Commands that the controller has not received yet, with the times at which it will.
+        # Commands that the controller has not received yet, and the times at which it receives
+        # them.
         self._queue: deque[tuple[float, np.ndarray]] = deque()
-        # The commanded targets, and the targets on the way to them at `speed`.
+        # The commanded targets, and the current targets, which approach them at `speed`.
         self._goal = np.zeros(0)
         self._target = np.zeros(0)
 
@@ -158,8 +161,9 @@ class MujocoArm:
         self._frame_s = 1 / fps
         self._renderer: Any = None
         self._pictures: dict[str, np.ndarray] = {}
-        self._pictures_s = -np.inf  # the time of these pictures
-        self._card: str | None = None  # the camera before which the operator holds the red card
+        self._pictures_s = -np.inf  # the time of the pictures, s
+        # The camera in front of which the operator holds the red card.
+        self._card: str | None = None
 
         spec = _read(mujoco, arm_model, str(model))
         _add_actuators(mujoco, spec)
@@ -269,7 +273,7 @@ class MujocoArm:
     def hold_card(self, camera: str | None) -> None:
         """Show something red in the upper left of the picture of a camera; None takes it away."""
         self._card = camera
-        self._pictures_s = -np.inf  # so that the next observation has new pictures
+        self._pictures_s = -np.inf  # makes the next observation render new pictures
 
     def render(self) -> dict[str, np.ndarray]:
         """Return the present pictures of all cameras, (H, W, 3) uint8 RGB."""
@@ -354,13 +358,13 @@ class MujocoArm:
 
     def _add_scene(self, spec: Any, cameras: Sequence[str]) -> None:
         """Add a floor, a light and the cameras: "front" in the world, the others on the hands."""
-        # Everything farther than 1 cm from a camera is drawn.
+        # Everything further than 1 cm from a camera is drawn.
         spec.stat.extent = 1.0
         spec.visual.map.znear = 0.01
 
         world = spec.worldbody
         world.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1])
-        # The floor touches nothing; with 0, URDF files lose it as a visual.
+        # The floor collides with nothing. With `contype` 0, URDF files would lose it as a visual.
         floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
         world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
 
@@ -372,7 +376,7 @@ class MujocoArm:
         for hand_position, base_position in zip(hand_positions, base_positions, strict=True):
             reach = max(reach, float(np.linalg.norm(hand_position - base_position)))
 
-        arm = 0  # the arm that gets the next camera on its hand
+        arm = 0  # the arm whose hand gets the next camera
         for name in cameras:
             if name == "front":
                 away = np.array([1.5, 1.0, 1.0]) * reach
@@ -446,7 +450,7 @@ class MujocoArm:
             if self.model.actuator_biasprm[index, 1] == 0:
                 raise ConfigError(
                     f"{arm_model.menagerie}: actuator {name!r}: expected a position controller, "
-                    "got none; give each actuator one"
+                    "got none; give each actuator a position controller"
                 )
 
             low, high = map(float, self.model.actuator_ctrlrange[index])
@@ -458,7 +462,8 @@ class MujocoArm:
 
             arm = self._arm_of(f"{name} {joint}")
             if _GRIPPER.search(name) or _GRIPPER.search(joint) or not moves_joint:
-                # If two fingers move against each other, one of them is open at its lower limit.
+                # If two fingers move in opposite directions, one of them is open at its lower
+                # limit.
                 rising = arm_model.open_high if abs(high) >= abs(low) else not arm_model.open_high
                 drive = grippers[arm]
                 drive.low.append(low if rising else high)
@@ -474,7 +479,7 @@ class MujocoArm:
         return joints_of_arms
 
     def _arm_of(self, names: str) -> int:
-        """Return the index of the arm whose name is in the names of an actuator and its joint."""
+        """Return the index of the arm whose name the names of an actuator and its joint contain."""
         for i, arm in enumerate(self.arms):
             if arm and arm in names:
                 return i
@@ -507,7 +512,7 @@ def _read(mujoco: Any, arm_model: ArmModel, model: str) -> Any:
             return robot.spec(robot.default_model)
         except menagerie.MenagerieError as error:
             cure = (
-                "without a network, MENAGERIE_ROOT names a folder with the models, or give the "
+                "without a network, set MENAGERIE_ROOT to a folder with the models, or give the "
                 "path of a file"
             )
             raise ConfigError(
@@ -553,8 +558,8 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
 
 
 class SimulatedOperator(Operator):
-    """An operator at a simulated arm, who agrees to every motion, and reads the answers from the
-    simulation.
+    """An operator at a simulated arm, who agrees to every motion, and whose answers are read from
+    the simulation.
 
     Args:
         arm: The arm.
@@ -581,7 +586,7 @@ class SimulatedOperator(Operator):
         return self._arm.opening() < 0.5
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its
+        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of the arm's
         base.
         """
         true_pose = self._arm.hand_pose(arm)

@@ -1,4 +1,6 @@
-"""What this distribution registers: an entry for each robot, operator's device and command."""
+"""The entries that this distribution registers: one for each robot, operator's device and
+command.
+"""
 
 from vlagents_ray.registry import RegistryEntry
 

@@ -20,7 +20,7 @@ from vlagents_ray_robot import DISTRIBUTION
 
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "SpaceMouse"]
 
-_FULLY_OPEN = 0.9  # a gripper with a smaller opening may hold something
+_FULLY_OPEN = 0.9  # minimum opening of a gripper that counts as empty
 
 
 class AxesDevice(ABC):
@@ -53,7 +53,7 @@ class AxesDevice(ABC):
     def __enter__(self) -> AxesDevice:
         return self
 
-    def __exit__(self, *exc: object) -> None:  # noqa: B027 - not every device is to be closed
+    def __exit__(self, *exc: object) -> None:  # noqa: B027 - not every device needs closing
         """Close the device."""
 
     @classmethod
@@ -69,8 +69,8 @@ class AxesDevice(ABC):
 
         Args:
             contract: The contract of the policy or the environment.
-            step: The change of a number of the action at a tick with an axis at its end; None
-                takes it from the contract.
+            step: The change of a number of the action per tick at the full deflection of an axis;
+                None takes the change from the contract.
             measure: Returns the robot's measured pose, (D,), in an observation; None reads the
                 state's part `joints`.
 
@@ -84,24 +84,24 @@ class AxesDevice(ABC):
 class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
-    Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the
-    action has them, rotations; else the first six joints. The gripper is the number of
-    `ActionSpec.gripper_columns`. At a takeover the gripper stays open if it is fully open; else it
-    is closed, as it may hold something.
+    Axis i moves number i of the action: for relative actions of an end effector these are x, y, z
+    and, if the action has them, rotations; otherwise the first six joints. The gripper is the
+    number of `ActionSpec.gripper_columns`. At a takeover the gripper stays open if it is fully
+    open; otherwise it is closed, as it may hold something.
 
     Args:
         contract: The policy's contract, which declares `action.dim` and whether actions are
             relative.
         device: The device.
-        step: The change of a number at a tick with the axis at its end, in the action's units;
-            default: half of the action's bound, if actions are relative and bounded.
+        step: The change of a number per tick at the full deflection of an axis, in the action's
+            units; default: half of the action's bound, if actions are relative and bounded.
         measure: Returns the robot's pose in an observation, (D,) in the action's order and units,
-            from which absolute targets begin; default: the state's part `joints`, with the
-            gripper's command after it.
+            at which absolute targets begin; default: the state's part `joints`, with the gripper's
+            command after it.
 
     Raises:
-        ConfigError: The contract is incomplete, or has several grippers, which one button cannot
-            operate; or `step` is missing or not above 0.
+        ConfigError: The contract is incomplete, or has several grippers, which a single button
+            cannot operate; or `step` is missing or not above 0.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class AxesLeader:
             step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
-                f"step: expected the change of a number at a tick, above 0, got {step}; set it, "
+                f"step: expected the change of a number per tick, above 0, got {step}; set it, "
                 "as the contract has no bounds of relative actions to compute it from"
             )
 
@@ -143,7 +143,8 @@ class AxesLeader:
         if self._grippers and (spec.gripper_open is None or spec.gripper_closed is None):
             raise ConfigError(
                 "teleoperation: expected both `gripper_open` and `gripper_closed` in the "
-                f"contract's action, got {spec.gripper_open} and {spec.gripper_closed}; state both "
+                f"contract's action, got {spec.gripper_open} and {spec.gripper_closed}; declare "
+                f"both "
                 "in the policy's contract"
             )
 
@@ -154,14 +155,16 @@ class AxesLeader:
 
     @property
     def help(self) -> str:
-        """A line that explains the device to the operator; "" if it needs none."""
+        """A line that explains the device to the operator; "" if the device needs no
+        explanation.
+        """
         moves_joints = self._spec.space in (None, "joint") and not self._spec.relative
         return self._device.help(joints=moves_joints)
 
     def engaged(self) -> bool:
         """Read the device, and return whether the operator moves the robot."""
         engaged = self._device.engaged()
-        if engaged and not self._engaged:  # a takeover
+        if engaged and not self._engaged:  # the beginning of a takeover
             self._closed = None
             self._target = None
         self._engaged = engaged
@@ -179,7 +182,7 @@ class AxesLeader:
         """Return the action of the axes at the last reading, (D,) float32.
 
         Raises:
-            MissingState: The observation has no pose from which an absolute target begins.
+            MissingState: The observation has no pose at which an absolute target begins.
         """
         spec = self._spec
         axes = self._device.axes()
@@ -221,12 +224,12 @@ class AxesLeader:
         return np.array(pose, np.float32)
 
 
-# A keyboard as a device with axes, read from the terminal so that it also works over SSH.
+# A keyboard as a device with axes. It is read from the terminal, so that it also works over SSH.
 
-# The time for which a key counts as pressed: terminals report no release, and repeat a key that is
-# held down.
+# The time for which a key counts as pressed. Terminals report no release, but repeat a key that
+# stays pressed.
 HOLD_S = 0.2
-# By key: the axis and the direction.
+# The axis and the direction by key.
 AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
 AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
 GRIPPER, TAKE = " ", "\n"
@@ -247,7 +250,7 @@ class Keyboard(AxesDevice):
             player = ChunkPlayer(agent, override=AxesLeader(agent.contract, device))
 
     Args:
-        keys: Further keys, and functions, which the thread of the control loop calls.
+        keys: Further keys, each with a function that the thread of the control loop calls.
         terminal: The file descriptor of the terminal; default: the one of standard input.
 
     Raises:
@@ -266,7 +269,7 @@ class Keyboard(AxesDevice):
             )
 
         self._terminal = Terminal(terminal)
-        # By axis and direction: the time until which its key counts as pressed, s of
+        # The time until which the key of an axis and a direction counts as pressed, s of
         # `time.monotonic`.
         self._until = np.zeros((6, 2))
         self._open = contextlib.ExitStack()
@@ -313,11 +316,12 @@ class Keyboard(AxesDevice):
         return True
 
 
-# A SpaceMouse as a device with axes; it needs the extra "spacemouse".
+# A SpaceMouse as a device with axes, which needs the extra "spacemouse".
 
-# Within this share of its range, an axis counts as 0: the cap never rests exactly in the middle.
+# An axis within this share of its range counts as 0, as the cap never rests exactly in the middle.
 _DEAD = 0.1
-# Most reports that are read at one tick, as the device sends more reports than a loop has ticks.
+# Maximum number of reports that are read at one tick, as the device sends more reports than a loop
+# has ticks.
 _REPORTS = 64
 
 
@@ -325,11 +329,11 @@ class SpaceMouse(AxesDevice):
     """The cap of a SpaceMouse as six axes: forward, left and up are +x, +y, +z, as in ROS (REP
     103).
 
-    Moving it takes over, its first button opens and closes the gripper, and its last one takes over
-    or gives back.
+    Moving the cap takes over. The first button opens and closes the gripper, the last button takes
+    over or gives back.
 
     Raises:
-        ConfigError: There is no such device, or it may not be read.
+        ConfigError: There is no such device, or this user may not read it.
         MissingDependency: The extra "spacemouse" is not installed.
     """
 
@@ -337,7 +341,7 @@ class SpaceMouse(AxesDevice):
         try:
             library: Any = require("pyspacemouse", extra="spacemouse", distribution=DISTRIBUTION)
             self._device: Any = library.open(axis_convention=library.AxisConvention.ROS)
-        except (OSError, RuntimeError) as error:  # the library loads hidapi, which may fail
+        except (OSError, RuntimeError) as error:  # The library loads hidapi, which may fail.
             raise ConfigError(
                 f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), "
                 "and let this user read its /dev/hidraw"
@@ -375,7 +379,7 @@ class SpaceMouse(AxesDevice):
         return self._axes
 
 
-# The functions that open the leaders "keyboard" and "spacemouse", see
+# The functions that open the leaders "keyboard" and "spacemouse"; see
 # `vlagents_ray.robot.leaders.OpenLeader`.
 open_keyboard = Keyboard.open_leader
 open_spacemouse = SpaceMouse.open_leader

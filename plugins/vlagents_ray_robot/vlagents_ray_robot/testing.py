@@ -1,4 +1,4 @@
-"""A test suite for robots, which the arms of this package pass and yours can also use.
+"""A test suite for robots, which the arms of this package pass, and which your robots can also use.
 
 from vlagents_ray_robot.testing import check_robot
 
@@ -26,7 +26,7 @@ def check_robot(robot: Robot, **options: Any) -> RobotReport:
             nothing moves.
 
     Returns:
-        The report, with the checks that were not made.
+        The report, with the skipped checks.
 
     Raises:
         ContractViolation: A check found something; the message has every finding.

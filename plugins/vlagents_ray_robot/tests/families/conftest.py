@@ -1,4 +1,4 @@
-"""Tests of robots that need LeRobot's environment or a ROS 2.
+"""Tests of robots that need LeRobot's Python environment or an installed ROS 2.
 
 `make families` runs them; in other environments they are left out.
 """
@@ -14,5 +14,5 @@ collect_ignore = not_here(Path(__file__).parent)
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Each of them loads torch or a ROS 2; of these folders alone."""
+    """Mark the tests in these folders as `sim`: each loads torch or ROS 2."""
     item.add_marker("sim")

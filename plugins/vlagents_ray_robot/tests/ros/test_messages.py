@@ -1,5 +1,5 @@
-"""Messages of ROS 2 as arrays and words, whatever their layout; garbage is rejected with its
-cure.
+"""Tests that messages of ROS 2 are converted to arrays and texts in every layout, and that errors
+about invalid messages have a cure.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3) * 7
 def image_message(
     pixels: np.ndarray, encoding: str, padding: int = 0, **more: Any
 ) -> dict[str, Any]:
-    """An Image of pixels, (H, W, bytes of a pixel), with unused bytes at the end of each row."""
+    """Return an Image with these pixels, (H, W, bytes of a pixel), and unused bytes at the end of
+    each row.
+    """
     height, width, _ = pixels.shape
     rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)), constant_values=255)
     said = {
@@ -244,7 +246,7 @@ def pose_message(quaternion: list[float]) -> dict[str, Any]:
 
 
 def test_a_pose_has_its_rotation_in_the_form_asked_for() -> None:
-    quarter = pose_message([0.0, 0.0, 2**-0.5, 2**-0.5])  # about z
+    quarter = pose_message([0.0, 0.0, 2**-0.5, 2**-0.5])  # a rotation about z
     np.testing.assert_allclose(messages.pose(quarter), [1, 2, 3, 0, 0, 2**-0.5, 2**-0.5], rtol=1e-6)
     stamped = {"header": {}, "pose": quarter}
     np.testing.assert_allclose(

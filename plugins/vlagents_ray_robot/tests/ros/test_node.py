@@ -1,4 +1,6 @@
-"""A robot behind topics: what is published while a policy drives it, and when something is lost."""
+"""Tests of a robot behind topics: the messages that are published while a policy drives it, and
+after losses.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +45,12 @@ from vlagents_ray_robot.ros.robot import settings_from
 
 STEP = 0.01
 MAX_STEP = 0.05
-FAR = 7.0  # rad; beyond the bounds
+FAR = 7.0  # a position beyond the bounds, rad
 
 
 class Ahead(Agent):
-    """Chunks of two rows that lead from the measured pose by STEP a row; FAR in each third
-    chunk, if it is wild.
+    """Returns chunks of two rows, each row STEP further from the measured pose; if `wild`, each
+    third chunk contains FAR.
     """
 
     shared = ("instructions", "seen")
@@ -78,9 +80,9 @@ class Ahead(Agent):
 
 
 class SeeingGuard(Guard):
-    """A guard that remembers what it has let pass, over all of its kind."""
+    """A guard that records the actions that all guards of this class have accepted."""
 
-    passed: list[list[float]] = []  # noqa: RUF012 - a test empties it
+    passed: list[list[float]] = []  # noqa: RUF012 - the test empties it
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
         accepted = super().__call__(action, last)
@@ -109,7 +111,7 @@ class Drive:
         return bool(beats) and beats[-1]["data"]
 
     def moves(self) -> None:
-        """Wait until commands have come since now."""
+        """Wait until new commands have arrived."""
         now = len(self.commands)
         wait_for(lambda: len(self.commands) > now + 3)
 
@@ -166,7 +168,7 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
                 str(MAX_STEP),
             ]
             status = command.main([f"http://127.0.0.1:{port}", *options, *said])
-    assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
+    assert status != 2, capsys.readouterr().out  # a tick may be late on a busy machine
     assert list(agent.instructions) == ["stack the cups"]
     obs = agent.seen[0]
     assert obs.cameras["front"].shape == (SIDE, SIDE, 3)
@@ -175,7 +177,7 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     assert len(commands) >= 20
     assert np.abs(np.diff([[0.0, 0.0], *commands], axis=0)).max() <= MAX_STEP
     assert commands[-1][0] > 0.05
-    assert commands[-1] in arm.poses  # it ends with a stop, at the measured pose
+    assert commands[-1] in arm.poses  # the loop ends with a stop, at the measured pose
     assert double.advertised == {
         COMMANDS: "std_msgs/msg/Float64MultiArray",
         BEAT: "std_msgs/msg/Bool",
@@ -192,9 +194,10 @@ def test_no_action_reaches_the_arm_that_the_guard_has_not_seen() -> None:
         wait_for(lambda: agent.acts > 20)
     assert len(drive.commands) > 20
     for one in drive.commands:
-        assert one in SeeingGuard.passed or one in drive.arm.poses  # a stop is where the arm is
+        # A stop commands the measured pose.
+        assert one in SeeingGuard.passed or one in drive.arm.poses
         assert FAR not in one
-    assert drive.reports[0].safe["limits"]  # the wild rows were asked for, and rejected
+    assert drive.reports[0].safe["limits"]  # the wild rows were proposed, and rejected
 
 
 def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
@@ -207,7 +210,7 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         # Messages of two topics may arrive in any order.
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 2)
         still = len(drive.commands)
-        assert drive.commands[-1] in drive.arm.poses  # where it was measured
+        assert drive.commands[-1] in drive.arm.poses  # the last command is a measured pose
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 7)  # the loop continues
         assert len(drive.commands) == still
         assert not drive.watchdog.control.stopped
@@ -223,7 +226,7 @@ def test_a_topic_that_is_silent_for_long_stops_the_arm_until_a_person_starts_it(
         drive.arm.broken = {CAMERA}
         wait_for(lambda: drive.watchdog.control.stopped)
         assert drive.watchdog.barks[0].startswith(f"{CAMERA}: silent for")
-        assert not drive.watchdog.restart()  # it is still silent
+        assert not drive.watchdog.restart()  # the topic is still silent
         still = len(drive.commands)
         drive.arm.broken = set()
         wait_for(lambda: drive.robot.holds is None and not drive.watchdog.control.silent)
@@ -240,11 +243,11 @@ def test_a_lost_rosbridge_holds_the_arm_and_tells_it_so_as_soon_as_it_is_back() 
         drive.double.close()
         wait_for(lambda: drive.robot.holds is not None)
         sent = len(drive.commands)
-        drive.arm.joints = [0.5, -0.5]  # somebody moves it by hand meanwhile
+        drive.arm.joints = [0.5, -0.5]  # a person moves the arm by hand in the meantime
         drive.double.published = [one for one in drive.double.published if one.topic != COMMANDS]
         drive.double.open()
         drive.moves()
-        # First the stop where it is now, by hand or since; then commands that begin there.
+        # The first command is a stop at the arm's new position; the next commands begin there.
         assert sent > 0
         assert drive.commands[0] == pytest.approx([0.5, -0.5])
         assert np.abs(np.diff(drive.commands, axis=0)).max() <= MAX_STEP
@@ -256,12 +259,12 @@ def test_a_stop_into_a_dead_connection_is_sent_again_at_the_pose_after_the_loss(
     with RosRobot(settings_from(ros_arm.settings("ws://dead"), "arm.yaml"), wire) as robot:
         robot.observe()
         assert robot.holds is None
-        robot.stop()  # as far as anybody knows, it arrives
+        robot.stop()  # as far as the robot knows, the stop arrives
         assert wire.commands == [[0.0, 0.0]]
         wire.connections = 2
         robot.observe()
         assert robot.holds == "the connection to the rosbridge was lost"
-        robot.stop()  # nobody knows where the arm is now
+        robot.stop()  # the position of the arm is unknown now
         assert len(wire.commands) == 1
         wire.deliver(0.5, -0.5)
         robot.observe()
@@ -308,7 +311,7 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
                 f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
             )
             status: list[int] = []
-            # A busy machine may stop it before.
+            # The arm may stop earlier on a busy machine.
             options += ["--timeout-s", "1", "--restart", "auto"]
             run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)]
             thread = threading.Thread(target=lambda: status.append(command.main(run)))
@@ -402,10 +405,10 @@ def test_the_check_of_a_robot_behind_topics_moves_nothing(
     *,
     declared: bool,
 ) -> None:
-    """Numbers that the measured pose stops are targets; of others only the contract of a policy
-    states it.
+    """If the measured pose stops the robot, actions are absolute; otherwise only the contract of a
+    policy declares whether they are.
     """
-    monkeypatch.setattr("builtins.input", lambda _: "")  # the person cannot tell
+    monkeypatch.setattr("builtins.input", lambda _: "")  # the operator cannot tell
     with ahead_server(Ahead()) as port, rosbridge_double() as double:
         settings = ros_arm.settings(double.url)
         settings["actions"][0]["stop"] = stop
@@ -429,7 +432,8 @@ def test_the_check_of_a_robot_behind_topics_moves_nothing(
 def test_only_a_camera_without_new_messages_is_frozen(camera: str) -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
         settings = settings_from(ros_arm.settings(double.url, max_age_s=0.3), "arm.yaml")
-        arm.varies = False  # a simulation without noise renders one picture while nothing moves
+        # A simulation without noise renders the same picture while nothing moves.
+        arm.varies = False
         with RosRobot(settings) as robot:
             if camera == "that hangs":
                 arm.broken = {CAMERA}

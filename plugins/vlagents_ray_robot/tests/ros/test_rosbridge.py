@@ -1,8 +1,6 @@
-"""The rosbridge protocol: what a real server sent is read as it was meant, and by the double's
-rules as well.
-
-`recorded_rosbridge.jsonl` holds frames of rosbridge_suite (commit c1bfc2f, of the branch ros2)
-beside ROS 2 Kilted, to a client that subscribed without compression.
+"""Tests of the rosbridge protocol with recorded messages of a real server, which must also follow
+the rules of the test double. `recorded_rosbridge.jsonl` contains frames of rosbridge_suite (commit
+c1bfc2f of the branch ros2) with ROS 2 Kilted, sent to a client that subscribed without compression.
 """
 
 from __future__ import annotations
@@ -69,7 +67,7 @@ def test_a_frame_that_is_no_message_is_refused(frame: str) -> None:
 def linked(
     double: RosbridgeDouble, take: Callable[[Any], None], *topics: str
 ) -> Iterator[Rosbridge]:
-    """An open link that is subscribed to these topics, and publishes to /arm."""
+    """Yield an open link that is subscribed to these topics, and publishes to /arm."""
     link = Rosbridge(double.url)
     for topic in topics:
         link.subscribe(topic, "std_msgs/msg/Float64MultiArray", take)
@@ -122,8 +120,8 @@ def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() 
 def test_a_silent_sensor_is_subscribed_to_again(
     busy: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A real server that subscribed before it knew the publisher may have chosen a quality that
-    does not match it.
+    """A real server that subscribed before the publisher existed may have chosen a quality of
+    service that does not match the publisher's.
     """
     monkeypatch.setattr("vlagents_ray_robot.ros.links._SILENT_S", 0.2)
     with rosbridge_double() as double, linked(double, lambda _: None, "/silent", "/busy"):
@@ -159,5 +157,5 @@ def test_a_server_that_does_not_read_does_not_block_the_control_loop(
             longest_s = max(longest_s, time.monotonic() - begun)
         begun = time.monotonic()
         link.close()
-        assert longest_s < 2  # with the limit 0.3 s
+        assert longest_s < 2  # the limit of a message is 0.3 s
         assert time.monotonic() - begun < 10

@@ -1,4 +1,4 @@
-"""A file of topics: what it may state, and the errors that say what to write instead."""
+"""Tests of the file of topics: its valid settings, and the errors with a cure for invalid ones."""
 
 from __future__ import annotations
 

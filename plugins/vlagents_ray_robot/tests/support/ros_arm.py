@@ -1,5 +1,5 @@
-"""An arm with a camera behind topics, as a thread that runs its driver: at 30 Hz it publishes,
-and obeys commands.
+"""An arm with a camera behind topics. A thread runs its driver, which publishes and executes
+commands at 30 Hz.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ HZ = 30.0
 
 
 def settings(link: str, **more: Any) -> dict[str, Any]:
-    """The file of its topics, with limits for a busy machine."""
+    """Return the settings of the arm's topics, with limits for a busy machine."""
     return {
         "link": link,
         "cameras": {"front": {"topic": CAMERA}},
@@ -39,11 +39,11 @@ def settings(link: str, **more: Any) -> dict[str, Any]:
 
 
 class RosArm(threading.Thread):
-    """The arm; its joints are at once where a command wants them.
+    """The arm; its joints reach a commanded position immediately.
 
     Args:
         publish: Publishes a message on a topic.
-        commands: Returns the commands that have come so far.
+        commands: Returns the commands that have arrived so far.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class RosArm(threading.Thread):
     ) -> None:
         super().__init__(name="arm")
         self.joints = [0.0, 0.0]
-        self.poses: list[list[float]] = []  # all that it has been in
-        self.broken: set[str] = set()  # topics that it does not publish on
+        self.poses: list[list[float]] = []  # all poses in which the arm has been
+        self.broken: set[str] = set()  # topics on which the arm does not publish
         self.images = 0
-        self.varies = True  # whether each picture differs, as by the noise of a sensor
+        self.varies = True  # whether each picture differs, as with the noise of a sensor
         self._publish, self._commands = publish, commands
         self._over = threading.Event()
 
@@ -78,7 +78,7 @@ class RosArm(threading.Thread):
                     self._publish(topic, message)
 
     def _state(self) -> dict[str, Any]:
-        # In another order than the policy's, with a joint that it does not know.
+        # The joints are in another order than the policy's, with an additional joint.
         numbers = np.array([0.5, self.joints[1], self.joints[0]])
         return {"header": header(), "name": ["gripper", "elbow", "shoulder"], "position": numbers}
 

@@ -1,8 +1,8 @@
 """A rosbridge server without ROS, written from the protocol's specification, version 2.
 
-It is compared with the real one in tests/robot/ros: with a recording of what that sends, and by the
-same tests against both. Topics exist in this process alone: a test publishes with `publish`, and
-reads what clients published.
+It is compared with the real server: with a recording of the real server's messages, and with tests
+that run against both. Topics exist only in this process: a test publishes with `publish`, and reads
+what clients published.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 @dataclass
 class Published:
-    """What a client has published."""
+    """A message that a client has published."""
 
-    at: float  # s of `time.monotonic`
+    at: float  # time of arrival, s of `time.monotonic`
     topic: str
     message: dict[str, Any]
 
@@ -38,9 +38,9 @@ class RosbridgeDouble:
     published: list[Published] = field(default_factory=list)
     advertised: dict[str, str] = field(default_factory=dict)
     subscribed: dict[str, str] = field(default_factory=dict)
-    # In their order, with those that were made again.
+    # Subscribed topics in order, including repeated subscriptions.
     subscriptions: list[str] = field(default_factory=list)
-    # Gets each message that a client publishes.
+    # Called with each message that a client publishes.
     noticed: Callable[[dict[str, Any]], None] = lambda _: None
     _asked: dict[ServerConnection, set[str]] = field(default_factory=lambda: defaultdict(set))
     _server: Server | None = None
@@ -51,11 +51,11 @@ class RosbridgeDouble:
         return f"ws://127.0.0.1:{self.port}"
 
     def on(self, topic: str) -> list[dict[str, Any]]:
-        """The messages that clients have published on a topic."""
+        """Return the messages that clients have published on a topic."""
         return [one.message for one in list(self.published) if one.topic == topic]
 
     def publish(self, topic: str, message: dict[str, Any]) -> None:
-        """Send a message to those who have subscribed to its topic."""
+        """Send a message to the clients that have subscribed to its topic."""
         for socket, asked in list(self._asked.items()):
             if topic in asked:
                 with contextlib.suppress(ConnectionClosed, OSError):
@@ -64,7 +64,7 @@ class RosbridgeDouble:
                     )
 
     def open(self) -> None:
-        """Listen, at the same port as before if it was open before."""
+        """Listen; if the server was open before, use the same port."""
         self._server = serve(
             self._handle, "127.0.0.1", self.port, compression=None, close_timeout=0.5
         )
@@ -73,7 +73,7 @@ class RosbridgeDouble:
         self._thread.start()
 
     def close(self) -> None:
-        """End all connections, and listen no more."""
+        """End all connections, and stop listening."""
         server, thread, self._thread = self._server, self._thread, None
         if server is None or thread is None:
             return
@@ -124,7 +124,7 @@ def rosbridge_double() -> Iterator[RosbridgeDouble]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON's values of a message: bytes in base64, numbers that are not finite as null."""
+    """Return a message as JSON values: bytes in base64, numbers that are not finite as null."""
     if isinstance(value, dict):
         return {name: _plain(one) for name, one in value.items()}
     if isinstance(value, (bytes, bytearray)):

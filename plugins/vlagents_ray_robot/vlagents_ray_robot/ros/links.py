@@ -30,12 +30,13 @@ from vlagents_ray.errors import (
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
-_SILENT_S = 2.0  # after this time without a message, the connection or a topic is checked
+_SILENT_S = 2.0  # time without a message after which the connection or a topic is checked, s
 _GET_ROS = (
     "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach "
     "ROS through a rosbridge, `link: ws://arm-pc:9090`"
 )
-_SEND_S = 0.2  # time limit of a message: a dead link would block the control loop for minutes
+# Time limit of a message, s: without it, a dead link would block the control loop for minutes.
+_SEND_S = 0.2
 _OPEN_S = 5.0  # time limit of the opening handshake
 _CLOSE_S = 1.0  # maximum time of a closing handshake
 _LARGEST = 64 << 20  # largest frame, bytes; a 4K image in base64 has 34 million
@@ -71,13 +72,13 @@ class Ros2:
     def subscribe(self, topic: str, message_type: str, take: Callable[[Any], None]) -> None:
         """Pass the messages of a topic to a function, on the link's thread; called before `open`.
 
-        Only the newest message is kept, and a lost message is not sent again; this also matches
-        reliable publishers.
+        Only the newest message is kept, and a lost message is not sent again; this quality of
+        service also matches reliable publishers.
 
         Args:
             topic: The topic.
             message_type: The type of its messages, such as "sensor_msgs/msg/Image".
-            take: The function.
+            take: The function for the messages.
         """
         qos = require("rclpy.qos")
         newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
@@ -140,8 +141,8 @@ def filled(instance: Any, message: Mapping[str, Any]) -> Any:
 
     Args:
         instance: The message, an object of rclpy.
-        message: The values of its fields. A list of mappings becomes a list of the messages that
-            the type of the field names.
+        message: The values of its fields. A list of mappings becomes a list of messages of the
+            field's type.
     """
     for name, value in message.items():
         if isinstance(value, Mapping):
@@ -171,12 +172,12 @@ class Rosbridge:
 
     def __init__(self, url: str) -> None:
         self._url = url
-        # By subscribed topic: the function for its messages, its type, and the time of its last
-        # message or subscription, s of `time.monotonic`.
+        # For each subscribed topic: the function for its messages, its type, and the time of its
+        # last message or subscription, s of `time.monotonic`.
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
         self._heard_at: dict[str, float] = {}
-        self._published_types: dict[str, str] = {}  # by topic
+        self._published_types: dict[str, str] = {}  # the types of the published messages by topic
 
         self._socket: LimitedWebSocket | None = None
         self._open = contextlib.ExitStack()
@@ -187,13 +188,14 @@ class Rosbridge:
     def subscribe(self, topic: str, message_type: str, take: Callable[[Any], None]) -> None:
         """Pass the messages of a topic to a function, on the link's thread; called before `open`.
 
-        While the topic is silent, it is subscribed to again: the server chooses the quality of
-        service from the publishers at that time, and would miss a later publisher with best effort.
+        While no messages arrive, the topic is subscribed to again: the server chooses the quality
+        of service according to the publishers at the time of the subscription, and would not
+        receive from a later publisher with best effort.
 
         Args:
             topic: The topic.
             message_type: The type of its messages, such as "sensor_msgs/msg/Image".
-            take: The function.
+            take: The function for the messages.
         """
         self._take[topic] = take
         self._types[topic] = message_type
@@ -283,7 +285,8 @@ class Rosbridge:
                 try:
                     self._receive(socket.connection.recv(_SILENT_S))
                 except TimeoutError:
-                    # Without an answer, the server is lost, for instance after a power failure.
+                    # Without an answer, the server counts as lost, for instance after a power
+                    # failure.
                     if not socket.connection.ping().wait(_SILENT_S):
                         self._lose(socket)
                         continue
@@ -302,14 +305,14 @@ class Rosbridge:
         self._heard_at[topic] = time.monotonic()
 
     def _reconnect(self) -> None:
-        """Try to connect again once; wait for half a second if that fails."""
+        """Try to connect again once; wait for half a second if the attempt fails."""
         try:
             self._connect()
         except ConnectionLost:
             self._closing.wait(0.5)
             return
 
-        # `close` may have run before the connection was up.
+        # `close` may have run before the new connection was made.
         socket = self._socket
         if self._closing.is_set() and socket is not None:
             self._lose(socket)
@@ -329,7 +332,7 @@ class Rosbridge:
         try:
             message = decoded(frame)
         except VLAgentsError as error:
-            logger.warning("%s: sent what is left out: %s", self._url, error)
+            logger.warning("%s: sent an unreadable message, which is ignored: %s", self._url, error)
             return
 
         if message.get("op") == "publish":

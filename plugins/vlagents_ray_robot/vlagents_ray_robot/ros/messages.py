@@ -1,8 +1,8 @@
 """Converts messages of ROS 2 to numbers and images, and actions to messages; ROS is not needed.
 
-A received message is a mapping, as from rosbridge, or an object with the same fields, as from
-rclpy. A message to send is a mapping of its fields. ROS 2's packages `sensor_msgs`,
-`geometry_msgs`, `std_msgs` and `trajectory_msgs` define the fields and their units.
+A received message is a mapping (from rosbridge) or an object with the same fields (from rclpy). A
+message to send is a mapping of its fields. ROS 2's packages `sensor_msgs`, `geometry_msgs`,
+`std_msgs` and `trajectory_msgs` define the fields and their units.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vlagents_ray.images.jpeg_png import MAX_PIXELS, decode
 
 Values = Literal["position", "velocity", "effort"]
 PoseRotation = Literal["quat_xyzw", "quat_wxyz", "euler_xyz", "none"]
-# By encoding: the number of bytes of a pixel; see `sensor_msgs/image_encodings.hpp`.
+# The number of bytes of a pixel by encoding; see `sensor_msgs/image_encodings.hpp`.
 _PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2}
 TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.z")
 
@@ -69,10 +69,10 @@ def stamp(message: Any) -> float | None:
 def image(message: Any) -> np.ndarray:
     """Return the pixels of a `sensor_msgs/msg/Image`, (H, W, 3) uint8 RGB, as a copy.
 
-    Rows may be longer than their pixels (`step`). Of "mono16" the upper 8 bits are used.
+    Rows may be longer than their pixels (`step`). The upper 8 bits of "mono16" are used.
 
     Raises:
-        InvalidObservation: The encoding is neither of colours nor of greys.
+        InvalidObservation: The encoding is neither a colour nor a grey encoding.
         MalformedMessage: The size of the data differs from the fields.
         MessageTooLarge: The image has more than 4096 x 4096 pixels.
     """
@@ -243,7 +243,7 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
 
 
 def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
-    """Return a `trajectory_msgs/msg/JointTrajectory` of one point.
+    """Return a `trajectory_msgs/msg/JointTrajectory` with one point.
 
     Args:
         row: The positions of the point, (D,).
@@ -256,7 +256,7 @@ def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> d
         "positions": row.astype(np.float64).tolist(),
         "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
     }
-    # Controllers read a stamp of zero as now.
+    # Controllers interpret a stamp of zero as the present.
     now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     return {"header": now, "joint_names": list(names), "points": [point]}
 

@@ -28,7 +28,7 @@ from vlagents_ray_robot.ros.messages import TWIST, PoseRotation, Values
 
 logger = logging.getLogger(__name__)
 ROS2 = "ros2"
-# Types of messages.
+# Types of messages
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -38,7 +38,7 @@ ARRAY = "std_msgs/msg/Float64MultiArray"
 NUMBERS = (ARRAY, "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64", "std_msgs/msg/Float32")
 TWIST_TYPE = "geometry_msgs/msg/Twist"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-# Values of `stop` that are no part of the state.
+# Values of `stop` that are not the name of a part of the state.
 ZEROS = "zeros"
 NOTHING = "nothing"
 _AGE_KEYS = ("max_age_s", "silent_s")
@@ -51,10 +51,10 @@ class InputTopic:
     topic: str
     type: str = ""  # such as "sensor_msgs/msg/Image"; the file's section has a default
     names: tuple[str, ...] = ()  # joints of a JointState, in the policy's order; all if empty
-    values: Values = "position"  # the field of a JointState
+    values: Values = "position"  # the field of a JointState that is read
     rotation: PoseRotation = "quat_xyzw"  # the form of the rotation of a pose
-    open: float | None = None  # the number of the topic at which the gripper is open
-    closed: float | None = None  # the number of the topic at which it is closed
+    open: float | None = None  # the value on the topic at which the gripper is open
+    closed: float | None = None  # the value on the topic at which the gripper is closed
     max_age_s: float = 0.3  # if the newest message is older, the robot holds still
     silent_s: float = 1.0  # if the newest message is older, the watchdog stops the robot
 
@@ -65,19 +65,21 @@ class ActionTopic:
 
     topic: str
     type: str
-    # What a stop publishes: "zeros", "nothing", or the part of the state with the measured pose.
+    # The message that stops the robot: "zeros", "nothing", or the part of the state with the
+    # measured pose.
     stop: str = ""
-    numbers: int | None = None  # the number of numbers of a Float64MultiArray
+    numbers: int | None = None  # how many numbers a Float64MultiArray has
     names: tuple[str, ...] = ()  # the joints of a JointState or JointTrajectory
     values: Values = "position"  # the field of a JointState
     fields: tuple[str, ...] = TWIST  # the fields of a Twist
     reach_s: float = 0.1  # the time in which the arm should reach the point of a JointTrajectory
-    # The indices of the grippers among its numbers; None for the joints of the gripper's topic.
+    # The indices of the grippers among the topic's numbers; None for the joints of the gripper's
+    # topic.
     grippers: tuple[int, ...] | None = None
 
     @property
     def dim(self) -> int:
-        """The number of an action's numbers that are published on this topic."""
+        """How many numbers of an action are published on this topic."""
         if self.type == ARRAY:
             return self.numbers or 0
         return len(self.fields) if self.type == TWIST_TYPE else len(self.names)
@@ -85,8 +87,8 @@ class ActionTopic:
 
 @dataclass(frozen=True)
 class HeartbeatTopic:
-    """A topic of type `std_msgs/msg/Bool` that tells, while the control loop runs, whether it may
-    move the robot.
+    """A topic of type `std_msgs/msg/Bool` whose messages say whether the control loop may move the
+    robot.
     """
 
     topic: str
@@ -98,7 +100,8 @@ class RosSettings:
     """The settings of the file; see docs/ros.md."""
 
     link: str  # "ros2", or the address of a rosbridge, such as "ws://arm-pc:9090"
-    actions: tuple[ActionTopic, ...]  # the numbers of an action are published on them in this order
+    # The topics on which the numbers of an action are published, in this order.
+    actions: tuple[ActionTopic, ...]
     cameras: Mapping[str, InputTopic] = field(default_factory=dict)
     state: Mapping[str, InputTopic] = field(default_factory=dict)
     gripper: InputTopic | None = None
@@ -118,16 +121,14 @@ class RosSettings:
 
     @property
     def dim(self) -> int:
-        """The number of numbers of an action."""
+        """How many numbers an action has."""
         return sum(command.dim for command in self.actions)
 
     @property
     def delta(self) -> bool | None:
-        """Whether actions are relative: False if the measured pose stops the robot, as the numbers
-        of an action are targets then.
-
-        It is None otherwise: zeros stop velocities as well as deltas, and a topic without a stop
-        does not show the meaning of its numbers.
+        """Whether actions are relative. False if the measured pose stops the robot, as the numbers
+        of an action are then targets. None otherwise: zeros stop both velocities and deltas, and
+        the meaning of a topic's numbers is unknown if it has no stop.
         """
         stops = {command.stop for command in self.actions} - {NOTHING}
         return False if stops and stops <= self.state.keys() else None
@@ -246,8 +247,8 @@ def _check_sensors(settings: RosSettings, where: str) -> None:
 
     if not settings.sensors:
         raise ConfigError(
-            f"{where}: expected a camera, state or gripper, by whose age the robot is stopped, "
-            "got none; add one"
+            f"{where}: expected a camera, state or gripper, since the robot is stopped if its "
+            f"messages are too old, got none; add one"
         )
     for name, topic, _ in sensors:
         _require_above_zero(f"{where}: {name}: max_age_s", topic.max_age_s)
@@ -259,7 +260,7 @@ def _check_sensors(settings: RosSettings, where: str) -> None:
     if gripper.open is None or gripper.closed is None or gripper.open == gripper.closed:
         raise ConfigError(
             f"{where}: gripper: expected two different numbers, got open={gripper.open} and "
-            f"closed={gripper.closed}; set `open` and `closed` as the topic gives them"
+            f"closed={gripper.closed}; set `open` and `closed` to the values on the topic"
         )
 
 
@@ -295,9 +296,9 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         _require_one_of(f"{where}: fields", name, TWIST)
     if command.dim < 1:
         needed = (
-            "`numbers`, how many it takes"
+            "`numbers`, how many numbers it has"
             if command.type == ARRAY
-            else "`names`, those of the joints"
+            else "`names`, the names of the joints"
         )
         raise ConfigError(f"{where}: expected {needed}, got none for a {command.type}; add them")
     if command.type == TRAJECTORY and not command.reach_s > 0:
@@ -307,8 +308,8 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         raise ConfigError(
             f"{where}: stop: expected the value that stops {command.topic}, got none; set "
             f"{ZEROS!r} where numbers are velocities or deltas, a part of the state with the "
-            f"measured pose where they are targets, or {NOTHING!r} where the controller stays at "
-            "its last target and that is right"
+            f"measured pose where they are targets, or {NOTHING!r} where it is right that the "
+            f"controller stays at its last target"
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
         _require_one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
@@ -318,7 +319,8 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
     if command.grippers and command.stop == ZEROS and settings.gripper is None:
         raise ConfigError(
             f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no "
-            "`gripper`; add the topic of its opening, as a stop publishes that in place of a zero"
+            "`gripper`; add the topic of the gripper's opening, which a stop publishes in place "
+            "of a zero"
         )
 
 
@@ -385,29 +387,30 @@ class TopicReader:
     def __init__(self, reading: InputTopic, by_stamp: bool) -> None:
         self.topic = reading.topic
         self.value: Any = None  # None before the first message
-        self.captured_at = 0.0  # s since 1970
+        self.captured_at = 0.0  # capture time of the value, s since 1970
         self.unreadable = 0  # the number of messages that could not be read
 
         self._reading = reading
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
-        self._captured_s = -math.inf  # s of `time.monotonic`
+        self._captured_s = -math.inf  # the same time, s of `time.monotonic`
 
         # A stop by the watchdog reads the pose at the same time as the control loop.
         self._lock = threading.Lock()
-        # Messages and the times of their arrival, s since 1970: the newest, and the one that was
-        # decoded last.
+        # The newest message and the last decoded message, with the times of their arrival, s since
+        # 1970.
         self._newest: tuple[Any, float] | None = None
         self._decoded: tuple[Any, float] | None = None
 
     def take(self, message: Any) -> None:
-        """Keep a message, on the link's thread; the control loop decodes only the newest one."""
+        """Store a message, on the link's thread; the control loop decodes only the newest
+        message.
+        """
         self._newest = message, time.time()
 
     def refresh(self) -> None:
-        """Decode the newest message, if there is one that is not decoded yet.
-
-        An unreadable message is ignored, so that the reading ages.
+        """Decode the newest message, if it is not decoded yet. An unreadable message is ignored, so
+        that the age of the reading grows.
 
         Raises:
             ConfigError: The first message is unreadable.
@@ -428,7 +431,10 @@ class TopicReader:
                     raise ConfigError(f"{self.topic}: {error}") from error
                 if self.unreadable == 1:
                     logger.warning(
-                        "%s: a message is left out, as are others like it: %s", self.topic, error
+                        "%s: ignored an unreadable message, and will ignore others without a "
+                        "warning: %s",
+                        self.topic,
+                        error,
                     )
                 return
 
@@ -460,18 +466,18 @@ class TopicReader:
 
     @property
     def age_s(self) -> float:
-        """The age of the reading, s; infinite if its time is in the future."""
+        """The age of the reading, s; infinite if its capture time is in the future."""
         return time.monotonic() - self._captured_s
 
 
 class RosRobot:
     """A `Robot` whose cameras, state and actions are topics.
 
-    An observation has the newest message of each topic, and the time of the oldest of them as
-    `captured_at`. While a message is older than its `max_age_s`, or the link is lost, `holds` is
-    the reason why the control loop stops the robot; it continues by itself later. After `silent_s`
-    without a new message the watchdog stops the robot. Use it as a context manager, which connects
-    and waits for the first message of each topic.
+    An observation has the newest message of each topic, and the time of the oldest of these
+    messages as `captured_at`. While a message is older than its `max_age_s`, or the link is lost,
+    `holds` is the reason why the control loop stops the robot; it continues by itself later. After
+    `silent_s` without a new message the watchdog stops the robot. Use it as a context manager,
+    which connects and waits for the first message of each topic.
 
     Args:
         settings: The topics, or the path of their YAML file.
@@ -479,8 +485,8 @@ class RosRobot:
     """
 
     dates_pictures = True
-    """Whether `captured_at` is from the messages, so that the age of a picture shows when its
-    camera hangs.
+    """Whether `captured_at` is from the messages, so that the age of a picture grows if its camera
+    hangs.
     """
 
     def __init__(self, settings: RosSettings | Path | str, link: Link | None = None) -> None:
@@ -494,15 +500,16 @@ class RosRobot:
             link = Ros2() if settings.link == ROS2 else Rosbridge(settings.link)
         self._link: Link = link
 
-        self._readers: dict[int, TopicReader] = {}  # by the id of their settings
+        self._readers: dict[int, TopicReader] = {}  # the readers by the id of their settings
         for sensor in settings.sensors:
             self._readers[id(sensor)] = TopicReader(sensor, settings.clock == "stamp")
 
         self._beat_at = -math.inf  # the time of the last heartbeat, s of `time.monotonic`
         self._connections = 0
-        self._lost_at = -math.inf  # s of `time.monotonic`
+        # The last time at which the connection was lost, s of `time.monotonic`.
+        self._lost_at = -math.inf
         self._stop_unsent = False
-        # The last numbers on each topic of the actions, by its index.
+        # The last numbers that were published on each topic of the actions, by the topic's index.
         self._commanded: dict[int, np.ndarray] = {}
 
         types = {sensor.topic: sensor.type for sensor in settings.sensors}
@@ -529,8 +536,8 @@ class RosRobot:
 
     @property
     def silent_s(self) -> dict[str, float]:
-        """The sources for a `Watchdog`: each topic, and its longest time without a new message,
-        s.
+        """The sources for a `Watchdog`: each topic, and its maximum time without a new
+        message, s.
         """
         limits: dict[str, float] = {}
         for reading in self.settings.sensors:
@@ -580,11 +587,11 @@ class RosRobot:
             action: The numbers of all topics, (D,), in the order of the settings.
 
         Raises:
-            InvalidAction: The action has another number of numbers than the topics.
+            InvalidAction: The length of the action differs from that of the topics' numbers.
         """
         if action.shape != (self.settings.dim,):
             raise InvalidAction(
-                f"action: expected shape ({self.settings.dim},), as the topics take, got "
+                f"action: expected shape ({self.settings.dim},), as the topics need, got "
                 f"{action.shape}"
             )
         first = 0
@@ -599,7 +606,7 @@ class RosRobot:
 
         Grippers keep their last command, as the measured opening would loosen their grasp.
         """
-        self._stop_unsent = not self._link.up  # then it is sent when the link is up again
+        self._stop_unsent = not self._link.up  # An unsent stop is sent when the link is up again.
         for index, command in enumerate(self.settings.actions):
             if command.stop == NOTHING:
                 continue
@@ -613,7 +620,7 @@ class RosRobot:
                 reader = self._readers[id(reading)]
                 reader.refresh()
                 if reader.age_s > reading.max_age_s or self._from_before_loss(reader):
-                    self._stop_unsent = True  # it is sent when a pose is known
+                    self._stop_unsent = True  # The stop is sent when a pose is known.
                     logger.warning(
                         "%s: no stop was published, as the pose of %s is old",
                         command.topic,
@@ -627,7 +634,7 @@ class RosRobot:
             self._publish(command, row)
 
     def _measured_opening(self) -> float:
-        """Return the opening of the gripper in the numbers of its topic; 0 without such a topic."""
+        """Return the opening of the gripper in the units of its topic; 0 without such a topic."""
         reading = self.settings.gripper
         if reading is None or reading.open is None or reading.closed is None:
             return 0.0
@@ -650,11 +657,12 @@ class RosRobot:
         self._link.publish(command.topic, message)
 
     def _hold_if_old(self) -> None:
-        """Set `holds` if a reading is too old or the link is lost, and report the signs of life of
-        the topics to the watchdog.
+        """Set `holds` if a reading is too old or the link is lost, and report the age of each topic
+        to the watchdog.
         """
         connections = self._link.connections
-        was_lost = connections != self._connections  # between two ticks
+        # The connection was lost and made again between two ticks.
+        was_lost = connections != self._connections
         if not self._link.up or was_lost:
             self._connections = connections
             self._lost_at = time.monotonic()
@@ -676,10 +684,10 @@ class RosRobot:
             self.stop()
 
     def _beat(self, *, alive: bool) -> None:
-        """Publish the heartbeat, if it is time.
+        """Publish the heartbeat, if it is due.
 
         Args:
-            alive: Whether the control loop runs; otherwise a last heartbeat is sent at once.
+            alive: Whether the control loop runs; otherwise a last heartbeat is sent immediately.
         """
         heartbeat = self.settings.heartbeat
         now = time.monotonic()
@@ -739,7 +747,7 @@ class RosRobot:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
                 raise ConfigError(
-                    f"{command.topic}: stop: expected {command.dim} numbers, as the topic takes, "
+                    f"{command.topic}: stop: expected {command.dim} numbers, as the topic needs, "
                     f"got {command.stop!r} with {len(self._value(pose))}; name a part of the "
-                    "state with these, in this order"
+                    f"state with these numbers, in this order"
                 )

@@ -1,4 +1,6 @@
-"""LeRobot's robots by name: one that registers itself, and its SO-101 on a bus without hardware."""
+"""Tests of LeRobot's robots by name: a robot that registers itself, and LeRobot's SO-101 on a bus
+without hardware.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from vlagents_ray_robot import lerobot_robot
 from vlagents_ray_robot.check import examine
 from vlagents_ray_robot.mujoco_arm import SimulatedClock
 
-SPEED = 90.0  # deg/s of the motors
+SPEED = 90.0  # speed of the motors, deg/s
 CLOCK = SimulatedClock()
 
 
@@ -84,7 +86,7 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
         "gripper",
     ]
     assert arm.contract.state["joints"].unit == "deg"
-    half = 360 * 2047 / 4095 / 2  # of the calibrated range
+    half = 360 * 2047 / 4095 / 2  # % of the calibrated range
     np.testing.assert_allclose(arm.joint_limits, [*[(-half, half)] * 5, (0, 100)])
     arm.apply(np.arange(6, dtype=np.float32))
     CLOCK.sleep(1.0)

@@ -1,8 +1,8 @@
-"""A robot behind topics of a real ROS 2: rclpy and its middleware, with a driver that knows nothing
-of this package.
+"""Tests of a robot behind topics of a real ROS 2 (rclpy and its middleware), with a driver that
+does not use this package.
 
-If ROSBRIDGE_URL names a rosbridge_server of the same ROS_DOMAIN_ID, the tests run through it as
-well.
+If ROSBRIDGE_URL names a rosbridge_server with the same ROS_DOMAIN_ID, the tests also run through
+that server.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from vlagents_ray_robot.ros.links import Ros2
 from vlagents_ray_robot.ros.robot import settings_from
 
 pytestmark = [
-    # Of a parser that rclpy imports.
+    # The warning is of a parser that rclpy imports.
     pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"),
-    # Of rclpy's own, of logging.
+    # The warning is of rclpy itself, about logging.
     pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning"),
 ]
 
@@ -53,7 +53,9 @@ each_link = pytest.mark.parametrize(
 
 
 class Driver:
-    """A node of ROS 2 that publishes what the arm says, and notes what is published to it."""
+    """A node of ROS 2 that publishes the arm's messages, and records the messages that are
+    published to it.
+    """
 
     def __init__(self) -> None:
         self.came: dict[str, list[Any]] = {}
@@ -62,13 +64,14 @@ class Driver:
         self.node = rclpy.create_node("driver", context=self._context)
         self._publishers = {
             CAMERA: self.node.create_publisher(Image, CAMERA, qos_profile_sensor_data),
-            JOINTS: self.node.create_publisher(JointState, JOINTS, 10),  # reliable
+            # This publisher is reliable.
+            JOINTS: self.node.create_publisher(JointState, JOINTS, 10),
         }
         self._executor = SingleThreadedExecutor(context=self._context)
         self._thread = threading.Thread(target=self._spin)
 
     def note(self, kind: type[Any], topic: str) -> None:
-        """Note what is published on a topic."""
+        """Record the messages that are published on a topic."""
         came = self.came.setdefault(topic, [])
         self.node.create_subscription(
             kind, topic, came.append, QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
@@ -105,7 +108,7 @@ class Driver:
 
 
 class Ahead(Agent):
-    """Single rows that lead from the measured pose by STEP."""
+    """Returns single rows that are STEP beyond the measured pose."""
 
     contract = Contract(
         {"front": CameraSpec(ros_arm.SIDE, ros_arm.SIDE)},
@@ -185,7 +188,7 @@ def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver, link: s
         action = np.array([0.1, 0.2, 0.3, 0.4, 0.5], np.float32)
 
         def came(topic: str) -> Any:
-            # Until both nodes have found each other.
+            # The command is repeated until both nodes have discovered each other.
             wait_for(lambda: robot.apply(action) or driver.came[topic])
             return driver.came[topic][-1]
 
