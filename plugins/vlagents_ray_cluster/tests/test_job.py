@@ -1,5 +1,5 @@
-"""A job in Slurm: what it makes of Slurm's variables, when it ends, and how its server says that
-it can be reached.
+"""Tests of a job in Slurm: its use of Slurm's variables, its end, and the connection info of its
+server.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ENVIRONMENT = {
 
 
 def options(**more: str) -> dict[str, str]:
-    """Of `ray start`, by name."""
+    """Return the options of `ray start` by name."""
     words = Allocation.here(ENVIRONMENT | more).ray_start("10.0.0.5", "/tmp/x")
     assert words[:2] == ["ray", "start"]
     return dict(word.removeprefix("--").partition("=")[::2] for word in words[2:])

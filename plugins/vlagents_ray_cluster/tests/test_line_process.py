@@ -1,4 +1,4 @@
-"""The line protocol between a benchmark and its processes."""
+"""Tests of the line protocol between a benchmark and its processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The script of a job under signals, with programs in place of Slurm's and of Python."""
+"""Tests of the script of a job that receives signals, with fake programs in place of Slurm's and of
+Python.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from eval_fakes import wait_for
 
 from vlagents_ray_cluster.slurm.submission import BODY
 
-# The job's Python: finds the address, or is the command, which writes its results once it has been
-# told to end.
+# The fake Python of the job prints the address, or acts as the command, which writes its results
+# after a signal.
 PYTHON = """#!/bin/bash
 case "$*" in
   *address) echo 127.0.0.1:1 ;;
@@ -50,8 +52,8 @@ arguments=(eval)
 def test_a_job_ends_after_its_command_however_many_signals_it_gets(
     signals: int, status: int, tmp_path: Path
 ) -> None:
-    """Slurm sends one before the time limit, one at it, and one when somebody cancels the job
-    meanwhile.
+    """Slurm sends a signal before the time limit, another at the limit, and one if the job is
+    cancelled.
     """
     (tmp_path / "bin").mkdir()
     for name, text in {"python": PYTHON, "srun": SRUN, "scancel": SCANCEL}.items():
@@ -70,7 +72,8 @@ def test_a_job_ends_after_its_command_however_many_signals_it_gets(
         wait_for((tmp_path / "running").exists)
         wait_for((tmp_path / "ray.pid").exists)
         arrived = tmp_path / "signals"
-        for number in range(1, signals + 1):  # one after the other: equal signals that wait are one
+        # Signals are sent one after another, since equal pending signals are merged.
+        for number in range(1, signals + 1):
             os.killpg(job.pid, signal.SIGTERM)
             wait_for(lambda sent=number: arrived.exists() and len(arrived.read_text()) == sent)  # type: ignore[misc]
         assert job.poll() is None

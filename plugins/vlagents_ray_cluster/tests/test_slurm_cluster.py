@@ -1,4 +1,4 @@
-"""A real Slurm with two nodes: jobs that are cancelled, run out of time, and serve."""
+"""Tests with a real Slurm with two nodes: jobs that are cancelled, run out of time, and serve."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def slurm() -> Iterator[Slurm]:
 
 
 def command(folder: Path, *more: str) -> list[str]:
-    """An evaluation of twelve episodes on both nodes; the two with seeds 6 and 7 wait for
-    `folder/open`.
+    """Return the command of an evaluation of twelve episodes on both nodes; the episodes with seeds
+    6 and 7 wait for `folder/open`.
     """
     words = [
         "slurm",
@@ -64,7 +64,7 @@ def command(folder: Path, *more: str) -> list[str]:
 
 
 def episodes(folder: Path) -> list[tuple[int, int]]:
-    """(episode, run) of all that is recorded."""
+    """Return (episode, run) of each recorded episode."""
     file = folder / "out" / "results.db"
     if not file.exists():
         return []
@@ -75,7 +75,7 @@ def episodes(folder: Path) -> list[tuple[int, int]]:
 
 
 def held(folder: Path) -> bool:
-    """Are both episodes that wait under way?"""
+    """Return whether both waiting episodes are running."""
     return all(any(folder.glob(f"*-{seed}")) for seed in (6, 7))
 
 
@@ -110,7 +110,7 @@ def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(
     slurm: Slurm, tmp_path: Path
 ) -> None:
     (tmp_path / "open").touch()
-    # It has a second: no episode is begun.
+    # The job has one second, in which no episode begins.
     job = slurm.vlagents_ray(
         *command(tmp_path, "--nodes=1", "--time=10", "--closing-s=599", "--resubmit=5")
     ).strip()

@@ -1,4 +1,4 @@
-"""`vlagents-ray slurm`: what becomes of its words."""
+"""Tests of the arguments of `vlagents-ray slurm`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def script(*words: str) -> str:
 
 
 def arguments(*words: str) -> list[str]:
-    """What the job's first node is told to do."""
+    """Return the arguments of the program on the job's first node."""
     match = re.search(r"^arguments=\((.*)\)$", script(*words), re.MULTILINE)
     assert match is not None
     return shlex.split(match[1])

@@ -1,4 +1,4 @@
-"""Which words of a command line are sbatch's, and the script that it gets."""
+"""Tests of which arguments of a command line are passed to sbatch, and of the script."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_no_name_path_or_option_becomes_a_command(
 ) -> None:
     try:
         text = Script(name, Path(folder), arguments, {"comment": option}).text()
-    except (ConfigError, ValueError):  # a path with a NUL
+    except (ConfigError, ValueError):  # a path with a NUL character
         return
     head = text.removesuffix(BODY.read_text()).encode(errors="surrogateescape")
     commands = [

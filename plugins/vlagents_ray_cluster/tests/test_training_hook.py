@@ -1,4 +1,4 @@
-"""The call of a training script."""
+"""Tests of the hook that a training script calls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ echo 77
 
 @pytest.fixture
 def python(tmp_path: Path) -> Path:
-    """In place of the one that has the command; notes what it was called with."""
+    """Return a fake Python interpreter, which records its arguments."""
     file = tmp_path / "python"
     file.write_text(PYTHON.format(folder=tmp_path))
     file.chmod(0o755)
@@ -101,7 +101,7 @@ def call_for(folder: Path, step: int = 20) -> str | None:
 
 @pytest.fixture
 def claimed(tmp_path: Path, python: Path) -> Path:
-    """The claim of a training that was killed before its submission had an answer."""
+    """Return the claim of a training that was killed before its submission was answered."""
     assert call_for(tmp_path) == "77"
     [mark] = (tmp_path / "record").iterdir()
     claim = json.loads(mark.read_text())
@@ -115,7 +115,7 @@ def claimed(tmp_path: Path, python: Path) -> Path:
 def test_a_claim_without_a_job_holds_for_as_long_as_a_submission_may_take(
     claimed: Path, empty: bool, age_s: float, jobs: list[str]
 ) -> None:
-    if empty:  # killed before anything was written
+    if empty:  # the process was killed before it wrote the claim
         claimed.write_text("")
     then = time.time() - age_s
     os.utime(claimed, (then, then))

@@ -1,5 +1,5 @@
-"""`vlagents-ray tune` prints the settings of a file to change, with the figures that they were
-chosen by.
+"""Tests that `vlagents-ray tune` prints the settings of a file to change, and the figures by which
+they were chosen.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def printed_settings(output: str) -> dict[str, Any]:
-    """Return the YAML at the end of the output, after the line that says where it belongs."""
+    """Return the YAML at the end of the output, after the line that names its place in the file."""
     settings: dict[str, Any] = yaml.safe_load(re.split(r"\nset .*:\n", output)[1])
     return settings
 

@@ -1,4 +1,4 @@
-"""Variants of a policy, measured in separate processes."""
+"""Tests of variants of a policy, which are measured in separate processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def tuner(policy: str = "Tunable", *, batch: dict[str, Any] | None = None, **options: Any) -> Tuner:
-    """A quick tuner; options are fields of the plan, or else settings of the policy."""
+    """Return a quick tuner; options are fields of the plan, or otherwise settings of the policy."""
     plan: dict[str, Any] = {"goal": TuningGoal("throughput"), "max_batch": 2, "seconds": 0.1}
     config = {}
     for name, value in options.items():
@@ -101,7 +101,7 @@ def test_variants_that_cannot_be_loaded_leave_the_file_as_it_is() -> None:
     measured = tuner(compiles=False, dtypes=["bfloat16"])
     names = [point.variant.name for point in measured.measure()]
     assert set(names) == {"own settings", "dtype: bfloat16"}
-    # Nor any with both.
+    # Variants with both changes are not measured either.
     assert measured.left_out == ["compile: true: ConfigError: compile: this one has no compiler"]
 
 
@@ -152,7 +152,7 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
 def test_other_modes_of_compilation_are_tried_unless_the_file_compiles(
     file_mode: Any, modes: list[Any], tried: list[Any]
 ) -> None:
-    sizes = [1, 2, 4, 8] if file_mode else None  # by default
+    sizes = [1, 2, 4, 8] if file_mode else None  # the default
     settings = {"compile": file_mode, "batch_sizes": sizes}
     ready = {"settings": settings, "dtypes": [], "modes": modes}
 

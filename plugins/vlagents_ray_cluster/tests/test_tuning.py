@@ -1,4 +1,6 @@
-"""What `tune` measures on, how far actions may differ, and what it chooses from given figures."""
+"""Tests of the observations with which `tune` measures, the tolerance of actions, and its choice
+from given figures.
+"""
 
 from __future__ import annotations
 
@@ -143,7 +145,7 @@ def test_for_robots_the_most_sessions_within_the_time_are_chosen() -> None:
         point(COMPILED, 2, 50, 40),
     ]
     assert choose(points[:3], goal) == points[1]
-    assert choose(points, goal) == points[3]  # as many, with shorter round trips
+    assert choose(points, goal) == points[3]  # serves as many robots, with shorter round trips
     more = point(COMPILED, 4, 80, 60)
     assert choose([*points, more], goal) == more
 

@@ -1,4 +1,6 @@
-"""Commands from the live page to sessions: who may give them, and what becomes of them."""
+"""Tests of commands from the live page to sessions: the permissions of callers, and the
+outcomes.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,7 @@ class Board:
         return str(self.board.press("arm", do, "lab")["id"])
 
     def answered(self, **info: Any) -> dict[str, Any] | None:
-        """Answer a request that says this, and return the command in the answer."""
+        """Answer a request with this info, and return the command in the answer."""
         self.board.read_outcomes("arm", Request("act", Obs(info=info)))
         reply = Reply(act=Act(np.zeros(2, np.float32)))
         self.board.send("arm", reply)
@@ -84,7 +86,7 @@ def test_a_robot_that_does_not_answer_ignores_it(board: Board) -> None:
     for _ in range(4):
         board.answered()
     assert board.states == ["ignored"]
-    board.answered(**{COMMANDED: {pressed: ""}})  # it was only slow
+    board.answered(**{COMMANDED: {pressed: ""}})  # the robot was only slow
     assert board.states == ["done"]
 
 
@@ -139,7 +141,7 @@ def post(
 
 
 class Arm:
-    """A robot that counts what it is told to do."""
+    """A robot that counts its actions and stops."""
 
     simulated = True
 
@@ -159,7 +161,9 @@ class Arm:
 
 @contextmanager
 def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str, list[LoopReport]]]:
-    """A robot that is driven over the server; with the name of its session."""
+    """Yield a robot that the server controls, the name of its session, and the reports of its
+    loop.
+    """
     arm, over, reports = Arm(), threading.Event(), []
     commands = CommandInbox() if obeys else None
     with RemoteAgent(server.url, commands=commands) as agent:
@@ -218,7 +222,7 @@ def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(
             status, said = post(server, {"session": session, "do": do, "text": "go on"})
             assert (status, "at the robot" in said["detail"]) == (400, True)
         steps = server.engine.sessions.get(session).steps
-        # The policy continues.
+        # The policy continues to answer.
         wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)
         assert (arm.applied, reports) == (applied, [])
 
@@ -234,7 +238,7 @@ def test_a_marked_episode_ends_the_robots_command(
     [session] = server.engine.sessions.ids()
     assert post(server, {"session": session, "do": "failure"})[0] == 200
     thread.join(30)
-    assert status in ([0], [1])  # safe actions while it connected
+    assert status in ([0], [1])  # the status is 1 if safe actions were used while it connected
     assert "marked as a failure" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""The live page of an evaluation and of a training, in a browser."""
+"""Tests of the live page of an evaluation and of a training, in a browser."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ PLAYING = (
 )
 UNFOLD = "document.getElementById('failures').closest('details').open = true"
 SCROLL = "document.getElementById('failures').scrollIntoView()"
-# Videos in view that are still requested: a server that ends before it sent them leaves their files
-# open.
+# Videos in view that are still being requested: a server that ends before it has sent them leaves
+# their files open.
 LOADING = (
     "[...document.querySelectorAll('#failures video:not([src])')].map((one) => "
     "one.getBoundingClientRect()).filter((box) => box.bottom > 0 && box.top < innerHeight).length"
@@ -48,7 +48,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of a policy beside another one, with videos of failures, an error and a lost
+    """A sweep of one policy, and another policy, with videos of failures, an error and a lost
     episode.
     """
     out = tmp_path_factory.mktemp("results") / "sweep"
@@ -60,7 +60,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(
     read: Callable[[], dict[str, Any]], videos: Any = {}.get, keys: Keys | None = None
 ) -> Iterator[str]:
-    """The address of the page of such a document."""
+    """Yield the address of the page of this document."""
     with page_server(
         Fleet(None, extra=read), ("127.0.0.1", 0), keys, name="eval", videos=videos
     ) as url:
@@ -69,7 +69,7 @@ def served(
 
 def show(page: Page, url: str, *, width: int = 1400, scheme: str = "light") -> None:
     page.open(Address("about:blank"), width=width, scheme=scheme)  # type: ignore[arg-type]
-    page.said.clear()  # of the page before, whose server has ended
+    page.said.clear()  # messages of the previous page, whose server has ended
     page.asked.clear()
     page.open(Address(url), width=width, scheme=scheme)  # type: ignore[arg-type]
 
@@ -79,7 +79,7 @@ def until(page: Page, expression: str, want: object) -> None:
 
 
 def begun(out: Path, **options: bool) -> ProgressDocument:
-    """An evaluation that runs."""
+    """Return the document of a running evaluation."""
     document = ProgressDocument(out, **options)
     planned = plan_cases(runs(out, episodes=5))
     document.begin(planned, {}, sum(case.planned for case in planned))
@@ -116,7 +116,7 @@ def test_cases_fill_with_their_intervals_and_failures_come_with_video(
         )
         page.value(UNFOLD)
         page.value(SCROLL)
-        until(page, f"{PLAYING} >= 1", want=True)  # those that can be seen
+        until(page, f"{PLAYING} >= 1", want=True)  # the videos in view
         until(page, LOADING, 0)
         controls = (
             "((video) => { const before = video.controls; video.click(); return [before, "
@@ -130,7 +130,7 @@ def test_cases_fill_with_their_intervals_and_failures_come_with_video(
         text = page.value("document.getElementById('failures').innerText")
         assert "lost to infrastructure" in text
         assert "error of the policy" in text
-        assert "policy_failed: </script><img" in text  # as text
+        assert "policy_failed: </script><img" in text  # shown as text
         until(page, POINTS, 2)
         assert "learner: " in page.value(
             "document.getElementById('curve').getAttribute('aria-label')"

@@ -1,4 +1,4 @@
-"""The snapshots of several replicas, gathered for several viewers."""
+"""Tests of the snapshots of several replicas, gathered for several viewers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vlagents_ray_live.live_view import (
 
 
 class Others:
-    """Other replicas: each with one session, which shows one picture."""
+    """Other replicas, each with one session with one picture."""
 
     def __init__(self, *names: str) -> None:
         self.names = list(names)

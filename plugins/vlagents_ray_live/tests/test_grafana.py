@@ -1,5 +1,5 @@
-"""The Grafana dashboard in cluster/grafana: it asks for what a server exports, and leaves
-nothing of that out.
+"""Tests that the Grafana dashboard in cluster/grafana queries all series of a server, and no
+others.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SUFFIXES = {"Counter": ("_total",), "Gauge": ("",), "Histogram": ("_bucket", "_s
 
 
 class Series(NamedTuple):
-    """What Prometheus reads of one metric."""
+    """A series of a metric, as Prometheus reads it."""
 
     metric: str
     labels: set[str]
@@ -38,7 +38,7 @@ class Series(NamedTuple):
 
 @pytest.fixture(scope="module")
 def exported() -> dict[str, Series]:
-    """The series that a replica and its parts declare, by the name that Prometheus reads."""
+    """Return the series that a replica and its parts declare, by the name that Prometheus reads."""
     series = {}
 
     def declared(kind: str) -> Any:
@@ -56,7 +56,7 @@ def exported() -> dict[str, Series]:
     with pytest.MonkeyPatch.context() as patch:
         for kind in SUFFIXES:
             patch.setattr(metrics, kind, declared(kind))
-            for part in (recording, weights_part):  # each has some of the kinds
+            for part in (recording, weights_part):  # each part uses some of the kinds
                 patch.setattr(part, kind, declared(kind), raising=False)
         engine = Engine(Agent())
         tags = dict.fromkeys(TAGS, "x")
@@ -69,7 +69,9 @@ def exported() -> dict[str, Series]:
 
 
 def queries() -> list[tuple[str, str]]:
-    """Expression and legend of every line of the dashboard, and the query of its variable."""
+    """Return the expression and legend of every line of the dashboard, and the query of its
+    variable.
+    """
     lines = [
         (target["expr"], target["legendFormat"])
         for panel in DASHBOARD["panels"]
@@ -84,7 +86,7 @@ def queries() -> list[tuple[str, str]]:
 
 
 def names(expression: str) -> set[str]:
-    """The series that an expression names."""
+    """Return the series that an expression names."""
     return set(re.findall(r"\bray_\w+", expression))
 
 
@@ -118,8 +120,8 @@ def test_an_alert_in_the_documentation_names_series_and_labels_that_the_server_e
 
 
 def test_no_increase_is_computed_of_a_counter_that_begins_with_its_first_event() -> None:
-    """The series of a rare event has no earlier value, so the first event is no increase. A replica
-    whose policy hung is replaced, so there is no second one.
+    """A series that begins with the first event has no earlier value, so this event is no increase.
+    A replica whose policy hung is replaced, so no second event follows.
     """
     expressions = [expression for expression, _ in queries()]
     expressions += re.findall(r"`(\w+\([^`]*ray_vlagents[^`]*)`", MONITORING)
@@ -144,7 +146,9 @@ def test_every_metric_of_the_server_is_on_the_dashboard_and_in_the_documentation
 
 
 def test_no_series_has_a_label_for_each_session(exported: dict[str, Series]) -> None:
-    """The values of each label but the replica's own are words of the code."""
+    """The values of each label, except those that identify the replica, are constants of the
+    code.
+    """
     words = {"op", "transport", "priority", "model", "code", "stage", "kind", "outcome", "le"}
     labels = set().union(*(series.labels for series in exported.values()))
     assert labels - set(TAGS) <= words

@@ -1,5 +1,5 @@
-"""What is kept for viewers while somebody looks, and the memory and the disk that clients can
-take by it.
+"""Tests of the data that are kept for viewers while there are any, and of the memory and disk that
+clients can use in this way.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def observe(
     )
     pending.files = files or {}
     observer.on_request(pending)
-    request.obs = None  # as the engine does once the policy has acted
+    request.obs = None  # the engine does this once the policy has acted
     observer.before_answer(pending, reply)
     observer.on_answer(pending, reply)
 
 
 class Watched:
-    """A live observer at a clock that stands, and the engine's watchers."""
+    """A live observer with a clock that stands still, and the engine's observers."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -155,11 +155,11 @@ def test_sessions_that_ended_are_forgotten(watched: Watched) -> None:
     assert watched.live.observation("b") is not None
 
 
-# Bounds.
+# Limits
 
-LARGE = 2**20  # bytes of one part of a message; a server accepts up to 64 MiB
-BUDGET = 2**21  # budget of each kind of what is kept
-SLACK = 2**20  # bytes of everything besides
+LARGE = 2**20  # size of a part of a message, bytes; a server accepts up to 64 MiB
+BUDGET = 2**21  # limit of each kind of kept data, bytes
+SLACK = 2**20  # allowance for all other memory, bytes
 
 ObsAndReply = tuple[Obs, Reply]
 
@@ -194,7 +194,7 @@ MESSAGES: dict[str, Callable[[], ObsAndReply]] = {
 
 
 class Kept:
-    """The bytes of Python's and numpy's memory that are held now beyond those at its beginning."""
+    """Measures how much the memory of Python and numpy has grown since the context began, bytes."""
 
     def __enter__(self) -> Kept:
         gc.collect()
@@ -236,7 +236,7 @@ def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_obse
             if number % 20 == 0 and (seen := watched.observation(f"key/{number}")) is not None:
                 seen.pictures()
         assert kept.bytes() < 1.5 * BUDGET + SLACK
-        assert watched.answers(0)[-1].size < 2**17  # of each answer something is kept
+        assert watched.answers(0)[-1].size < 2**17  # a part of each answer is kept
         clock.now += 10.0
         watched.expire()
         del seen
@@ -286,12 +286,12 @@ def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.Monke
         found = view.read(0, names)
         assert 0 < sum(map(len, found.files)) <= BUDGET
         pictured |= {one["id"] for one in found.document["sessions"] if one["pictures"]}
-    assert pictured == set(names)  # in turns
+    assert pictured == set(names)  # pictures are sent in turns
     view.close()
 
 
 class Tracer:
-    """OpenTelemetry that is never asked for a span."""
+    """A tracer that is never called."""
 
 
 @pytest.mark.library("opentelemetry")
@@ -344,7 +344,7 @@ def test_the_ring_holds_no_more_than_its_memory(tmp_path: Path, kind: str) -> No
             send(held.watched, "s", MESSAGES[kind]())
             held.ring.read()
             held.clock.now += 1.05 / live.RATE
-        # The ring, and the last observation that the live observer keeps.
+        # The ring's frames, and the last observation in the live observer.
         assert kept.bytes() < 2e6 + 2 * LARGE + SLACK
         assert held.ring.bytes <= 2e6
 
@@ -353,7 +353,8 @@ def test_a_save_decodes_one_frame_at_a_time(saves: Saves) -> None:
     tracemalloc.start()
     try:
         saves.ring.save("s")
-        assert tracemalloc.get_traced_memory()[1] < 4 * 3 * 2**20  # a few pictures of the twelve
+        # The memory of a few of the twelve pictures.
+        assert tracemalloc.get_traced_memory()[1] < 4 * 3 * 2**20
     finally:
         tracemalloc.stop()
 
@@ -391,7 +392,7 @@ def test_a_save_that_fails_leaves_no_files_and_the_next_one_works(
     decode, files = ring.decode, iter(range(100))
 
     def fails(file: bytes, most: int) -> np.ndarray:
-        return decode(file, most if next(files) < 4 else 0)  # of the fourth frame
+        return decode(file, most if next(files) < 4 else 0)  # fails at the fourth frame
 
     monkeypatch.setattr(ring, "decode", fails)
     with pytest.raises(MessageTooLarge):

@@ -1,4 +1,6 @@
-"""The live page's data: who gets it, and that it is what the policy got and answered."""
+"""Tests of the live page's data: the permissions of viewers, and that the data equal the policy's
+inputs and answers.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ IMAGE = RNG.integers(0, 255, (16, 24, 3), np.uint8)
 
 
 class Explains(Agent):
-    """Answers with a chunk, and says things of it."""
+    """Answers with a chunk and further info."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         return {}
@@ -87,7 +89,8 @@ def test_a_viewer_sees_what_the_policy_got_and_answered(server: LiveServer, code
         while "act" not in found or "picture" not in found:
             agent.act(obs)
             document, files = ask(viewer, [] if session is None else [session])
-            replica = document["replicas"][-1]  # a viewer that was slow gets several of one
+            # A slow viewer gets several documents of the same replica.
+            replica = document["replicas"][-1]
             for one in [one for each in document["replicas"] for one in each["sessions"]]:
                 session = one["id"]
                 assert one["instruction"] == "stack the cubes"
@@ -101,7 +104,8 @@ def test_a_viewer_sees_what_the_policy_got_and_answered(server: LiveServer, code
         assert act["info"] == {"subtask": "grasp", "uncertainty": 0.25, "nothing": None}
         assert set(act["ms"]) >= {"decode_ms", "queue_ms", "inference_ms", "total_ms"}
         assert found["state"] == {"joints": [0, 1, 2], "gripper": [0.5]}
-        sent = JPEG.file(IMAGE)  # both ways: the client's file, or one made of its pixels
+        # The same file, whether the client sent it or it was encoded from the pixels.
+        sent = JPEG.file(IMAGE)
         assert found["picture"] == sent
         assert np.abs(decode(sent, 10**6).astype(int) - IMAGE).mean() < 60
         assert (replica["name"], replica["policy"], replica["ready"]) == ("this", "noop", True)
@@ -136,7 +140,7 @@ def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
         assert server.engine.observers.any
-        # Without a WebSocket.
+        # The data are also available without a WebSocket.
         status, text, _ = get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})
         assert (status, json.loads(text)["replicas"][0]["waiting"]) == (
             200,
@@ -192,10 +196,10 @@ def test_a_viewer_who_asks_for_nothing_is_let_go(
     "headers",
     [
         {"origin": "http://evil.example"},
-        # As an image: without an origin.
+        # The browser requests the address as an image, without an origin.
         {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},
         {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
-        {"sec-fetch-site": "same-site"},  # another port of this machine
+        {"sec-fetch-site": "same-site"},  # the request is from another port of this machine
     ],
 )
 def test_another_sites_page_sees_nothing_and_does_not_start_the_observer(
@@ -236,7 +240,7 @@ def test_a_key_wants_the_scope(keys: ChangingKeys) -> None:
             while True:
                 said = viewer.recv(10)
                 if not said.startswith(b"{"):
-                    read_message(said)  # it was on its way
+                    read_message(said)  # the message had already been sent
                     viewer.send(b'{"shown": []}', 10)
                     continue
                 assert isinstance(read_error(json.loads(said)), Forbidden)
@@ -276,7 +280,7 @@ def test_viewers_end_with_the_server() -> None:
     assert ended.wait(30)
 
 
-# The page of a process that is no replica: where it listens, who may watch, and that it ends.
+# The page of a process that is not a replica: its address, the permissions of viewers, and its end.
 
 
 def fleet() -> Fleet:

@@ -1,4 +1,4 @@
-"""The live page in a browser."""
+"""Tests of the live page in a browser."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def show(
 
 
 def until(page: Page, expression: str, want: object) -> None:
-    """Wait until the page says so."""
+    """Wait until the expression has this value."""
     wait_for(lambda: page.value(expression) == want, 30)
 
 
@@ -65,7 +65,7 @@ def until(page: Page, expression: str, want: object) -> None:
 def acting(
     server: LiveServer, number: int, priority: PriorityName = "robot", key: str | None = None
 ) -> Iterator[None]:
-    """So many robots or simulations that act until the end of the context."""
+    """Run this number of robots or simulations until the end of the context."""
     over = threading.Event()
 
     def act(index: int) -> None:
@@ -110,7 +110,7 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
     with acting(server, 1):
         show(page, server)
         until(page, PICTURES, 1)
-        # state, gripper and plan.
+        # The plots show state, gripper and plan.
         until(page, "document.querySelectorAll('article polyline').length >= 15", True)
         text = page.value("document.querySelector('article').innerText")
         assert "push cube 0" in text
@@ -128,7 +128,7 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
         assert "plan: 8 rows" in text
         assert page.value("document.querySelectorAll('#fleet tr').length") == 1
         until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
-    until(page, CARDS, 0)  # it ended
+    until(page, CARDS, 0)  # the session has ended
 
 
 class Failing(Agent):
@@ -173,7 +173,7 @@ PRESS = (
 def operated(
     server: LiveServer, key: str | None = None, cameras: int = 0
 ) -> Iterator[list[LoopReport]]:
-    """A simulated robot that obeys the page."""
+    """Yield the reports of a simulated robot that executes commands of the page."""
     specs = {f"camera{number}": CameraSpec(480, 480) for number in range(cameras)}
     commands, over, reports = CommandInbox(), threading.Event(), []
     with RemoteAgent(server.url, api_key=key, commands=commands) as agent:
@@ -353,7 +353,7 @@ VALUES = [None, True, -1, 1e300, "", "text", [], [None], [[None]], ["text"], {},
 
 
 def every_place(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """The path of each value of a document, of lists the first ones."""
+    """Yield the path of each value of a document, for lists only of the first element."""
     if path:
         yield path
     parts = (

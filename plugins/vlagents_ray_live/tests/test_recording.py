@@ -1,4 +1,4 @@
-"""What a server keeps of its sessions, whatever becomes of the disk or of its memory."""
+"""Tests of the recording of sessions, also when the disk or the memory is full."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_each_act_is_a_frame_with_its_whole_chunk(tmp_path: Path) -> None:
         {"seed": 7},
         *[None] * 4,
     ]
-    acting = {"weights": "sampled-sha256:9f2c", "revision": "c0ffee"}  # in this episode
+    acting = {"weights": "sampled-sha256:9f2c", "revision": "c0ffee"}  # the weights of this episode
     assert [from_text(text, budget) if text else None for text in frames["weights"]] == [
         acting,
         *[None] * 4,
@@ -96,7 +96,7 @@ def test_an_observation_is_copied_before_its_answer_is_kept(tmp_path: Path) -> N
         obs = seen(3)
         robot.act(obs)
         wait_for(server.recorder._copier._calls.empty)
-        obs.cameras["front"][:] = 0  # its memory is the client's again
+        obs.cameras["front"][:] = 0  # the client may change its memory again
         obs.state["joints"][:] = 9
     assert rows(only(tmp_path))["observation.state"][1] == [3, -3, 0.5]
 
@@ -211,7 +211,7 @@ def test_an_observation_that_cannot_be_kept_is_a_gap(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
         robot = server.robot()
         robot.play(1)
-        # As only a caller in this process may send it.
+        # Only a caller in this process can send such an observation.
         robot.act(replace(seen(1), info={"object": object()}))
         robot.act(seen(2))
     assert rows(only(tmp_path))["tick"] == [0, 2]
@@ -250,7 +250,8 @@ def test_requests_that_wait_are_bounded(
             server.recorder.on_request(one)
         assert [bool(one.observer_data) for one in waiting] == kept
         del one, waiting
-        wait_for(lambda: server.recorder._held == 0)  # nobody waits for them any more
+        # The memory is freed, as no thread needs it any more.
+        wait_for(lambda: server.recorder._held == 0)
 
 
 def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) -> None:

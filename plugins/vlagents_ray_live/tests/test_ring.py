@@ -1,4 +1,4 @@
-"""The last seconds of each session, and the episodes that are made of them."""
+"""Tests of the last seconds of each session, and of the episodes that are saved from them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IMAGE = np.random.default_rng(0).integers(0, 255, (64, 96, 3), np.uint8)
 
 
 class Counts(Agent):
-    """Chunks whose first row is the number of the act."""
+    """Returns chunks whose first row is the number of the act."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         self.acts = 0
@@ -50,7 +50,7 @@ def ring_of(server: LiveServer) -> Ring:
 
 
 def drive(agent: RemoteAgent, acts: int) -> str:
-    """Act for so many tenths of a second."""
+    """Request this number of actions, one every 0.11 s."""
     obs = Obs({"front": IMAGE}, 0.5, {"joints": np.arange(3, dtype=np.float32)})
     agent.reset(obs, "stack the cups")
     for number in range(acts):
@@ -61,7 +61,7 @@ def drive(agent: RemoteAgent, acts: int) -> str:
 
 
 def pressed(server: LiveServer, session: str) -> dict[str, str]:
-    """Press "save", and return what became of it."""
+    """Press "save", and return the outcome."""
     server.view.press(session, "save", "lab")
     wait_for(lambda: server.view.commands.describe(session)[-1]["state"] in ("done", "refused"), 60)
     found: dict[str, str] = server.view.commands.describe(session)[-1]
@@ -88,7 +88,7 @@ def test_a_press_makes_an_episode(server: LiveServer, settings: LiveConfig, code
     first = [row for row in rows if row["episode_index"] == 0]
     assert len(first) >= 4
     for row in first:
-        # the observation with the number n was answered with n + 1
+        # The answer to the observation with the number n is n + 1.
         assert row["action"] == [row["observation.state"][0] + 1] * 2
         assert row["observation.state"][3] == pytest.approx(0.5)
     times = [row["captured_at"] for row in first]
@@ -106,7 +106,7 @@ def test_the_oldest_goes_first_when_the_memory_is_full(tmp_path: Path) -> None:
             kept = [frame.action[0] for frame in ring._frames[session]]
             assert kept == sorted(kept)
             assert kept[0] > 1
-        wait_for(lambda: ring.bytes == 0, 30)  # the session ended
+        wait_for(lambda: ring.bytes == 0, 30)  # the session has ended
 
 
 def test_old_frames_are_dropped(tmp_path: Path) -> None:
@@ -123,7 +123,9 @@ def test_old_frames_are_dropped(tmp_path: Path) -> None:
 def test_where_nothing_can_be_saved_a_press_says_why(
     tmp_path: Path, settings: str | None, why: str
 ) -> None:
-    """Without the setting nothing is held either; a file cannot be a folder."""
+    """Without the setting no frames are kept; with it, the folder is a file, so nothing can be
+    saved.
+    """
     (tmp_path / "file").write_text("")
     args = None if settings is None else LiveConfig(folder=str(tmp_path / settings))
     with live_server(Counts(), settings=args) as server, RemoteAgent(server.url) as agent:

@@ -1,4 +1,4 @@
-"""The data of other replicas: their snapshots, and commands to sessions that they have."""
+"""Tests of the data of other replicas: their snapshots, and commands to their sessions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
 
 class Answering:
-    """Another replica, whose live part answers as a test says."""
+    """Another replica, whose live part gives an answer that the test chooses."""
 
     def __init__(self, name: str, answer: Any) -> None:
         self.name = name

@@ -1,4 +1,6 @@
-"""OpenTelemetry spans: one trace of a request from the client's program to the batch."""
+"""Tests of OpenTelemetry spans: one trace contains a request from the client's program to the
+batch.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ OBS = Obs(state={"joints": np.zeros(3, np.float32)})
 
 
 class Picky(Agent):
-    """Fails where an observation asks for it, and says what it got."""
+    """Fails if an observation requests it; otherwise reports whether the observation had a
+    trace.
+    """
 
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
@@ -31,7 +35,7 @@ class Picky(Agent):
 
 @pytest.fixture
 def exporter(monkeypatch: pytest.MonkeyPatch) -> Iterator[InMemorySpanExporter]:
-    """What is exported of a process that traces."""
+    """Yield the exporter of a process that traces."""
     kept = InMemorySpanExporter()
     provider = TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(kept))

@@ -1,1 +1,1 @@
-"""Parts of a server that show and keep its sessions."""
+"""Parts of a server that show and record its sessions."""

@@ -28,14 +28,14 @@ from vlagents_ray.serve.sessions import SessionTable
 logger = logging.getLogger(__name__)
 
 TO_ROBOT = ("pause", "stop", "success", "failure")
-"""The commands that are sent to a robot. None of them makes it move."""
+"""The commands that are sent to a robot. None of them makes the robot move."""
 SAVE = "save"  # the command with which the server saves the session's last seconds
 COMMANDS = (*TO_ROBOT, SAVE)
 
 TRACKED_S = 15.0  # the time for which the outcome of a command is awaited
 _WAITS_S = 5.0  # the time within which a command must reach the robot
-_SHOWN = 5  # the number of commands that are kept and shown for each session, the latest ones
-# The number of requests without the outcome of a command after which it counts as ignored.
+_SHOWN = 5  # the number of the latest commands that are kept and shown for each session
+# The number of requests without the outcome of a command after which the command counts as ignored.
 _UNANSWERED = 3
 _REFUSAL = 200  # maximum length of a reason, characters
 
@@ -44,14 +44,15 @@ State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too 
 
 @dataclass(slots=True)
 class Press:
-    """A command that was given by a button of the page."""
+    """A command that was given with a button of the page."""
 
     id: str
     do: str  # the command, one of `COMMANDS`
     by: str  # the name of the caller's key; empty without keys
-    pressed: float  # s, of the clock of the board
+    pressed: float  # time at which it was pressed, s, of the clock of the board
     state: State = "waiting"
-    why: str = ""  # the reason for a refusal, or the folder into which the session was saved
+    # The reason why the command was rejected, or the folder into which the session was saved.
+    why: str = ""
     requests: int = 0  # the number of the session's requests since the command was sent
 
     def describe(self) -> dict[str, Any]:
@@ -78,7 +79,7 @@ class CommandBoard:
         self._save = save
         self._sessions = sessions
         self._clock = clock
-        self._presses: dict[str, list[Press]] = {}  # by session, oldest first
+        self._presses: dict[str, list[Press]] = {}  # the commands by session, oldest first
         self._lock = threading.Lock()
 
     def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
@@ -104,7 +105,8 @@ class CommandBoard:
             )
         if session_id not in self._sessions:
             raise UnknownSession(
-                f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere"
+                f"session {session_id[:80]!r}: is not at this replica; it has ended, or has moved "
+                f"to another replica"
             )
 
         pressed = Press(uuid.uuid4().hex, do, by, self._clock())
@@ -116,8 +118,8 @@ class CommandBoard:
                 replaced = _replaceable(presses, do)
                 if replaced is None:
                     raise Overloaded(
-                        f"session {session_id!r}: {_SHOWN} commands wait already for its robot's "
-                        "request"
+                        f"session {session_id!r}: {_SHOWN} commands already wait for its robot's "
+                        f"request"
                     )
                 presses.remove(replaced)
             presses.append(pressed)
@@ -133,7 +135,7 @@ class CommandBoard:
         if not presses or request.obs is None:
             return
 
-        # By id of a command: the reason for a refusal, empty for a command that was executed.
+        # By id of a command: the reason for rejecting it; empty if the command was executed.
         outcomes = request.obs.info.get(COMMANDED)
         if not isinstance(outcomes, dict):
             outcomes = {}
@@ -167,8 +169,8 @@ class CommandBoard:
                     return
 
     def describe(self, session_id: str) -> list[dict[str, Any]]:
-        """Describe the last commands to a session, oldest first: `id`, `do`, `by`, `state` and
-        `why` of each.
+        """Return `id`, `do`, `by`, `state` and `why` of each of the last commands to a session,
+        oldest first.
         """
         with self._lock:
             presses = self._presses.get(session_id, [])
@@ -207,7 +209,7 @@ def _replaceable(presses: Collection[Press], do: str) -> Press | None:
     for press in presses:
         if press.state not in ("waiting", "saving"):
             return press
-    if do == "stop":  # it is more important than the others
+    if do == "stop":  # a stop is more important than the other commands
         for press in presses:
             if press.state == "waiting" and press.do != "stop":
                 return press

@@ -23,12 +23,13 @@ from vlagents_ray.interface import Obs
 
 logger = logging.getLogger(__name__)
 
-# Maximum number of frames of an episode, whose numbers are in memory; then another episode begins.
+# Maximum number of frames of an episode, whose numbers are kept in memory; beyond it, another
+# episode begins.
 _FRAMES = 2000
-_BYTES = 16 * 2**20  # maximum size of the numbers of an episode
+_BYTES = 16 * 2**20  # maximum size of the numbers of an episode, bytes
 # Maximum number of sessions that are recorded at the same time; each has an encoder per camera.
 _SESSIONS = 32
-_FREE_BYTES = 2**30  # the space that the recording leaves free on its disk
+_FREE_BYTES = 2**30  # the space that the recording leaves free on its disk, bytes
 _CHECK_S = 10.0  # the interval of the checks of the folder's size
 # The keys of the metadata that a trace contains.
 _TRACE_KEYS = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")
@@ -44,7 +45,7 @@ class RecordedAct:
 
     obs: Obs
     chunk: np.ndarray  # (H, D) float32
-    captured_at: float  # s since 1970
+    captured_at: float  # capture time, s since 1970
     tick: int  # the number of the session's action requests since its reset
     columns: Mapping[str, Any]  # see `RunningEpisode.add`
 
@@ -63,7 +64,7 @@ class _Target:
 
     dataset: Dataset
     shapes: tuple[Any, ...]
-    rows: int  # the number of rows of `CHUNK`
+    rows: int  # the number of rows of the feature `CHUNK`
     action_spec: ActionSpec
 
     def fits(self, frame: RecordedAct) -> bool:
@@ -77,12 +78,13 @@ class _RecordedSession:
 
     number: int  # the number of the session, the same in all its episodes
     instruction: str
-    reset: str  # the options of the reset, as text; empty once they are recorded
-    weights: str  # the loaded weights in the reset's info, as text; empty once recorded
+    reset: str  # the options of the reset, as text; empty once they have been recorded
+    # The loaded weights in the reset's info, as text; empty once they have been recorded.
+    weights: str
     target: _Target | None = None  # the dataset of `episode`
     episode: RunningEpisode | None = None  # None before the first frame
     frames: int = 0  # the number of frames of `episode`
-    size: int = 0  # the size of its numbers, bytes
+    size: int = 0  # the size of the episode's numbers, bytes
 
 
 class EpisodeWriter:
@@ -93,12 +95,12 @@ class EpisodeWriter:
 
     Args:
         folder: The folder of the datasets.
-        name: The beginning of their names.
+        name: The beginning of the datasets' names.
         fps: The rate of the frames, from which their timestamps follow, Hz.
         lossless: Whether videos are encoded without loss.
         most_bytes: Maximum size of the folder, beyond which recording ends.
-        describe: Returns the metadata of the policy, for a trace; None if the frames are not a
-            trace.
+        describe: Returns the metadata of the policy, which a trace contains; None if the frames are
+            not a trace.
     """
 
     def __init__(
@@ -170,7 +172,7 @@ class EpisodeWriter:
             "weights": recorded.weights,
             SESSION: recorded.number,
             ROWS: len(frame.chunk),
-            # Repeats the last row.
+            # Shorter chunks are filled with their last row.
             CHUNK: np.pad(frame.chunk, ((0, missing_rows), (0, 0)), mode="edge").ravel(),
         }
         recorded.episode.add(
@@ -184,8 +186,8 @@ class EpisodeWriter:
         recorded.size += columns[CHUNK].nbytes + sum(text_sizes)
 
     def end(self, session: str) -> Path | None:
-        """End the session's episode, and return the folder of the dataset that contains it; None
-        without an episode.
+        """End the session's episode, and return the folder of the dataset that contains it; None if
+        the session has no episode.
         """
         recorded = self._recorded.pop(session, None)
         return None if recorded is None else self._save(recorded)
@@ -214,7 +216,7 @@ class EpisodeWriter:
         size = 0
         for root, _, names in os.walk(self._folder):
             for name in names:
-                with suppress(OSError):  # the file was renamed a moment ago
+                with suppress(OSError):  # the file has just been renamed
                     size += os.stat(os.path.join(root, name)).st_size
         if size > self._most_bytes:
             raise RecordingEnded(
@@ -226,8 +228,8 @@ class EpisodeWriter:
             raise RecordingEnded(f"the disk of {self._folder} has {free / 1e9:.1f} GB left")
 
     def _save(self, recorded: _RecordedSession) -> Path | None:
-        """Complete the current episode of a session, and return the folder of its dataset; None
-        without an episode.
+        """Complete the current episode of a session, and return the folder of its dataset; None if
+        the session has no episode.
         """
         episode, target, frames = recorded.episode, recorded.target, recorded.frames
         recorded.episode = None
@@ -247,7 +249,9 @@ class EpisodeWriter:
         return target.dataset.root
 
     def _target(self, frame: RecordedAct) -> _Target:
-        """Return the dataset for a frame of these shapes, with at least as many rows per chunk."""
+        """Return the dataset for a frame of these shapes, whose chunks have at least as many rows
+        as the frame's.
+        """
         for target in self._targets:
             if target.fits(frame):
                 return target

@@ -26,9 +26,9 @@ from vlagents_ray.serve.engine.observer import Observer, Observers
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray_live.commands import CommandBoard
 
-ENCODING_SHARE = 0.04  # the share of a core that encodes pictures
+ENCODING_SHARE = 0.04  # the maximum share of a core for encoding pictures
 RATE = 10.0  # maximum rate of kept observations per session, Hz
-LEASE_S = 2.0  # the time after the last reading for which data are kept
+LEASE_S = 2.0  # the time for which data are kept after they were last read
 ANSWER_BYTES = 2**25  # maximum size of the kept answers
 # Maximum size of the observations: 70 sessions of four unencoded VGA cameras.
 OBSERVATION_BYTES = 2**28
@@ -39,7 +39,8 @@ SHOWN_OPS = ("act", "reset")
 _ACTION = 4096  # maximum number of values of an action that is kept with its observation
 _NAMES = 64  # maximum number of cameras and parts of the state of a kept observation
 _INFO = 24  # maximum number of entries of an action's info
-# Entries of an action's info that are not shown: the page has them elsewhere, or they are internal.
+# Entries of an action's info that are not shown: the page shows them elsewhere, or they are
+# internal.
 _HIDDEN = ("timing", "policy", "behaviour", "distribution")
 _MOST = 2**53  # largest integer that JSON represents exactly
 # Estimated size of an answer or an observation without its arrays, files and texts, bytes.
@@ -55,14 +56,14 @@ class Answer(NamedTuple):
     session: str
     op: str  # "act" or "reset"
     priority: str
-    timing: Mapping[str, float]  # ms by stage; completed when the answer is sent
+    timing: Mapping[str, float]  # times in ms by stage; complete when the answer is sent
     error: str = ""  # the code of an error; empty without an error
     detail: str = ""  # the message of an error
     rows: int = 0  # the number of rows of the chunk
     # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an action.
     action: np.ndarray | None = None
     done: bool = False
-    # The numbers and short texts in the policy's info.
+    # the numbers and short texts in the policy's info
     info: Mapping[str, Any] = MappingProxyType({})
 
     @property
@@ -79,14 +80,14 @@ class KeptObservation:
     """An observation as the policy received it."""
 
     number: int  # increases with every answer and observation of the replica
-    time: float  # s, of `time.monotonic`
-    state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
+    time: float  # time of arrival, s, of `time.monotonic`
+    state: dict[str, np.ndarray]  # parts of the state, (D,) float32; the gripper is one of them
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty after they are encoded
     # JPEG or PNG files by camera, which the client sent, or which are encoded for the reader.
     files: dict[str, bytes]
     # (D,) float32, the first row of the answer; None before the answer is sent.
     action: np.ndarray | None = None
-    counted: int = 0  # the size that is included in the observer's sum, bytes
+    counted: int = 0  # the size that the observer's sum includes for this observation, bytes
 
     @property
     def size(self) -> int:
@@ -96,7 +97,7 @@ class KeptObservation:
             arrays += self.action.nbytes
         files = sum(len(file) for file in self.files.values())
 
-        # Several images may be in the same memory.
+        # Several images may share the same memory.
         pixels: dict[int, int] = {}
         for image in self.cameras.values():
             owner, size = _owner(image)
@@ -107,7 +108,7 @@ class KeptObservation:
         """Return the files of all cameras by name, after raw pixels are encoded, which may take
         milliseconds.
         """
-        with _ENCODING:  # there may be several readers
+        with _ENCODING:  # several readers may call this method at the same time
             for camera, image in self.cameras.items():
                 self.files[camera] = JPEG.file(image)
             self.cameras = {}
@@ -137,7 +138,7 @@ class LiveObserver(Observer):
         self._active = False
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque()
-        self._observations: dict[str, KeptObservation] = {}  # by session, oldest first
+        self._observations: dict[str, KeptObservation] = {}  # the answers by session, oldest first
         self._answer_bytes = 0
         self._observation_bytes = 0
         self._lock = threading.Lock()
@@ -150,8 +151,8 @@ class LiveObserver(Observer):
             self._observers.add(self)
 
     def expire(self) -> None:
-        """Drop all data after the last lease, and pixels that were not read; called every half
-        second.
+        """Drop all data after the end of the lease, and pixels that were not read; called every
+        half second.
         """
         if self._active and self._clock() >= self._until:
             self.close()
@@ -180,7 +181,7 @@ class LiveObserver(Observer):
             self._commands.read_outcomes(pending.session_id, pending.request)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add a command to the session's robot."""
+        """Add a command for the session's robot to the answer."""
         if self._commands is not None:
             self._commands.send(pending.session_id, reply)
 
@@ -301,10 +302,8 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 def _owner(image: np.ndarray) -> tuple[object, int]:
     """Return the object whose memory an image keeps alive, and its size in bytes: a small image may
-    be part of a large message.
-
-    Of memory that a client shares only the image itself counts, as the client keeps the memory in
-    any case.
+    be part of a large message. If a client shares the memory, only the image itself counts, as the
+    client keeps the memory in any case.
     """
     owner: Any = image
     while True:

@@ -15,7 +15,7 @@ from vlagents_ray_live.live_page import page_server
 from vlagents_ray_live.live_view import Fleet
 from vlagents_ray_live.sibling_views import METHODS, SiblingViews
 
-_PART = "live"  # the name of the part of the policies' replicas
+_PART = "live"  # the name of the live part of the policies' replicas
 _NAME = "eval"  # the application of the page, for keys that are limited to applications
 
 

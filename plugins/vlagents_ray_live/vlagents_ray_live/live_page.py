@@ -12,10 +12,10 @@ A process that is not a replica, such as the driver of an evaluation, serves the
 
     GET  /v1/live/videos/7  a video to which the document refers by its number
 
-The viewer requests each message, with the sessions whose pictures it shows: {"shown": ["arm-1",
-…]}. So a slow viewer misses old messages, and does not delay the others. The answer consists of the
-length of a JSON document (32 bits, little-endian), the document, and the files to which it refers
-by their index in `files`, the list of their lengths.
+The viewer requests each message, and lists the sessions whose pictures it shows: {"shown":
+["arm-1", …]}. A slow viewer therefore misses old messages, and does not delay other viewers. The
+answer consists of the length of a JSON document (32 bits, little-endian), the document, and the
+files to which it refers by their index in `files`, the list of their lengths.
 
 A page in a browser cannot set a header, so it sends its key among the subprotocols of the
 WebSocket, as "vlagents.key.KEY".
@@ -75,13 +75,13 @@ _COMMAND = f"{PATH}/command"
 _WATCH, _OPERATE = "watch", "operate"  # scopes of keys
 _COMMAND_BYTES = 2**14  # maximum size of a command
 _VIEWERS = 32  # maximum number of viewers
-_SILENT_S = 30.0  # maximum time between two messages of a viewer
+_SILENT_S = 30.0  # maximum time between two requests of a viewer
 _SCRIPTS = ("evaluation.js", "live.js")
 _CHARACTERS = 2**16  # maximum length of a viewer's message
 _POLICY_VIOLATION = 1008  # a close code of WebSocket
-_LAST_S = 0.5  # the time in which viewers receive the end of an evaluation
+_LAST_S = 0.5  # the time for viewers to receive the end of an evaluation, s
 _END_S = 1  # the time limit for the connections of viewers to close, s
-_LEAVE_S = 5.0  # the time limit for the whole shutdown
+_LEAVE_S = 5.0  # the time limit for the whole shutdown, s
 
 # A function that returns the file of the video with a number; None if there is no such video.
 VideoFiles = Callable[[int], Path | None]
@@ -94,8 +94,8 @@ def live_routes(
 
     Args:
         fleet: The data of the page.
-        open_to_network: Whether other machines reach this server without a key. Watching is then
-            rejected, since the pictures of all robots would be public.
+        open_to_network: Whether other machines reach this server without a key. In that case
+            viewers are rejected, since the pictures of all robots would be public.
         videos: Finds the videos to which the document of an evaluation refers; None for the server
             of a policy.
     """
@@ -157,7 +157,7 @@ class _LiveEndpoint:
         try:
             self._scopes.require(_WATCH)
             if self._watching >= _VIEWERS:
-                raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
+                raise Overloaded(f"live: {_VIEWERS} viewers already watch; close one of them")
         except VLAgentsError as error:
             await deny(socket, error)
             return
@@ -209,7 +209,7 @@ class _LiveEndpoint:
 class _ViewerRequest(BaseModel):
     """A viewer's request for the next message."""
 
-    shown: list[str]  # ids of the sessions whose pictures it shows
+    shown: list[str]  # ids of the sessions whose pictures the viewer shows
 
 
 class _Command(BaseModel):
@@ -324,4 +324,4 @@ def page_server(
         if fleet.viewers:
             time.sleep(_LAST_S)
         server.should_exit = True
-        thread.join(_LEAVE_S)  # it may be waiting for a lost Ray
+        thread.join(_LEAVE_S)  # the thread may be waiting for a lost Ray cluster

@@ -36,20 +36,23 @@ logger = logging.getLogger(__name__)
 
 _SESSIONS = 256  # maximum number of sessions that a replica's snapshot describes
 _INSTRUCTION = 1000  # maximum length of an instruction
-PICTURES = 2**24  # maximum size of the pictures in a snapshot; further sessions have none
+# Maximum size of the pictures in a snapshot, bytes; further sessions have no pictures.
+PICTURES = 2**24
 _STATE_S = 0.5  # the time for which data that are slow to collect are reused
-# Maximum number of gathered snapshots that wait for a slow viewer, which misses the oldest.
+# Maximum number of gathered snapshots that wait for a slow viewer; beyond it, the oldest are
+# dropped.
 _BEHIND = 20
-_WAITING_BYTES = 2**26  # maximum size of the pictures that wait for a slow viewer
+_WAITING_BYTES = 2**26  # maximum size of the pictures that wait for a slow viewer, bytes
 
 
 @dataclass(slots=True)
 class Snapshot:
     """The events of one replica since the previous snapshot."""
 
-    number: int  # the number of the last answer or observation in it
+    number: int  # the number of the last answer or observation in the snapshot
     document: dict[str, Any]
-    files: list[bytes] = field(default_factory=list)  # `document` refers to them by index
+    # The picture files, to which `document` refers by index.
+    files: list[bytes] = field(default_factory=list)
 
 
 class ReplicaView:
@@ -90,7 +93,7 @@ class ReplicaView:
         self._meter = LoadMeter(engine.queue)
         self._slow_data: dict[str, Any] = {}
         self._collected_at = float("-inf")
-        # By session: the number of the observation whose pictures were read last.
+        # The number of the observation whose pictures were read last, by session.
         self._pictured: dict[str, int] = {}
 
     def open(self) -> None:
@@ -107,7 +110,7 @@ class ReplicaView:
         self.live.close()
 
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, and read its outcome for a limited time.
+        """Give a command to a session, and wait for its outcome for a limited time.
 
         Args:
             session: The session.
@@ -131,7 +134,7 @@ class ReplicaView:
 
         Args:
             since: The number of the viewer's last snapshot; 0 for the first one.
-            shown: The sessions whose pictures are wanted.
+            shown: The sessions whose pictures are requested.
 
         Returns:
             The events since the last snapshot.
@@ -151,7 +154,7 @@ class ReplicaView:
         for session in ordered_sessions[:_SESSIONS]:
             sessions[session.id] = _session(session, last_answers.get(session.id), engine.clock())
 
-        # The session whose pictures are the oldest comes first.
+        # The sessions whose pictures are the oldest come first.
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):
@@ -226,8 +229,8 @@ class ReplicaView:
 
 
 def _session(session: Session[LoadedModel], last: live.Answer | None, now: float) -> dict[str, Any]:
-    """Describe a session for viewers at `now`, s, of the engine's clock, with its last answer if
-    that is new.
+    """Describe a session for viewers at `now`, s, of the engine's clock; include the session's last
+    answer if it is new.
     """
     weights = session.weights
     described = {
@@ -246,7 +249,9 @@ def _session(session: Session[LoadedModel], last: live.Answer | None, now: float
 
 
 def _in_time(session: Session[LoadedModel], now: float) -> dict[str, Any] | None:
-    """Describe how well a session's robot was served lately; None if it does not report that."""
+    """Describe how well a session's robot was served lately; None if the robot does not report
+    this.
+    """
     lately = None if session.times is None else session.times.lately(now)
     if lately is None or lately.share is None:
         return None
@@ -314,7 +319,7 @@ def _counts(answers: list[live.Answer]) -> dict[str, Any]:
 
 SnapshotReader = Callable[[int, Collection[str]], Awaitable[Snapshot]]
 """A function that returns another replica's snapshot. Its arguments are the number of the last
-snapshot, and the sessions whose pictures are wanted.
+snapshot, and the sessions whose pictures are requested.
 """
 
 
@@ -331,13 +336,13 @@ class OtherReplicas(Protocol):
 
 
 class Viewer:
-    """The data that are not sent to one viewer yet."""
+    """The data that have not been sent to one viewer yet."""
 
     def __init__(self) -> None:
-        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
+        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures the viewer shows
         self._waiting: deque[list[Snapshot]] = deque()
         self._has_data = asyncio.Event()
-        self._extra: dict[str, Any] = {}  # the latest further entries of the document
+        self._extra: dict[str, Any] = {}  # the latest value of the document's further entries
         self._sent_extra = self._extra
 
     def put(self, snapshots: list[Snapshot], extra: dict[str, Any] | None = None) -> None:
@@ -405,7 +410,7 @@ class Fleet:
         self._extra = extra
         self.viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
-        # By name of a replica: the number of the last snapshot. "" is this replica.
+        # The number of the last snapshot by name of the replica. "" is this replica.
         self._last_numbers: dict[str, int] = {}
 
     @contextmanager
@@ -443,7 +448,7 @@ class Fleet:
         if pressed is None and self._other_replicas is not None:
             pressed = await self._other_replicas.press(session, do, by)
         if pressed is None:
-            raise UnknownSession(f"session {session[:80]!r}: no replica has it; it has ended")
+            raise UnknownSession(f"session {session[:80]!r}: no replica has it, so it has ended")
         return pressed
 
     async def _gather(self) -> None:
@@ -455,7 +460,7 @@ class Fleet:
                 snapshots = await self._snapshots()
                 extra = None if self._extra is None else await asyncio.to_thread(self._extra)
             except Exception:
-                logger.exception("the live view was not read; tried again")
+                logger.exception("the live view could not be read; it will be read again")
             else:
                 for viewer in self.viewers:
                     viewer.put(snapshots, extra)

@@ -3,8 +3,9 @@
 A deployment file turns it on: `parts: {record: {folder: /data/traces}}`.
 
 The thread that handles a message only puts references into a queue. A second thread copies the
-observations, since their memory may belong to the client, and a third one encodes and writes. If
-these are too slow, or the disk is full, frames are dropped and counted. No answer is delayed.
+observations, since their memory may belong to the client, and a third thread encodes and writes
+them. If these threads are too slow, or the disk is full, frames are dropped and counted. No answer
+is delayed.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ from vlagents_ray_live.episodes import EpisodeWriter, RecordedAct, RecordingEnde
 
 logger = logging.getLogger(__name__)
 
-NO_VERSION = -1  # the version of the weights for answers that contain none
-_HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be written
-# Estimated size of a request without its pictures and the bytes in its `info`.
+NO_VERSION = -1  # the version of the weights for answers that do not contain one
+_HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be written, bytes
+# Estimated size of a request without its pictures and the bytes in its `info`, bytes.
 _OTHER_BYTES = 16 * 2**10
-_NICE = 5  # a lower priority than that of the policy's thread
-_CLOSING_S = 30.0  # the time for the threads to write the waiting frames
+_NICE = 5  # niceness: a lower priority than that of the policy's thread
+_CLOSING_S = 30.0  # the time for the threads to write the waiting frames, s
 
 
 class RecordConfig(PartConfig):
@@ -130,7 +131,7 @@ class RecordingMetrics:
         # 1 while sessions are recorded, 0 after the recording has ended.
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._recorder = recorder
-        self._exported = Counts[str]()  # the counts that are exported already
+        self._exported = Counts[str]()  # the counts that have been exported already
         self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
@@ -199,12 +200,12 @@ class _Recorded:
     recorder: SessionRecorder
     session: str
     op: str
-    received_at: float  # s since 1970
-    obs: Obs | None  # None for a reset or a close
+    received_at: float  # time of arrival, s since 1970
+    obs: Obs | None  # the reply; None for a reset or a close
     instruction: str
     # The options of the reset, before the queue removes some of them; `_copy` makes them a text.
     options: Any
-    size: int  # the size of its memory, bytes
+    size: int  # the size of the request's memory, bytes
     info: str = ""  # the observation's info, as text
 
     def __del__(self) -> None:
@@ -235,7 +236,7 @@ class SessionRecorder(Observer):
         # Guards `_held`, which the garbage collector may reduce at any time.
         self._lock = threading.RLock()
 
-        # By session: the step at its reset; None if it is not recorded.
+        # The step at the reset of each session; None if the session is not recorded.
         self._first_steps: dict[str, int | None] = {}
         # Whether a comparison of the current sessions with `_first_steps` is scheduled.
         self._is_comparing = False
@@ -253,7 +254,7 @@ class SessionRecorder(Observer):
 
     @property
     def lost(self) -> int:
-        """The number of action requests that the recording lacks."""
+        """The number of action requests that are missing in the recording."""
         return self.dropped + self._writer.lost
 
     def on_request(self, pending: PendingRequest) -> None:
@@ -331,7 +332,9 @@ class SessionRecorder(Observer):
             self.count_held(texts)
         except Exception as error:  # noqa: BLE001 - an error of this request only
             logger.warning(
-                "recording: an act of session %s is left out: %s", recorded.session, error
+                "recording: an action request of session %s is left out: %s",
+                recorded.session,
+                error,
             )
             self.dropped += 1
             recorded.obs = None
@@ -349,7 +352,7 @@ class SessionRecorder(Observer):
             write()
         except (OSError, RecordingEnded) as error:
             self.ended = str(error)
-            logger.error("recording has ended, and the sessions go on: %s", error)  # noqa: TRY400 - it says why
+            logger.error("recording has ended, but the sessions continue: %s", error)  # noqa: TRY400 - the message contains the reason
             self._writer.close()
 
     def _handle(self, recorded: _Recorded, reply: Reply) -> None:
@@ -378,7 +381,7 @@ class SessionRecorder(Observer):
 
         except (OSError, RecordingEnded):
             raise
-        except UnknownSession:  # the session has ended, and its episode with it
+        except UnknownSession:  # the session has ended, and with it its episode
             self.dropped += 1
         except Exception as error:  # noqa: BLE001 - affects one session's episode
             logger.warning("recording: the episode of session %s is lost: %s", session, error)
@@ -386,8 +389,8 @@ class SessionRecorder(Observer):
             self._writer.drop(session)
 
     def _is_recorded(self, session: str) -> bool:
-        """Return whether the session is recorded; for a session from another replica this is
-        drawn here.
+        """Return whether the session is recorded; for a session that comes from another replica,
+        draw this now.
         """
         if session not in self._first_steps:
             self._first_steps[session] = None
@@ -404,7 +407,9 @@ class SessionRecorder(Observer):
             self._write_later(partial(self._end_others, frozenset(self._sessions.ids())))
 
     def _end_others(self, current: frozenset[str]) -> None:
-        """End the episodes of sessions that have ended; a new session may be missing once."""
+        """End the episodes of sessions that were missing in two comparisons, as a new session may
+        be missing in one.
+        """
         self._is_comparing = False
         missing = self._first_steps.keys() - current
         for session in missing & self._missing:
@@ -461,7 +466,7 @@ def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first_step: int) -> Reco
 
     Args:
         recorded: The request.
-        obs: Its observation.
+        obs: The observation of the request.
         reply: The answer.
         first_step: The step at the reset of the session.
     """

@@ -1,5 +1,5 @@
-"""What this distribution registers: an entry for each part of a replica, and one for the page of
-evaluations.
+"""The entries that this distribution registers: one for each part of a replica, and one for the
+page of evaluations.
 """
 
 from vlagents_ray.registry import RegistryEntry

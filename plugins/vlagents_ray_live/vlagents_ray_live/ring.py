@@ -2,10 +2,10 @@
 LeRobotDataset.
 
 A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files.
-Files of clients are kept unchanged; other pictures are encoded with at most 4 % of a core, by
-omitting frames. The frames of all sessions need at most `memory_mb`; beyond that the oldest frames
-are dropped. One session is saved at a time, and one of its frames decoded at a time, until the size
-of the folder is `most_gb`.
+Files of clients are kept unchanged; other pictures are encoded; frames are omitted so that this
+needs at most 4 % of a core. The frames of all sessions have at most `memory_mb`; beyond that the
+oldest frames are dropped. One session is saved at a time, and one frame is decoded at a time.
+Nothing is saved once the size of the folder is `most_gb`.
 """
 
 from __future__ import annotations
@@ -104,14 +104,14 @@ class Ring:
         for module in ("av", "pyarrow"):
             require(module)
 
-        self.bytes = 0  # the size of the kept frames
+        self.bytes = 0  # the size of the kept frames, bytes
         self._live = live
         self._sessions = sessions
         self._settings = settings
         self._writer = EpisodeWriter(
             folder, name, RATE, lossless=False, most_bytes=settings.most_gb * 1e9
         )
-        self._frames: dict[str, deque[KeptObservation]] = {}  # by session
+        self._frames: dict[str, deque[KeptObservation]] = {}  # the frames by session
         self._lock = threading.Lock()  # guards `_frames`
         self._saving = threading.Lock()  # guards `_writer`
         self._periodic = Periodic(1 / RATE)
@@ -191,7 +191,7 @@ class Ring:
         except RecordingEnded as error:
             raise StorageFailed(f"parts.live.folder: {error}; make room there") from error
         finally:
-            self._writer.drop(session)  # the remains of a failed attempt
+            self._writer.drop(session)  # the remains of a failed attempt to save
             self._saving.release()
 
     def _last_number(self, session: str) -> int:

@@ -17,17 +17,18 @@ from vlagents_ray_live.live_view import OtherReplicas, ReplicaView, SnapshotRead
 
 logger = logging.getLogger(__name__)
 
-# The methods that the live page calls at other replicas, and the time limit of each, s. The page
-# calls a replica that is late again.
+# The methods that the live page calls at other replicas, and the time limit of each, s. If a
+# replica is late, the page calls it again later.
 METHODS = {"read": 0.3, "press": 3.0}
-_VIEW_S = 2.0  # the time for which the list of replicas is reused
+_VIEW_S = 2.0  # the time for which the list of replicas is reused, s
 
 
 class SiblingViews(OtherReplicas):
     """The views of other replicas, through their live parts.
 
     Args:
-        siblings: Returns the live part of each other replica; they may change between two calls.
+        siblings: Returns the live part of each other replica; the replicas may change between two
+            calls.
     """
 
     def __init__(self, siblings: Callable[[], Awaitable[Sequence[SiblingPart]]]) -> None:

@@ -17,7 +17,8 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 
-_KEPT = 4096  # maximum number of answers in half a second; of more, the oldest have no spans
+# Maximum number of answers with spans in half a second; older answers beyond it have none.
+_KEPT = 4096
 # The stages in order, after decoding, and the names of their spans.
 _STAGES = {"queue": "queue", "inference": "batch"}
 _OPS = ("act", "reset")  # the requests that have spans
@@ -33,8 +34,8 @@ class _ServedRequest(NamedTuple):
     traceparent: str  # the client's span, in W3C's format; empty if unknown
     decoded_ns: int  # the time at which the request was decoded, ns since 1970
     timing: Mapping[str, float]  # ms by stage; completed when the answer is sent
-    error: str  # empty without an error
-    answered_ns: int  # ns since 1970
+    error: str  # the code of an error; empty without an error
+    answered_ns: int  # the time at which the answer was sent, ns since 1970
 
 
 class RequestSpans(Observer):
@@ -66,7 +67,7 @@ class RequestSpans(Observer):
             return
         obs = pending.request.obs
         traceparent = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")
-        if not isinstance(traceparent, str):  # the client may send anything
+        if not isinstance(traceparent, str):  # the client may send a value of any type
             traceparent = ""
         pending.observer_data[self] = traceparent[:_TEXT], time.time_ns()
 

@@ -1,5 +1,5 @@
-"""A Slurm of a test's own: its controller on one host, slurmd on others, with their own key and
-files.
+"""A Slurm for a test: its controller on one host and slurmd on others, with a separate key and
+separate files.
 """
 
 from __future__ import annotations
@@ -53,41 +53,43 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=60 DefaultTime=10
 
 
 def no_slurm() -> str | None:
-    """Why tests cannot have a Slurm here; None if they can."""
+    """Return the reason why tests cannot run Slurm here; None if they can."""
     missing = [tool for tool in _TOOLS if shutil.which(tool) is None]
     return f"{', '.join(missing)} not found; install slurm-wlm and munge" if missing else None
 
 
 @dataclass(frozen=True, slots=True)
 class Slurm:
-    """One that runs. Jobs are submitted at `login`, which is no node."""
+    """A running Slurm. Jobs are submitted at `login`, which is not a node."""
 
     login: Host
     nodes: list[Host]
 
     def vlagents_ray(self, *words: str) -> str:
-        """What `vlagents-ray` prints where jobs are submitted."""
+        """Run `vlagents-ray` where jobs are submitted, and return its output."""
         return self.login.run(
             [sys.executable, "-c", "from vlagents_ray.cli import main; main()", *words]
         )
 
     def do(self, *command: str) -> str:
-        """What one of Slurm's own commands prints there."""
+        """Run a command of Slurm where jobs are submitted, and return its output."""
         return self.login.run(command)
 
     def state(self, job: str) -> str:
-        """PENDING, RUNNING, COMPLETED, …"""
+        """Return the state of a job: PENDING, RUNNING, COMPLETED, …"""
         return self.do(
             "squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}"
         ).strip()
 
     def wait_for_end(self, job: str, timeout_s: float = 240.0) -> str:
-        """Until the job is over; its last state."""
+        """Wait until the job is over, and return its last state."""
         self.wait_for(job, lambda: self.state(job) in ENDED, timeout_s)
         return self.state(job)
 
     def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 180.0) -> None:
-        """Poll until `true()`; says what Slurm knows of the job if it never is."""
+        """Poll until `true()`; after the time limit, raise an error with Slurm's information about
+        the job.
+        """
         try:
             wait_for(true, timeout_s, every_s=0.2)
         except TimeoutError as error:
@@ -99,8 +101,8 @@ class Slurm:
 
 @contextlib.contextmanager
 def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
-    """A cluster of so many nodes with so many CPUs each, which are bookkeeping; all of it ends
-    with the context.
+    """Yield a cluster with this number of nodes, each with this number of CPUs as far as Slurm
+    knows; it ends with the context.
     """
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
     try:
@@ -115,7 +117,7 @@ def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
             configuration.write_text(
                 _CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines))
             )
-            # A GPU as far as bookkeeping goes.
+            # Slurm counts a GPU, which does not exist.
             (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")
             for host in (login, *node_hosts):
                 host.environment |= {
@@ -145,7 +147,7 @@ def _daemons(slurm: Slurm, folder: Path) -> Iterator[None]:
             }
             process = host.start(command, **quiet)
             stack.callback(process.wait, 20)
-            stack.callback(process.kill)  # what it started in the host ends with that
+            stack.callback(process.kill)  # the processes that it started in the host end with it
 
         start(slurm.login, munged)
         _until((folder / "munge.socket").exists, folder)

@@ -1,4 +1,4 @@
-"""An environment that notes on which host it is stepped, and can be held up."""
+"""An environment that records the host on which it runs, and can be paused."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ NOTED = "slurm_envs:Noted"
 
 
 class Noted(Line):
-    """A file HOST-SEED in `folder` for each episode; those with a seed in `held` wait in it for
-    the file `open`.
+    """Writes a file HOST-SEED into `folder` for each episode. Episodes with a seed in `held` wait
+    until the file `open` exists.
     """
 
     def __init__(self, folder: str, held: Sequence[int] = ()) -> None:

@@ -1,4 +1,4 @@
-"""Policies with settings that `vlagents-ray tune` tries, and what can go wrong with them."""
+"""Policies with settings that `vlagents-ray tune` tries, some of which fail."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 
 class TunableConfig(BaseModel, extra="forbid"):
-    """What a batch costs, how far fewer bits are off, and at which number of rows it fails."""
+    """The time of a batch, the deviation of types with fewer bits, and the number of rows beyond
+    which a batch fails.
+    """
 
     compile: bool = False
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     quantization: Literal["int8", "float8"] | None = None
     batch_sizes: list[int] | None = None
-    eager_ms: float = 60.0  # of a batch that is not compiled
-    row_ms: float = 0.0  # row of each of its rows
-    off: float = 0.0  # of all numbers, in bfloat16 or quantized
-    most_rows: int | None = None  # larger batches have no memory
+    eager_ms: float = 60.0  # time of a batch that is not compiled, ms
+    row_ms: float = 0.0  # additional time for each row of such a batch, ms
+    off: float = 0.0  # deviation of all numbers in bfloat16 or if quantized
+    most_rows: int | None = None  # larger batches raise MemoryError
     compiles: bool = True
 
 
 class Tunable(Agent):
-    """Acts on state, image and seed. Compiled, a batch costs nothing; in float16, its process
-    ends while it loads.
+    """Computes actions from state, image and seed. A compiled batch takes no time; with float16,
+    the process ends while it loads.
     """
 
     Config: ClassVar[type] = TunableConfig
@@ -78,7 +80,7 @@ class Tunable(Agent):
 
 
 class Unseeded(Tunable):
-    """Acts at random, whatever the seed."""
+    """Returns random actions, which do not depend on the seed."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         self.seed = int.from_bytes(os.urandom(2), "big")

@@ -13,7 +13,9 @@ from vlagents_ray.images.mp4 import Mp4
 def record(
     file: Path, first: float, steps: int = 5, frames: int = 6, part: str = "arm/joints"
 ) -> None:
-    """Observation i has first + i as its joints, and an image as bright as 20 i."""
+    """Write a trajectory in which observation i has first + i as its joints, and an image of
+    brightness 20 i.
+    """
     state = {part: first + np.arange(steps + 1, dtype=np.float32)[:, None] * np.ones(2, np.float32)}
     trajectory = Trajectory(
         np.zeros((steps, 2), np.float32), np.zeros(steps), np.zeros(steps, bool), state,

@@ -24,7 +24,7 @@ __all__ = ["submit_evaluation"]
 log = logging.getLogger(__name__)
 
 _SUBMISSION_S = 300.0
-# Age at which a claim without a job counts as abandoned by a killed process.
+# The age at which a claim without a job counts as abandoned by a killed process, s.
 _ABANDONED_S = _SUBMISSION_S + 60.0
 
 
@@ -46,7 +46,7 @@ def submit_evaluation(
     A checkpoint is submitted once, by the first process that calls this function, even after a
     restart of the training. If a call fails, a later call tries again. If the training is killed
     during a call, the first call after 6 minutes, for any checkpoint, also submits the interrupted
-    one.
+    checkpoint.
 
     Args:
         words: The arguments of `vlagents-ray slurm eval`, in which `{checkpoint}` and `{step}` are
@@ -88,7 +88,8 @@ def submit_evaluation(
 
 
 def _submit_abandoned(folder: Path, current: Path, python: str) -> None:
-    """Submit checkpoints whose claiming processes were killed, since no call may follow for them.
+    """Submit checkpoints whose claiming processes were killed, since they may not be submitted by a
+    later call.
 
     Args:
         folder: The folder of the marks.
@@ -117,8 +118,8 @@ def _submit_abandoned(folder: Path, current: Path, python: str) -> None:
 def _take_claim(mark: Path, claim: dict[str, Any]) -> bool:
     """Claim a checkpoint for this process, and return whether that succeeded.
 
-    The first process to claim a checkpoint submits it. If that process was killed, another one
-    takes its place.
+    The first process to claim a checkpoint submits it. If that process was killed, another process
+    takes over its claim.
     """
     try:
         mark.open("x").close()
@@ -127,8 +128,8 @@ def _take_claim(mark: Path, claim: dict[str, Any]) -> bool:
         if since is None:
             return False
         try:
-            # Several processes may find this claim abandoned. The one that creates this file
-            # replaces it.
+            # Several processes may find this claim abandoned. The process that creates this file
+            # takes it over.
             mark.with_suffix(f".{since}").open("x").close()
         except FileExistsError:
             return False

@@ -29,8 +29,8 @@ slurm = typer.Typer(
     "--nodes and --time, are passed to sbatch.",
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
-_FOUND_OUT = "it finds that out for itself"  # why an option does not fit a job
-_TASK = "%a"  # is replaced by the number of a task of --array, as in sbatch's file names
+_FOUND_OUT = "the job determines it itself"  # the reason why an option does not fit a job
+_TASK = "%a"  # replaced by the number of a task of --array, as in sbatch's file names
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Print the script, without writing or submitting it.")
 ]
@@ -92,23 +92,25 @@ def eval_(
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
         config, cases = _evaluation([word.replace(_TASK, index) for word in words])
-        # Another number, which need not be a task of the array.
+        # Another number in the place of the task's, which need not be a task of the array.
         other_config, _ = _evaluation([word.replace(_TASK, f"{index}0") for word in words])
         for tracker in config.track:
             registered_class("trackers", tracker)  # raises an error for an unknown name
         if "array" in options and config.out == other_config.out:
             raise ConfigError(
-                f"--array: expected a folder for each task, got one for all; put {_TASK} in it, "
+                f"--array: expected a folder for each task, got the same folder for all; put "
+                f"{_TASK} in it, "
                 f"as in --out runs/x/{_TASK}"
             )
 
-        # Without --workers, the workers fill the job. They must not have GPUs then, since the
-        # number of GPUs that policies need is not known.
+        # Without --workers, the workers fill the job. In that case they must not have GPUs, since
+        # the number of GPUs that policies need is not known.
         fill = []
         if "workers" not in config.model_fields_set:
             if most_gpus(cases):
                 raise ConfigError(
-                    "workers: expected their number, as they have GPUs, got none; set --workers, "
+                    "workers: expected the number of workers, as they have GPUs, got none; set "
+                    "--workers, "
                     "as policies get the GPUs left over"
                 )
             fill = [f"--fill={max(1.0, most_cpus(cases)):g}"]
@@ -190,7 +192,7 @@ def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
     if parsable:
         typer.echo(job)
         return
-    number = "*" if "array" in script.options else job  # each task of an array has its number
+    number = "*" if "array" in script.options else job  # each task of an array has its own number
     log = script.options.get("output") or f"{script.folder}/{number}.log"
     lines = [
         f"job {job} is queued; its script: {script.file}",
@@ -215,14 +217,14 @@ def _options(command: Callable[..., None]) -> dict[str, bool]:
 
 
 def _parse(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
-    """Parse the arguments of a command; raises the errors of that command."""
+    """Parse the arguments of a command; raises the command's errors."""
     context = _click(command).make_context(f"vlagents-ray slurm {name}", list(words))
     params: dict[str, Any] = context.params
     return params
 
 
 def _click(command: Callable[..., None]) -> Any:
-    """Return the command of Click that Typer makes of a function."""
+    """Return the Click command that Typer creates from a function."""
     app = typer.Typer(add_completion=False)
     app.command()(command)
     return typer.main.get_command(app)
@@ -247,13 +249,15 @@ def _evaluation(words: list[str]) -> tuple[EvalConfig, list[EvalCase]]:
     _reject(options, _FOUND_OUT, "address", "end_at")
     _reject(
         options,
-        "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)",
+        "it would wait for a training; let the training submit each checkpoint "
+        "(`submit_evaluation`)",
         "watch",
     )
     eval_options = EvalOptions(**options)
     config = config_from_options(eval_options)
     if eval_options.out is None and eval_options.source is not None:
         raise ConfigError(
-            "--out: expected a folder, which a repeated or requeued job continues, got none; add it"
+            "--out: expected a folder, in which a repeated or requeued job continues, got none; "
+            "add it"
         )
     return config, plan_cases(resolve_policies(config, ask=False)[0])

@@ -47,15 +47,15 @@ _COMMON_OPTIONS = ("--block", "--disable-usage-stats", "--log-color=false")
 # the machine's memory.
 _OBJECTS = 0.25
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-# Ray would otherwise drain for 30 s, for which a job that ends has no use.
+# Without this, Ray would drain for 30 s, which is useless in a job that ends.
 _NO_DRAIN = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}
-_HEAD_S = 120.0  # time limit for the head to listen
-_NODES_S = 300.0  # time limit for all nodes to join
+_HEAD_S = 120.0  # time limit until the head listens, s
+_NODES_S = 300.0  # time limit until all nodes have joined, s
 # Runs the command line with this Python, whatever PATH contains.
 _COMMAND = "from vlagents_ray.cli import main; main()"
 FILE = "server.json"
 _POLL_S = 0.5
-_MOST_S = 3600.0  # time limit for loading the policies
+_MOST_S = 3600.0  # time limit for loading the policies, s
 _TEXT = """\
 serving {names} in job {job}, until it ends; all of this, and the key, is in {file}
 on the cluster's network:   {url}
@@ -95,16 +95,16 @@ class Allocation:
     job: int
     nodes: int
     node: int  # number of this node, from 0; the head is 0
-    cpus: int  # on this node
-    gpus: int  # on this node
-    memory: int | None  # on this node, bytes; None if Slurm does not manage memory
+    cpus: int  # number of CPUs on this node
+    gpus: int  # number of GPUs on this node
+    memory: int | None  # memory on this node, bytes; None if Slurm does not manage memory
 
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
         """Return the resources of this process, from Slurm's environment variables."""
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
         gpus = len(list(filter(None, environ.get("SLURM_STEP_GPUS", "").split(","))))
-        # Slurm counts MiB, and 0 is all memory of the node.
+        # Slurm counts in MiB; 0 means all memory of the node.
         mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0"))
         if not mebibytes:
             mebibytes = int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
@@ -112,7 +112,7 @@ class Allocation:
             job=int(environ["SLURM_JOB_ID"]),
             nodes=int(environ["SLURM_JOB_NUM_NODES"]),
             node=int(environ.get("SLURM_NODEID", "0")),
-            cpus=min(cpus, len(os.sched_getaffinity(0))),  # a task may be bound to fewer
+            cpus=min(cpus, len(os.sched_getaffinity(0))),  # a task may be bound to fewer CPUs
             gpus=int(environ.get("SLURM_GPUS_ON_NODE", gpus)),
             memory=mebibytes * 2**20 or None,
         )
@@ -157,7 +157,8 @@ def run_node() -> int:
     """Run Ray on this node until the step ends, and remove Ray's files.
 
     Returns:
-        The exit status of the step. On the head it is that of Ray, unless Slurm has ended the step.
+        The exit status of the step. On the head it is Ray's exit status, unless Slurm has ended the
+        step.
     """
     allocation = Allocation.here()
     head = os.environ[HEAD]
@@ -207,7 +208,7 @@ def run_command(arguments: Sequence[str]) -> None:
     """Wait for Ray on all nodes, and replace this process with `vlagents-ray eval` or `serve`.
 
     Args:
-        arguments: The arguments of this program, then "--", then those of the command.
+        arguments: The arguments of this program, then "--", then the arguments of the command.
     """
     end_of_own = arguments.index("--")
     options = _command_options(arguments[:end_of_own])
@@ -266,7 +267,7 @@ def _start_announcing(options: argparse.Namespace, allocation: Allocation) -> li
     words = ["--host=0.0.0.0", f"--port={port}"]
     if options.key:
         keys = folder / "keys.json"
-        keys.unlink(missing_ok=True)  # keys from before the job was requeued
+        keys.unlink(missing_ok=True)  # keys that were created before the job was requeued
         key = new_key(keys, f"job-{allocation.job}")
         words.append(f"--keys={keys}")
 
@@ -348,7 +349,7 @@ def announce(words: Sequence[str]) -> None:
     deadline = time.monotonic() + _MOST_S
     server = os.getppid()
     while not all(map(_answers, health_urls)):
-        has_ended = os.getppid() != server  # its log has the reason
+        has_ended = os.getppid() != server  # the server's log has the reason
         if has_ended or time.monotonic() > deadline:
             return
         time.sleep(_POLL_S)
@@ -395,7 +396,7 @@ def as_text(info: Mapping[str, Any], file: Path) -> str:
 
     Args:
         info: The result of `connection_info`.
-        file: The file with the key, from which the text reads it.
+        file: The file that contains the key; the text has a command that reads the key from it.
     """
     url = next(iter(info["apps"].values()))
     key = f"export {KEY_VARIABLE}=(the key that you were given; none, if the server is --insecure)"

@@ -14,7 +14,7 @@ from pathlib import Path
 from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
-# Options of sbatch (22.05 to 24.11) that have no value, or a value only after "=".
+# Options of sbatch (22.05 to 24.11) without a value, or with a value only after "=".
 _ALONE = {
     "contiguous",
     "exclusive",
@@ -36,7 +36,7 @@ _ALONE = {
     "use-min-nodes",
     "verbose",
 }
-# Short options of sbatch -> their long names.
+# The long names of sbatch's short options.
 _SHORT = {
     "A": "account",
     "B": "extra-node-info",
@@ -66,7 +66,7 @@ _SHORT = {
     "w": "nodelist",
     "x": "exclude",
 }
-# Rejected options -> what to use instead. The script starts one process of Ray on each node.
+# Rejected options, and what to use instead. The script starts one process of Ray on each node.
 _OURS = {
     "ntasks": "--nodes and --cpus-per-task",
     "ntasks-per-node": "--nodes and --cpus-per-task",
@@ -76,8 +76,8 @@ _OURS = {
     "ntasks-per-socket": "--cpus-per-task",
     "gpus-per-task": "--gpus-per-node",
     "wrap": "no `--wrap`, as the script is written for you",
-    "wait": "`squeue`, and --dependency in the jobs that wait",
-    "W": "`squeue`, and --dependency in the jobs that wait",
+    "wait": "`squeue`, and --dependency in the waiting jobs",
+    "W": "`squeue`, and --dependency in the waiting jobs",
     "input": "a deployment or a run file",
     "i": "a run file",
 }
@@ -124,13 +124,13 @@ def split(
 
             if option in _OURS:
                 raise ConfigError(
-                    f"{word}: expected options that fit one Ray process on each node, got "
-                    f"another; use {_OURS[option]}"
+                    f"{word}: expected options that fit one Ray process on each node, got this "
+                    f"option; use {_OURS[option]}"
                 )
             if is_short and len(option) == 1:
                 raise ConfigError(
-                    f"{word}: expected an option of this command or a short one of sbatch, got "
-                    "another"
+                    f"{word}: expected an option of this command or a short option of sbatch, got "
+                    f"another"
                 )
             if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
                 raise ConfigError(f"{word}: expected --NAME=VALUE, got an invalid name")
@@ -163,10 +163,10 @@ def first_index(array: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """A job; its strings may contain %a, the number of a task of `--array`."""
+    """The script of a job; its strings may contain %a, the number of a task of `--array`."""
 
     name: str
-    folder: Path  # for the script and the job's logs, on a file system that all nodes share
+    folder: Path  # folder for the script and the job's logs, on a file system that all nodes share
     arguments: Sequence[str]  # arguments of `vlagents_ray_cluster.slurm.job`
     options: Mapping[str, str | None]  # options of sbatch; they override the defaults
     resubmit: int = 0  # number of times that the job is submitted again when its time is over
@@ -181,9 +181,9 @@ class Script:
         """Return the content of the script.
 
         Raises:
-            ConfigError: A name, path or option has a control character: after a line feed, the
-                remainder of a comment would be a command. Or a value with spaces has quotes, which
-                sbatch cannot read.
+            ConfigError: A name, path or option has a control character (after a line feed, the rest
+                of a comment would be a command), or a value with spaces has quotes, which sbatch
+                cannot read.
         """
         defaults: dict[str, str | None] = {
             "job-name": f"vlagents-ray-{self.name}",

@@ -186,7 +186,7 @@ def tune_command(
 def _words(point: MeasuredPoint | None) -> str:
     """Return a point and its figures in words."""
     if point is None:
-        return "not measured, or out of the goal"
+        return "not measured, or does not reach the goal"
     from vlagents_ray_cluster.tune.tuner import sessions
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"

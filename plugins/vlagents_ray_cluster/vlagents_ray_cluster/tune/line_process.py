@@ -1,4 +1,4 @@
-"""Processes of a benchmark, which answer lines of text and end with this process."""
+"""Processes of a benchmark that answer lines of text, and end with this process."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from typing_extensions import Self
 import vlagents_ray
 from vlagents_ray.errors import VLAgentsError
 
-_END_S = 10.0  # time for a process to end
-_LOOK_S = 0.5  # interval of the checks of a server for whose clients one waits
-_SHOWN_CHARACTERS = 2000  # number of characters of a failed process's standard error
+_END_S = 10.0  # time for a process to end, s
+_LOOK_S = 0.5  # interval between checks of a server for whose clients this process waits, s
+_SHOWN_CHARACTERS = 2000  # number of characters of a failed process's standard error in a message
 
 
 class ProcessFailed(VLAgentsError):
@@ -54,7 +54,7 @@ class LineProcess:
 
         self.name = name
         self._end_s = end_s
-        self._received = b""  # the bytes after the last complete line
+        self._received = b""  # the bytes after the last complete line of the output
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
             list(command),
@@ -62,7 +62,7 @@ class LineProcess:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env=child_environment,
-            # Ctrl-C reaches this process alone, which ends its children in order.
+            # Ctrl-C reaches only this process, which ends its children in order.
             start_new_session=True,
         )
         self._input = cast(IO[bytes], self._process.stdin)
@@ -74,7 +74,8 @@ class LineProcess:
 
         Args:
             timeout_s: Time limit for the answer, s.
-            server: The process that it waits for: if that has ended, there is no answer.
+            server: The process for which this process waits; if the server has ended, no answer is
+                expected.
 
         Raises:
             ProcessFailed: The process or its server ended, or the process did not answer in time,
@@ -142,7 +143,7 @@ class LineProcess:
         self.close()
 
     def _failure(self, what: str) -> ProcessFailed:
-        """Return the error that says what happened to the process, with its last errors."""
+        """Return an error that describes what happened to the process, with its last errors."""
         return ProcessFailed(f"{self.name}: {what}\n{self._last_errors()}".rstrip())
 
     def _last_errors(self) -> str:

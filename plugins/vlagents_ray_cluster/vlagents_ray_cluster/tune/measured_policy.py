@@ -47,8 +47,8 @@ from vlagents_ray.validation import check_observation
 
 INSTRUCTION = "pick up the cube"
 WARM = 2  # number of warm-up batches, which are not counted
-_LATE_S = 600.0  # a first batch may be compiled
-FRAMES = 8  # episodes whose first actions are compared
+_LATE_S = 600.0  # time limit of a batch, since the first batch may be compiled
+FRAMES = 8  # number of episodes whose first actions are compared
 _TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
 
@@ -58,7 +58,7 @@ class QueuedTurn:
 
     actions_per_s: float
     mean_batch: float
-    trips_ms: Sequence[float]  # round trip of each call
+    trips_ms: Sequence[float]  # round trip of each call, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ class MeasuredPolicy:
                 the last batch continues with episode 0.
 
         Returns:
-            At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i
+            At least `count` actions, (D,) or (H, D) float32; the action at i belongs to episode i
             modulo `count`.
         """
         actions: list[np.ndarray] = []
@@ -146,7 +146,7 @@ class MeasuredPolicy:
         return act
 
     def queued(self, size: int, seconds: float, priority: PriorityName) -> QueuedTurn:
-        """Measure sessions that send their next request as soon as the last one is answered.
+        """Measure sessions that send their next request as soon as the last request is answered.
 
         Args:
             size: The number of sessions.
@@ -207,7 +207,7 @@ class MeasuredPolicy:
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
     """Return actions per second: the slope of the line through the ends of all calls.
 
-    Actions are computed in batches, so that a count within a fixed time could be wrong by a batch.
+    Actions are computed in batches, so a count within a fixed time could be wrong by a batch.
 
     Args:
         calls: The calls of each client; the first value of a call is its end, s.
@@ -281,12 +281,12 @@ class ProcessSettings:
     policy: str
     config: dict[str, Any]
     wrappers: Sequence[Any]
-    max_size: int  # largest number of sessions to be measured
-    patience: float  # `batch.patience`
-    batch_sizes: Sequence[int]  # `batch.sizes`, or none
+    max_size: int  # maximum number of sessions to be measured
+    patience: float  # the deployment's `batch.patience`
+    batch_sizes: Sequence[int]  # the deployment's `batch.sizes`, or none
     frames: str | None  # a file of `save_observations`; None selects random observations
-    side: int  # px, size of random images for which the contract defines none
-    dims: Mapping[str, int]  # name in the state -> size, for which the contract defines none
+    side: int  # size of random images for which the contract defines none, px
+    dims: Mapping[str, int]  # sizes by name in the state, where the contract defines none
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:

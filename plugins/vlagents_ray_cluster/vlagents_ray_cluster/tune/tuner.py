@@ -40,13 +40,13 @@ class TuningGoal:
     """The goal of `tune`: many actions per second, or many robots with short round trips."""
 
     kind: Literal["throughput", "robots"]
-    p99_ms: float | None = None  # for robots: limit of the 99th percentile of round trips
+    p99_ms: float | None = None  # for robots: limit of the 99th percentile of round trips, ms
 
     def __post_init__(self) -> None:
         if self.kind == "robots" and self.p99_ms is None:
             raise ConfigError(
-                "--for robots: expected --p99-ms, the longest round trip that your robots bear, "
-                "ms, got none; set it"
+                "--for robots: expected --p99-ms, the longest acceptable round trip of your "
+                "robots, ms, got none; set it"
             )
         if self.kind == "throughput" and self.p99_ms is not None:
             raise ConfigError("--p99-ms: applies only to --for robots; leave it out")
@@ -60,7 +60,9 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """The changes in words, without the batch sizes, which have a column in the table."""
+        """The changes in words, without the batch sizes, which are in a separate column of the
+        table.
+        """
         words = []
         for key, value in self.changes.items():
             if key != "batch_sizes":
@@ -80,10 +82,10 @@ class MeasuredPoint:
     sessions: int
     # Largest difference from the actions of the file's own settings, as a share of their range.
     difference: float
-    rates: list[float] = field(default_factory=list)  # actions per second of each turn
-    trips_ms: list[float] = field(default_factory=list)  # round trips of all turns
+    rates: list[float] = field(default_factory=list)  # rate of each turn, actions per second
+    trips_ms: list[float] = field(default_factory=list)  # round trips of all turns, ms
     peak_mib: float = 0.0
-    took_s: float = 0.0  # duration of the first turn
+    took_s: float = 0.0  # duration of the first turn, s
 
     def add(self, turn: Mapping[str, Any]) -> None:
         """Add the figures of a turn, as the process of the variant returns them."""
@@ -138,7 +140,7 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     def score(point: MeasuredPoint) -> float:
         return point.actions_per_s if goal.kind == "throughput" else point.sessions
 
-    # The best point of each variant, those with the fewest changes first.
+    # The best point of each variant; variants with the fewest changes come first.
     variants = {point.variant.name: point.variant for point in reaching}
     best_points = []
     for variant in sorted(variants.values(), key=lambda variant: len(variant.changes)):
@@ -240,10 +242,10 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
 
 # Factor by which the last two batch sizes must raise the rate before a larger one is measured.
 _RISING = 1.05
-_TURNS = 3  # turns of each point
-_END_S = 2.0  # time for a process to end before it is killed
-# The smallest range of a value of the action, as a share of its largest magnitude, since a value
-# may be nearly constant.
+_TURNS = 3  # number of turns of each point
+_END_S = 2.0  # time for a process to end before it is killed, s
+# The minimum range of a value of the action, as a share of its largest magnitude, since a value may
+# be nearly constant.
 _SMALLEST_RANGE = 0.1
 
 
@@ -258,15 +260,15 @@ class TunePlan:
     args: ServerArgs  # the `args` of a deployment file
     goal: TuningGoal
     max_batch: int = 32
-    minutes: float = 5.0  # time limit of the whole tuning
-    seconds: float = 2.0  # duration of each measurement
+    minutes: float = 5.0  # time limit of the whole tuning, minutes
+    seconds: float = 2.0  # duration of each measurement, s
     tolerance: float = 0.01  # largest difference of actions, as a share of their range
     # Types to try; None selects those that the device computes natively.
     dtypes: Sequence[str] | None = None
     # Folder of recorded trajectories; None selects random observations.
     frames: Path | None = None
-    side: int = 224  # px, size of random images if the policy accepts any size
-    # Name in the state -> size, for which the contract defines none.
+    side: int = 224  # size of random images if the policy accepts any size, px
+    # Sizes by name in the state, where the contract defines none.
     dims: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -457,7 +459,7 @@ class Tuner:
     ) -> None:
         """Measure a loaded variant with growing batches while the rate rises.
 
-        Then the points are measured in further turns, as time permits.
+        The points are then measured in further turns, as time permits.
 
         Args:
             process: The process of the variant.
@@ -538,8 +540,9 @@ class Tuner:
                 if variant.changes or points:
                     raise VariantFailed(f"rejected, as {off}")
                 raise VariantFailed(
-                    f"{off}, for the same observations and seeds, so nothing can be compared with "
-                    "them; let the seed of `reset` determine what is random in the policy, or "
+                    f"{off}, for the same observations and seeds, so the actions of variants "
+                    f"cannot be compared with them; let the seed of `reset` determine what is "
+                    f"random in the policy, or "
                     "raise --tolerance"
                 )
 
@@ -626,7 +629,7 @@ def largest_difference(actions: Sequence[np.ndarray], expected: Sequence[np.ndar
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
     """Read observations from the trajectories below a folder.
 
-    They are spread evenly over the trajectories and over the steps of each.
+    The observations are spread evenly over the trajectories and over the steps of each trajectory.
 
     Args:
         folder: A folder of trajectories, as evaluations save them.
@@ -669,7 +672,7 @@ def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
             for number, frame in enumerate(container.decode(video=0)):
                 if number in steps:
                     images[number] = frame.to_ndarray(format="rgb24")
-    except (OSError, ValueError) as error:  # PyAV's errors for broken files are of these types
+    except (OSError, ValueError) as error:  # PyAV raises these types of errors for broken files
         raise ConfigError(f"--frames: {video} cannot be read ({error})") from error
 
     missing = sorted(set(steps) - set(images))
