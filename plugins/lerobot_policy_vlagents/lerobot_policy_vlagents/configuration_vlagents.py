@@ -9,7 +9,8 @@ from lerobot.configs.policies import PreTrainedConfig
 from vlagents_ray.errors import ConfigError
 
 TRAINING = (
-    "policy.type=vlagents: expected a policy whose weights are here, got one on a server; train "
+    "policy.type=vlagents: expected a policy whose weights are on this machine, got a policy on a "
+    "server; train "
     "with the type of the checkpoint that the server loads, or push weights into the server "
     "(docs/weights.md)"
 )
@@ -18,33 +19,38 @@ TRAINING = (
 @PreTrainedConfig.register_subclass("vlagents")
 @dataclass
 class VlagentsConfig(PreTrainedConfig):
-    """The server, and the mapping of the policy's cameras and states to those of this robot or
-    environment.
+    """The settings of the server, and the mapping of the policy's cameras and states to those of
+    this robot or environment.
     """
 
-    url: str = ""  # http(s)://HOST:PORT[/APP], as of `RemoteAgent`
-    # policy's camera -> robot's, where the names differ.
+    url: str = ""  # URL of the server, http(s)://HOST:PORT[/APP], as for `RemoteAgent`
+    # The robot's names of cameras by the policy's names, where the names differ.
     cameras: dict[str, str] = field(default_factory=dict)
-    # The policy's parts in `observation.state`, in its order.
+    # The policy's parts of the state in `observation.state`, in the order of the vector.
     state: list[str] = field(default_factory=list)
-    instruction: str | None = None  # in place of the task of the dataset or the environment
-    # Rows of each chunk that are executed; None: all that the server returns.
+    instruction: str | None = None  # replaces the task of the dataset or the environment
+    # Number of rows of each chunk that are executed; None for all rows that the server returns.
     n_action_steps: int | None = None
-    checkpoint: str | None = None  # one of those that the server offers; None: its own
-    # Seed of the first session's first episode; each further episode has the next number.
+    # One of the checkpoints that the server offers; None for the server's default.
+    checkpoint: str | None = None
+    # Seed of the first session's first episode; the seed increases by one with each further
+    # episode.
     seed: int | None = None
-    key_file: Path | None = None  # holds the API key; without it, VLAGENTS_RAY_API_KEY is the key
-    ca: Path | None = None  # https: PEM file of the server's authorities; None: the system's
-    # https: PEM files of the client's certificate and its key.
+    # File that contains the API key; None uses the variable VLAGENTS_RAY_API_KEY.
+    key_file: Path | None = None
+    # For https: PEM file of the authorities for the server; None uses those of the system.
+    ca: Path | None = None
+    # For https: PEM files of the client's certificate and of its key.
     certificate: list[Path] = field(default_factory=list)
-    transport: str = "auto"  # as of `RemoteAgent`
-    codec: str = "auto"  # codec of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
-    priority: str = "robot"  # "simulation": robots of the same server go first
-    # Move a robot although the training's statistics do not fit it; the log shows it.
+    transport: str = "auto"  # transport, as for `RemoteAgent`
+    codec: str = "auto"  # codec of images, as for `RemoteAgent`: "jpeg", "lossless", "raw", …
+    priority: str = "robot"  # with "simulation", robots of the same server have precedence
+    # Whether to move a robot although the training's statistics do not fit it; the log shows this.
     ignore_mismatch: bool = False
-    timeout_s: float = 30.0  # for a request; after it the command ends with an error
-    connect_timeout_s: float = 60.0  # for a server that is still loading
-    device: str | None = "cpu"  # device of observations until they are sent
+    # Time limit of a request, s, after which the command ends with an error.
+    timeout_s: float = 30.0
+    connect_timeout_s: float = 60.0  # time limit for a server that is still loading, s
+    device: str | None = "cpu"  # device of observations before they are sent
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -68,8 +74,8 @@ class VlagentsConfig(PreTrainedConfig):
 
     @property
     def api_key(self) -> str | None:
-        """The API key in `key_file`; None if no file is set. Raises `ConfigError` if it cannot
-        be read.
+        """The API key in `key_file`; None if no file is set. Raises `ConfigError` if the file
+        cannot be read.
         """
         if self.key_file is None:
             return None

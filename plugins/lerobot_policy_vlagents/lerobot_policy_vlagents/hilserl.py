@@ -1,8 +1,6 @@
 """HIL-SERL with the policy on a server: LeRobot's learner trains, and vlagents_ray's control loop
-is its actor.
-
-It takes the place of `python -m lerobot.rl.actor`. `python -m lerobot_policy_vlagents.hilserl
-CONFIG FOLDER` writes the checkpoint that the server begins with.
+is its actor, in place of `python -m lerobot.rl.actor`. `python -m lerobot_policy_vlagents.hilserl
+CONFIG FOLDER` writes the first checkpoint for the server.
 """
 
 from __future__ import annotations
@@ -39,14 +37,14 @@ from vlagents_ray.datasets.episode import Label, camera_keys, state_vector
 from vlagents_ray.errors import ConfigError, Overloaded, PolicyUnavailable
 from vlagents_ray.interface import copied
 
-# The learner's names -> the policy's modules.
+# The policy's modules by the learner's names.
 _PARTS = {"policy": "actor", "discrete_critic": "discrete_critic"}
-_SEND_S = 60.0  # time limit for the transitions of an episode
+_SEND_S = 60.0  # time limit for the transitions of an episode, s
 logger = logging.getLogger(__name__)
 
 
 class Weights(Protocol):
-    """A `vlagents_ray_learn.Publisher`."""
+    """The methods of `vlagents_ray_learn.Publisher` that are used here."""
 
     def push(self, named: dict[str, torch.Tensor], *, partial: bool, allow_same: bool) -> int:
         """Push weights to the served policy, and return their version."""
@@ -59,13 +57,13 @@ class Actor:
             options = LoopOptions(reset_options={"weights": "follow"})
             run_loop(robot, player, hz=10, seconds=20, recorder=actor, options=options)
 
-    The learner's parameters are pushed to the server as they come, where the next episode acts with
-    them. An episode is sent when it ends, with the names of a recording by
-    `vlagents_ray.robot.record.Recorder`. The label "success" is a reward of 1 in its last
-    transition. An episode without a label was truncated.
+    The learner's parameters are pushed to the server when they arrive; the next episode uses them.
+    An episode is sent when it ends, with the names that `vlagents_ray.robot.record.Recorder` uses.
+    The label "success" becomes a reward of 1 in the last transition. An episode without a label
+    counts as truncated.
     """
 
-    interventions = True  # frames of an operator are accepted
+    interventions = True  # whether frames of an operator are accepted
 
     def __init__(
         self, config: str | Path, weights: Weights, *, connect_timeout_s: float = 60.0
@@ -75,7 +73,7 @@ class Actor:
         Args:
             config: The learner's JSON file, with its address and the policy's `input_features`.
             weights: The publisher to the served policy.
-            connect_timeout_s: Time for a learner that is still loading, s.
+            connect_timeout_s: Time limit for a learner that is still loading, s.
 
         Raises:
             PolicyUnavailable: The learner was not ready in time.
@@ -92,7 +90,8 @@ class Actor:
         # Observation, action, and whether the action is an operator's.
         self._frames: list[tuple[Obs, np.ndarray, bool]] = []
         self._steps = 0  # steps of all episodes
-        self._error: Exception | None = None  # of the thread, raised by the next episode or `close`
+        # Error of the thread, which the next episode or `close` raises.
+        self._error: Exception | None = None
         self._channel = grpc.insecure_channel(learner, grpc_channel_options())
         self._stub = services_pb2_grpc.LearnerServiceStub(self._channel)
         try:
@@ -112,8 +111,8 @@ class Actor:
 
     @contextlib.contextmanager
     def episode(self, instruction: str) -> Iterator[None]:
-        """Make the frames that are added within the context one episode; raise an error of the
-        thread before it.
+        """Make one episode of the frames that are added within the context. An earlier error of the
+        thread is raised first.
         """
         self._raise()
         self._label, self._frames = None, []
@@ -128,10 +127,10 @@ class Actor:
         self._label = label
 
     def add(self, obs: Obs, action: np.ndarray, *, intervention: bool = False, **_: object) -> None:
-        """Keep a frame until the episode ends; the arguments are those of `Recorder.add`.
+        """Store a frame until the episode ends; the arguments are those of `Recorder.add`.
 
         Raises:
-            ConfigError: The first observation has not the features of the policy.
+            ConfigError: The first observation does not have the features of the policy.
         """
         if not self._frames:
             _state(obs, self._inputs)
@@ -158,7 +157,7 @@ class Actor:
             raise error
 
     def _receive(self) -> None:
-        """Push all parameters of the stream."""
+        """Push all parameters of the learner's stream to the server."""
         try:
             receive_bytes_in_chunks(
                 self._parameters, SimpleNamespace(put=self._push), self._closed, "parameters"
@@ -169,7 +168,7 @@ class Actor:
                 self._error = error
 
     def _push(self, data: bytes) -> None:
-        modules = bytes_to_state_dict(data)  # by torch's loader for weights alone
+        modules = bytes_to_state_dict(data)  # torch loads only weights, and executes no code
         named = {
             f"{_PARTS[part]}.{name}": value
             for part, one in modules.items()
@@ -202,7 +201,8 @@ class Actor:
                 method(send_bytes_in_chunks(data, message), timeout=_SEND_S)
             except grpc.RpcError as error:
                 raise PolicyUnavailable(
-                    f"HIL-SERL: the learner did not take the episode ({error.code().name}); is it "
+                    f"HIL-SERL: the learner did not accept the episode ({error.code().name}); is "
+                    f"it "
                     "running?"
                 ) from error
 
@@ -212,8 +212,8 @@ def transitions(
     label: Label | None,
     inputs: Mapping[str, tuple[int, ...]],
 ) -> list[dict[str, Any]]:
-    """Return an episode of N frames as N of LeRobot's transitions; the last one has its own state
-    as the next one.
+    """Return an episode of N frames as N transitions of LeRobot; in the last transition, the next
+    state equals the state.
 
     Args:
         frames: Observation, action (D,) float32, and whether an operator moved the robot.
@@ -242,8 +242,8 @@ def transitions(
 
 
 def _state(obs: Obs, inputs: Mapping[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
-    """Return an observation with LeRobot's names: images (1, 3, H, W) in [0, 1], the state (1,
-    D).
+    """Return an observation with LeRobot's names: images (1, 3, H, W) in [0, 1], the state
+    (1, D).
     """
     values, _ = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
     seen = {
@@ -253,7 +253,7 @@ def _state(obs: Obs, inputs: Mapping[str, tuple[int, ...]]) -> dict[str, torch.T
     if (got := {name: value.shape for name, value in seen.items() if name in inputs}) != inputs:
         raise ConfigError(
             f"input_features: expected {dict(inputs)}, got {got} from the robot; train the policy "
-            "on these"
+            f"with the robot's features"
         )
     found = {
         name: torch.from_numpy(np.ascontiguousarray(seen[name]))[None].float() for name in inputs
@@ -262,18 +262,18 @@ def _state(obs: Obs, inputs: Mapping[str, tuple[int, ...]]) -> dict[str, torch.T
 
 
 def write_checkpoint(config: Path, folder: Path) -> None:
-    """Write the policy of a learner's configuration, with random weights, for the server to begin
-    with.
+    """Write the policy of a learner's configuration with random weights, as the first checkpoint of
+    the server.
 
     Args:
         config: The learner's JSON file (`--config_path`), whose `policy` has the features.
-        folder: The checkpoint's, which is made.
+        folder: The folder of the checkpoint, which is created.
     """
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(json.loads(config.read_text())["policy"]))
     settings: Any = PreTrainedConfig.from_pretrained(folder)
     get_policy_class(settings.type)(settings).save_pretrained(folder)
-    # LeRobot 0.4 normalises nothing in HIL-SERL, neither in the learner nor in the actor.
+    # LeRobot 0.4 does not normalise in HIL-SERL, neither in the learner nor in the actor.
     if settings.type == "sac":
         settings.normalization_mapping = dict.fromkeys(
             settings.normalization_mapping, NormalizationMode.IDENTITY

@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER, TICKS
 from vlagents_ray.robot.fit import Fit, Trained
 
-# Settings of RTCConfig that are rejected, since the server has its own.
+# Settings of RTCConfig that are rejected, since the server has separate settings.
 _GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")
 logger = logging.getLogger(__name__)
 
@@ -47,8 +47,7 @@ class VlagentsPolicy(PreTrainedPolicy):
 
         Raises:
             ConfigError: An option is missing or wrong.
-            ContractMismatch: The policy needs a missing input, or returns other actions than the
-                robot needs.
+            ContractMismatch: The policy needs a missing input, or its actions do not fit the robot.
             PolicyUnavailable: The server was not ready within `connect_timeout_s`.
         """
         super().__init__(config)
@@ -56,7 +55,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         # LeRobot's evaluation of several tasks at once calls one policy on several threads.
         self._threads = threading.local()
         self._threads.sessions = sessions = _Sessions(self._robot)
-        self._of_all_threads: _Sessions | None = None  # with real-time chunking
+        self._of_all_threads: _Sessions | None = None  # used with real-time chunking
         self._robot.check_features(sessions.agent)
 
     @classmethod
@@ -67,14 +66,14 @@ class VlagentsPolicy(PreTrainedPolicy):
         config: VlagentsConfig | None = None,
         **kwargs: Any,
     ) -> VlagentsPolicy:
-        """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which
-        only a server loads.
+        """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which only a
+        server can load.
         """
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
                 "policy.path: expected none with policy.type=vlagents, as the server loads the "
                 f"checkpoint, got {str(pretrained_name_or_path)!r}; --policy.checkpoint selects "
-                "one of those that it offers"
+                f"one of the server's checkpoints"
             )
         return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
 
@@ -83,8 +82,8 @@ class VlagentsPolicy(PreTrainedPolicy):
         self._sessions.reset()
 
     def select_action(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
-        """Return the next row of each session's chunk, (B, D) float32; after its last row, request
-        a new chunk.
+        """Return the next row of each session's chunk, (B, D) float32; after a chunk's last row,
+        request a new chunk.
 
         Args:
             batch: Images (B, C, H, W) in [0, 1], states (B, D), and the `task`, with LeRobot's
@@ -104,11 +103,11 @@ class VlagentsPolicy(PreTrainedPolicy):
         `select_action`.
 
         Args:
-            batch: As of `select_action`.
+            batch: The same as for `select_action`.
             inference_delay: Real-time chunking: the number of rows of the plan that will have been
                 executed.
-            prev_chunk_left_over: Real-time chunking: the plan from this observation on, (H', D) or
-                (B, H', D), which LeRobot pads with rows of zeros.
+            prev_chunk_left_over: Real-time chunking: the plan beginning at this observation, (H',
+                D) or (B, H', D), which LeRobot pads with rows of zeros.
         """
         rtc = getattr(self.config, "rtc_config", None)
         left = prev_chunk_left_over if rtc is None or rtc.enabled else None
@@ -130,7 +129,7 @@ class VlagentsPolicy(PreTrainedPolicy):
                 "executed, so that its chunks would not fit together, got rtc; use "
                 "--inference.type=sync, serve a policy with real-time chunking and `actions: "
                 "chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep the robot "
-                "moving while another policy computes, drive it by vlagents_ray's own "
+                "moving while another policy computes, drive it with vlagents_ray's own "
                 "ChunkPlayer(agent, mode='async')"
             )
         return True
@@ -140,7 +139,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         different threads.
 
         LeRobot calls this once `config.rtc_config` is set. Raises `ConfigError` for settings that
-        the server has.
+        only the server may set.
         """
         wanted, usual = self.config.rtc_config, RTCConfig()
         if changed := [name for name in _GUIDANCE if getattr(wanted, name) != getattr(usual, name)]:
@@ -169,7 +168,7 @@ class VlagentsPolicy(PreTrainedPolicy):
 
 
 class _Robot:
-    """The robot or the environments of LeRobot's command, as far as it states them."""
+    """The robot or the environments of LeRobot's command, as far as the command describes them."""
 
     def __init__(self, config: VlagentsConfig, dataset_meta: Any) -> None:
         self.config = config
@@ -182,23 +181,21 @@ class _Robot:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the loop has ticks that can be missed: it is one of a robot, and its rate is
-        known.
-        """
+        """Whether the loop can miss ticks: it controls a robot, and its rate is known."""
         return self.hz is not None and self.config.priority == "robot"
 
     def ticks_in(self, waited_s: float) -> int:
-        """Return the number of ticks that the loop misses while it waits, beside the one that
-        waits.
+        """Return the number of ticks that the loop misses while it waits, in addition to the
+        waiting tick.
         """
         return int(waited_s * self.hz) if self.hz is not None and self.is_timed else 0
 
     def connect(self) -> RemoteAgent:
-        """Return a connection to the server, which is ready."""
+        """Return a connection to the server, after the server is ready."""
         config = self.config
         if not config.url:
             raise ConfigError(
-                "policy.url: expected the server's, got none; set it, as "
+                "policy.url: expected the server's URL, got none; set it, as "
                 "--policy.url=http://gpu-box:8000"
             )
         certificate = (config.certificate[0], config.certificate[1]) if config.certificate else None
@@ -233,7 +230,7 @@ class _Robot:
     def mapping(
         self, agent: RemoteAgent, shapes: Mapping[str, Sequence[int]]
     ) -> ObservationMapping:
-        """Return the mapping of observations of these shapes to the policy's; raises
+        """Return the mapping from observations of these shapes to the policy's inputs; raises
         `ContractMismatch`.
         """
         found = ObservationMapping(self.config, agent.contract, shapes, self.names)
@@ -241,8 +238,8 @@ class _Robot:
         return found
 
     def fit(self, agent: RemoteAgent, mapping: ObservationMapping) -> Fit:
-        """Return the comparison of the policy's numbers with the robot's; an environment is not
-        compared.
+        """Return the comparison of the policy's statistics with the robot's numbers; environments
+        are not compared.
         """
         statistics = agent.statistics if self.config.priority == "robot" else None
         trained, parts = (
@@ -261,17 +258,18 @@ class _Sessions:
         self.agent = robot.connect()
         self._agents: list[RemoteAgent] = []
         self._rows: list[deque[np.ndarray]] = []
-        self._mapping: ObservationMapping | None = None  # None before the first episodes
-        # Comparison of the next chunks with the robot; None once it is done.
+        # The mapping; None before the first episodes.
+        self._mapping: ObservationMapping | None = None
+        # Comparison of the next chunks with the robot; None once it has been made.
         self._fit: Fit | None = None
         self._due = True  # whether the next batch begins episodes
-        self._begun = 0  # episodes so far
-        # For each session, since its last request: the ticks of LeRobot's loop, and the ticks that
+        self._begun = 0  # number of episodes so far
+        # For each session: the ticks of LeRobot's loop since the last request, and the ticks that
         # it missed while it waited for a chunk.
         self._ticks: list[list[int]] = []
 
     def reset(self) -> None:
-        """Begin episodes with the next batch; another thread may be in `chunks`."""
+        """Begin episodes with the next batch; another thread may be running `chunks`."""
         self._due = True
 
     def next_rows(self, batch: Mapping[str, Any]) -> np.ndarray:
@@ -295,8 +293,8 @@ class _Sessions:
         return np.stack([rows.popleft() for rows in self._rows])
 
     def _report(self, row: int) -> dict[str, Any]:
-        """Return the ticks since the session's last request as the info of its next one; nothing
-        for simulations, and for loops of an unknown rate.
+        """Return the ticks since the session's last request, as the info of the next request;
+        return nothing for simulations, and for loops whose rate is unknown.
         """
         if not self._robot.is_timed:
             return {}
@@ -304,14 +302,14 @@ class _Sessions:
         return {TICKS: ticks}
 
     def chunks(self, batch: Mapping[str, Any], plans: Sequence[dict[str, Any]]) -> list[np.ndarray]:
-        """Return a new chunk of each session, (H, D) float32 each, which continues its plan if
-        it has one.
+        """Return a new chunk for each session, (H, D) float32 each, which continues the session's
+        plan if there is one.
         """
         begun = self._begin_if_due(batch)
         return self._act(batch, range(len(self._agents)), () if begun else plans)
 
     def _begin_if_due(self, batch: Mapping[str, Any]) -> bool:
-        """Begin episodes if they are due; returns whether they were."""
+        """Begin episodes if they are due, and return whether they were."""
         size = _size(batch)
         if not self._due and size == len(self._agents):
             return False
@@ -327,7 +325,7 @@ class _Sessions:
         mapping = self._robot.mapping(self.agent, shapes_of_batch(batch))
         if mapping.unused and not self._begun:
             logger.info(
-                "cameras that the policy does not take, and that are not sent: %s", mapping.unused
+                "cameras that the policy does not use, and that are not sent: %s", mapping.unused
             )
         if size != len(self._agents):
             for agent in self._agents:
@@ -370,7 +368,7 @@ class _Sessions:
         if odd := [chunk.shape[1] for chunk in chunks if want not in (None, chunk.shape[1])]:
             raise ContractMismatch(
                 f"action: expected {want} numbers in each row, as this robot has, got {odd[0]} "
-                "from the server; check whether this is another robot's policy"
+                f"from the server; check whether this is another robot's policy"
             )
         if self._fit is not None:
             for chunk in chunks:
@@ -399,10 +397,9 @@ def _size(batch: Mapping[str, Any]) -> int:
 
 
 def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, Any]]:
-    """Return the `Obs.info` of real-time chunking of each session; none without a plan.
-
-    LeRobot pads a plan to its execution horizon with rows of zeros. Its rows are actions, not
-    normalised.
+    """Return each session's `Obs.info` for real-time chunking, which is empty without a plan.
+    LeRobot pads a plan with rows of zeros to the execution horizon. The rows of a plan are actions
+    that are not normalised.
     """
     if left is None:
         return []
@@ -414,8 +411,8 @@ def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, A
 
 
 def _names(names: Any) -> list[str]:
-    """Return the names of a feature's values, which a dataset lists, or maps from a group to a
-    list.
+    """Return the names of a feature's values. A dataset has them as a list, or as a mapping from
+    groups to lists.
     """
     groups = names.values() if isinstance(names, Mapping) else [names or []]
     return [str(name) for group in groups for name in group]

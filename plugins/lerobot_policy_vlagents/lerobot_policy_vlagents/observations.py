@@ -1,4 +1,4 @@
-"""Observations with LeRobot's names as those of the server's policy."""
+"""Converts observations with LeRobot's names to observations of the server's policy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from vlagents_ray.dataset_contract import divided_state, state_parts, wanted_par
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.naming import did_you_mean
 
-# Key of the image of an environment with one camera; others have `observation.images.NAME`.
+# Key of the image of an environment with one camera; with several cameras the keys are
+# `observation.images.NAME`.
 _IMAGE = "observation.image"
 _STATES = (OBS_STATE, OBS_ENV_STATE)
 _STATE_OPTION = "--policy.state='[joints, gripper]'"
@@ -39,7 +40,7 @@ class ObservationMapping:
 
         Args:
             config: The options.
-            policy: The contract of the server's policy; None if it states none.
+            policy: The contract of the server's policy; None if it has none.
             shapes: The shape of each feature, without the batch's dimension: images (C, H, W),
                 states (D,).
             names: The names of the values in `observation.state`; empty if they are unknown.
@@ -72,7 +73,7 @@ class ObservationMapping:
     def contract(
         self, action_dim: int | None, control_hz: float | None, action_names: Sequence[str] = ()
     ) -> Contract:
-        """Return the contract of the robot or the environment, as far as LeRobot states it."""
+        """Return the contract of the robot or the environment, as far as LeRobot describes it."""
         sizes = {name: self._shapes[key][1:] for name, key in self._cameras_here.items()}
         listed = [part for parts in self.parts.values() for part in parts]
         return Contract(
@@ -108,7 +109,7 @@ def shapes_of_features(features: Mapping[str, PolicyFeature]) -> dict[str, Seque
     """Return the shapes of images and states; None if LeRobot composes the state later."""
     states = {key for key, feature in features.items() if feature.type is FeatureType.STATE}
     if states - {OBS_STATE}:
-        return None  # LIBERO: LeRobot joins them to `observation.state` at each step
+        return None  # In LIBERO, LeRobot joins these values to `observation.state` at each step.
     return {
         key: feature.shape
         for key, feature in features.items()
@@ -134,7 +135,7 @@ def require_fit(policy: Contract | None, here: Contract) -> None:
 def _parts(
     config: VlagentsConfig, policy: Contract | None, widths: Mapping[str, int], names: Sequence[str]
 ) -> dict[str, list[tuple[str, int]]]:
-    """Return the parts in each feature that is a state, in their order, with their sizes."""
+    """Return, for each feature that is a state, its parts in order, with their sizes."""
     found: dict[str, list[tuple[str, int]]] = {}
     if OBS_ENV_STATE in widths:
         part = OBS_ENV_STATE.rpartition(".")[2]
@@ -155,8 +156,8 @@ def _parts(
             if sorted(chosen) != sorted(wanted):
                 raise ConfigError(
                     f"observation.state: expected the parts {wanted} of the policy, got the "
-                    f"values {list(names) or 'without names'}; name the parts in the order in "
-                    f"which they are in it: {_STATE_OPTION}"
+                    f"values {list(names) or 'without names'}; name the parts in the order of the "
+                    f"vector: {_STATE_OPTION}"
                 )
         found[OBS_STATE] = state_parts(
             widths[OBS_STATE], policy, chosen or None, option=_STATE_OPTION
@@ -169,8 +170,8 @@ def _short(key: str) -> str:
 
 
 def _image(tensor: torch.Tensor) -> np.ndarray:
-    """Return an image (C, H, W) in [0, 1], which LeRobot made of bytes, as those bytes, (H, W,
-    C) uint8.
+    """Convert an image (C, H, W) in [0, 1], which LeRobot computed from bytes, back to these bytes,
+    (H, W, C) uint8.
     """
     if tensor.is_floating_point():
         tensor = (

@@ -15,7 +15,7 @@ from lerobot.utils.constants import (
 def make_vlagents_pre_post_processors(
     *_: object, **__: object
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Return LeRobot's two pipelines without a step."""
+    """Return LeRobot's two pipelines, which have no steps."""
     return (
         PolicyProcessorPipeline(steps=[], name=POLICY_PREPROCESSOR_DEFAULT_NAME),
         PolicyProcessorPipeline(

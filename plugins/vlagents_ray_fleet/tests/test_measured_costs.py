@@ -1,4 +1,4 @@
-"""The plan of a fleet from the durations that a running server has measured of its batches."""
+"""Tests of the plan of a fleet with the durations of batches that a running server has measured."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ GPUS = {"count": 1, "memory_gb": 80}
 
 @contextlib.contextmanager
 def serving(agent: Agent, **metadata: Any) -> Iterator[str]:
-    """The address of a server whose metadata has the costs that it measures, or those given."""
+    """Yield the address of a server whose metadata contain the costs that it measures, or those in
+    `metadata`.
+    """
     engine = Engine(agent)
     engine.start()
 
@@ -58,7 +60,7 @@ def serving(agent: Agent, **metadata: Any) -> Iterator[str]:
 
 
 def drive(url: str, seconds: float, warm_s: float) -> float:
-    """Drive robots at their rate; the share of their ticks in time after `warm_s`."""
+    """Run robots at their rate, and return the share of their ticks in time after `warm_s`."""
     begin = threading.Barrier(ROBOTS)
 
     def run(_: int) -> tuple[int, int]:
@@ -83,7 +85,7 @@ def drive(url: str, seconds: float, warm_s: float) -> float:
 
 
 def planned(costs: dict[str, Any]) -> FleetPlan:
-    """The plan of the robots with a model of these costs."""
+    """Return the plan of the robots with a model of these costs."""
     return plan(
         FleetFile(
             robots={"arms": {"count": ROBOTS, "hz": HZ, "models": {"pi0": {"rows": ROWS}}}},

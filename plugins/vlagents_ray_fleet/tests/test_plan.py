@@ -1,4 +1,6 @@
-"""The plan of a fleet: enough GPUs and no more, in time in the simulation, and a file to serve."""
+"""Tests of the plan of a fleet: it has no more GPUs than needed, its robots are in time in the
+simulation, and its file can be served.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ GPUS = {"count": 8, "memory_gb": 80}
 
 
 def robots(count: int, hz: float, rows: int, model: str = "pi0", **more: Any) -> dict[str, Any]:
-    """Robots of one group with one model."""
+    """Return a group of robots that use one model."""
     return {"count": count, "hz": hz, "models": {model: {"rows": rows}}, **more}
 
 
@@ -57,7 +59,7 @@ def fleet(gpus: int = 8, **values: Any) -> FleetFile:
 
 
 def shares_of_gpus(solved: FleetPlan) -> list[float]:
-    """Return how much of each used GPU its replicas have."""
+    """Return the share of each used GPU that replicas have."""
     shares: list[float] = []
     for layout, count in solved.gpus:
         used_parts = sum(piece.parts * replicas for piece, replicas in layout.pieces)

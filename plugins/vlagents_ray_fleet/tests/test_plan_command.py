@@ -1,4 +1,4 @@
-"""`vlagents-ray plan` prints the plan, checks it, and writes a file that `serve` takes."""
+"""Tests that `vlagents-ray plan` prints the plan, checks it, and writes a file for `serve`."""
 
 from __future__ import annotations
 

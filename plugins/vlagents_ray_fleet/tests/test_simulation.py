@@ -1,4 +1,4 @@
-"""The simulation of a fleet keeps the rules of the chunk player and of the queue."""
+"""Tests that the simulation of a fleet follows the rules of the chunk player and of the queue."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ AT_WILL = Behaviour(jitter=0.0, transport_jitter_s=0.0, replan=False)
 
 
 def lone(need: RobotNeed, costs: CostCurve, behaviour: Behaviour = EXACT) -> tuple[World, Tally]:
-    """A robot that has acted for 60 s at a replica of its own."""
+    """Simulate a single robot at a replica for 60 s, and return the world and the counts of
+    ticks.
+    """
     world = World(behaviour=behaviour, transport_s=0.0)
     world.add_replica("model", costs, 16)
     tally = Tally()
@@ -27,7 +29,8 @@ def lone(need: RobotNeed, costs: CostCurve, behaviour: Behaviour = EXACT) -> tup
 def test_a_robot_that_asks_at_will_replans_at_each_tick_within_an_answer() -> None:
     world, tally = lone(RobotNeed(10.0, 50), CostCurve(0.25), AT_WILL)
     assert tally.starved == 0
-    # An answer of 250 ms is there at the third tick, and is executed for three.
+    # An answer that takes 250 ms is available at the third tick, and its rows are executed for
+    # three ticks.
     assert tally.age_s(0.999) == pytest.approx(0.5, abs=0.002)
     [replica] = world.replicas["model"]
     assert replica.requests == pytest.approx(60 / 0.3, abs=2)
@@ -58,8 +61,9 @@ def test_single_actions_need_an_answer_within_a_tick() -> None:
 
 
 def test_a_robot_without_rows_holds_still_with_its_plan() -> None:
-    # An answer takes 1.5 s, and has rows for a second. The request that is sent when a plan begins
-    # is answered too late, but for its last row; that of a robot without a plan has all of them.
+    # An answer takes 1.5 s, and has rows for one second. A request that is sent when a plan begins
+    # is answered too late, except for its last row. A robot without a plan executes all rows of its
+    # answer.
     _, tally = lone(RobotNeed(10.0, 10), CostCurve(1.5))
     cycle_ticks = 15 + 15
     assert tally.share == pytest.approx(11 / cycle_ticks, abs=0.05)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from vlagents_ray_fleet.plan import FleetPlan
 from vlagents_ray_fleet.simulation import USUAL, Behaviour, Stream, Tally, World
 
-_WARM_UP_S = 5.0  # within which all robots start
+_WARM_UP_S = 5.0  # time within which all robots start, s
 
 
 @dataclass(frozen=True)
 class GroupCheck:
-    """What the robots of one group got from one model in the simulation."""
+    """The result of the simulation for the robots of one group and one model."""
 
     model: str
     group: str
@@ -21,12 +21,12 @@ class GroupCheck:
     predicted_share: float
     age_p95_ms: float
     predicted_age_p95_ms: float
-    robots_in_time: int  # whose own share is at least their target
+    robots_in_time: int  # number of robots whose share is at least their target
     robots: int
 
     @property
     def points(self) -> float:
-        """The error of the predicted share, in points of a hundred."""
+        """The error of the predicted share, in percentage points."""
         return 100 * abs(self.share - self.predicted_share)
 
 
@@ -45,7 +45,7 @@ def check(
     seed: int = 0,
     behaviour: Behaviour = USUAL,
 ) -> Check:
-    """Run the plan for a time, s, after all robots have started."""
+    """Simulate the plan until `seconds` after all robots have started."""
     draw = random.Random(seed)
     groups = []
     requests = 0

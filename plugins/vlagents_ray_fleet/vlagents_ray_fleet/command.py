@@ -24,7 +24,10 @@ def plan_command(
         typer.Option("--out", metavar="FILE", help="Write the plan as a deployment file."),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Run the plan in the simulation, and compare.")
+        bool,
+        typer.Option(
+            "--check", help="Simulate the plan, and compare the results with the prediction."
+        ),
     ] = False,
     seconds: Annotated[
         float,
@@ -80,8 +83,8 @@ def plan_command(
             wanted = sum(plan.robots_wanted.values())
             missing = plan.gpus_needed - plan.gpus_at_hand
             fail(
-                f"{plan.gpus_at_hand} GPUs serve {served} of {wanted} robots in time; all of them "
-                f"need {plan.gpus_needed}, {missing} more",
+                f"{plan.gpus_at_hand} GPUs serve {served} of {wanted} robots in time; all robots "
+                f"need {plan.gpus_needed} GPUs, {missing} more",
                 1,
             )
 

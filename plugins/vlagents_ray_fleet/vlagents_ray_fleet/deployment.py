@@ -1,4 +1,4 @@
-"""The deployment file of a plan, which `vlagents-ray serve` takes."""
+"""The deployment file of a plan, for `vlagents-ray serve`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def deployment_document(fleet: FleetFile, plan: FleetPlan, folder: Path) -> dict
 
     Args:
         fleet: The file of the fleet.
-        plan: Its plan.
-        folder: The folder from which the file names deployment files.
+        plan: The plan of the fleet.
+        folder: The folder to which the names of deployment files in the fleet's file are relative.
 
     Raises:
         ConfigError: A model has no policy, or its deployment file cannot be read.
@@ -51,7 +51,7 @@ def write_deployment(document: dict[str, Any], file: Path, source: str) -> None:
         source: The name of the file of the fleet, for the comment at the top.
 
     Raises:
-        ConfigError: The file has another suffix than .yaml or .yml, or its settings are wrong.
+        ConfigError: The suffix of the file is neither .yaml nor .yml, or a setting is wrong.
     """
     if file.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--out: expected a YAML file (.yaml), got {str(file)!r}")
@@ -75,7 +75,7 @@ def _arguments(model: FleetModel, plan: ModelPlan, folder: Path) -> dict[str, An
             f"write `deployment: deployments/{plan.model}.yaml`"
         )
 
-    # The plan decides on these, whatever the deployment file of one robot says.
+    # The plan determines these settings, whatever the deployment file for a single robot contains.
     arguments.pop("autoscaling", None)
     batch = {"max_size": plan.batch_size}
     patience = (arguments.get("batch") or {}).get("patience")

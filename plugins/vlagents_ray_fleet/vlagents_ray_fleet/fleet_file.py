@@ -1,4 +1,4 @@
-"""The file of a fleet: its robots, the models that they need, and the GPUs at hand."""
+"""The file of a fleet: its robots, the models that they need, and the available GPUs."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from vlagents_ray.serve.fleet import USABLE, CostCurve
 from vlagents_ray.settings import wrong_settings
 
 MOST_LOAD = 0.8
-"""The largest load with which a plan fills a replica: the largest one at which each robot had at
-least 98 % of its ticks in time in the simulation of six kinds of robots, all of which began within
-3 s (`python -m benchmarks.fleet_plans --loads`). At 0.85, robots of one kind had less; the margin
-to `USABLE` is for them, and for replicas with more than their share of the sessions.
+"""The maximum load that a plan gives to a replica. It is the largest load at which, in the
+simulation of six kinds of robots that all began within 3 s, each robot had at least 98 % of its
+ticks in time (`python -m benchmarks.fleet_plans --loads`). At 0.85, robots of one kind had less;
+the margin to `USABLE` is for these robots, and for replicas with more than their share of the
+sessions.
 """
 
-_SERVER_S = 10.0  # longest wait for the costs that a running replica has measured
+_SERVER_S = 10.0  # time limit for the request of the costs that a running replica has measured, s
 _MOST_MS = 1e9
 _MOST_HZ = 1e4
 _MOST_GB = 1e6
@@ -42,13 +43,14 @@ class ModelUse(_FleetModel):
     """How the robots of a group use one model."""
 
     rows: int = Field(
-        default=1, ge=1, le=MOST_ROWS, description="rows of its chunks that are executed"
+        default=1, ge=1, le=MOST_ROWS, description="number of rows of each chunk that are executed"
     )
     hz: Hertz | None = Field(
-        default=None, description="rows a second; default: the rate of the robots"
+        default=None, description="rows per second; default: the rate of the robots"
     )
     age_ms: Milliseconds | None = Field(
-        default=None, description="largest age of an executed row; default: that of the robots"
+        default=None,
+        description="maximum age of an executed row; default: the maximum age of the robots",
     )
 
 
@@ -56,21 +58,23 @@ class RobotGroup(_FleetModel):
     """Robots with the same needs."""
 
     count: int = Field(ge=1, le=_MOST_ROBOTS, examples=[12])
-    hz: Hertz = Field(examples=[10], description="ticks of the control loop a second")
+    hz: Hertz = Field(examples=[10], description="ticks of the control loop per second")
     share: float = Field(
-        default=0.98, gt=0, le=1, description="of the ticks that must have an action in time"
+        default=0.98, gt=0, le=1, description="share of the ticks that must have an action in time"
     )
     age_ms: Milliseconds | None = Field(
-        default=None, description="largest age of an executed action; unset: any"
+        default=None, description="maximum age of an executed action; unset: any"
     )
     transport_ms: float = Field(
         default=5.0,
         ge=0,
         le=_MOST_MS,
-        description="time that a request and its answer spend on the way, with their coding",
+        description="time for the transport, encoding and decoding of a request and its answer",
     )
     models: dict[Name, ModelUse] = Field(
-        min_length=1, examples=["{pi0: {rows: 50}}"], description="by the names below `models`"
+        min_length=1,
+        examples=["{pi0: {rows: 50}}"],
+        description="uses of models, by the models' names below `models`",
     )
 
 
@@ -78,7 +82,7 @@ class Costs(_FleetModel):
     """The duration of a batch over its number of rows, on a whole GPU."""
 
     fixed_ms: float | None = Field(
-        default=None, ge=0, le=_MOST_MS, description="of a batch, whatever its size"
+        default=None, ge=0, le=_MOST_MS, description="duration of a batch, independent of its size"
     )
     row_ms: float | None = Field(default=None, ge=0, le=_MOST_MS, description="of each row")
     table: dict[Annotated[int, Field(ge=1, le=MOST_ROWS)], Milliseconds] | None = Field(
@@ -87,7 +91,8 @@ class Costs(_FleetModel):
     )
     url: str | None = Field(
         default=None,
-        description="address of a server of the model, which measures its batches as it runs",
+        description="address of a running server of the model, which measures the durations of "
+        "its batches",
         examples=["http://gpu-box:8000/pi0"],
     )
 
@@ -102,15 +107,15 @@ class Costs(_FleetModel):
             )
         if is_line and None in (self.fixed_ms, self.row_ms):
             raise ValueError(
-                f"expected fixed_ms with row_ms, got {sorted(self.model_fields_set)}; write "
-                "both, where 0 is none"
+                f"expected fixed_ms with row_ms, got {sorted(self.model_fields_set)}; write both; "
+                f"0 is allowed"
             )
         if is_line:
             self.curve()
         return self
 
     def curve(self) -> CostCurve:
-        """Return the curve; with `url`, as its server answers.
+        """Return the curve; with `url`, request it from the server.
 
         Raises:
             ConfigError: The costs are not above 0, or the server has measured too few batches.
@@ -131,7 +136,7 @@ class FleetModel(_FleetModel):
         gt=0, le=_MOST_GB, examples=[9], description="GPU memory of one replica"
     )
     max_batch_size: int = Field(
-        default=16, ge=1, le=MOST_ROWS, description="the largest batch that was measured"
+        default=16, ge=1, le=MOST_ROWS, description="largest batch that was measured"
     )
     gpu_fraction: float | None = Field(
         default=None,
@@ -143,12 +148,12 @@ class FleetModel(_FleetModel):
         default=MOST_LOAD,
         gt=0,
         le=USABLE,
-        description="largest load of a replica: requests a second that its robots need, as a share "
-        "of those that it can answer",
+        description="maximum load of a replica: the requests per second that its robots need, as "
+        "a share of the requests that it can answer",
     )
     deployment: str | None = Field(
         default=None,
-        description="deployment file with the settings of the policy, seen from the file of the "
+        description="deployment file with the settings of the policy, relative to the file of the "
         "fleet",
     )
     policy: str | None = Field(
@@ -164,7 +169,7 @@ class FleetModel(_FleetModel):
 
 
 class GpuPool(_FleetModel):
-    """The GPUs at hand, all of one kind."""
+    """The available GPUs, all of one kind."""
 
     count: int = Field(ge=1, le=MOST_WORKERS, examples=[4])
     memory_gb: float = Field(gt=0, le=_MOST_GB, examples=[80], description="of each")
@@ -172,7 +177,8 @@ class GpuPool(_FleetModel):
         default=0.1,
         gt=0,
         le=1,
-        description="smallest share of a GPU that the plan gives to a replica; 1 never shares",
+        description="smallest share of a GPU that the plan gives to a replica; with 1, GPUs are "
+        "never shared",
     )
 
 
@@ -210,14 +216,14 @@ class FleetFile(_FleetModel):
 
 
 def read_fleet(file: Path | str, overrides: Sequence[Override] = ()) -> FleetFile:
-    """Read the file of a fleet, and change it.
+    """Read the file of a fleet, and apply changes.
 
     Args:
         file: The file.
         overrides: The changes, as `parse_overrides` returns them.
 
     Raises:
-        ConfigError: The file cannot be read or changed so, or a setting is wrong.
+        ConfigError: The file cannot be read, a change cannot be applied, or a setting is wrong.
     """
     keys = "`models`, `robots` and `gpus`"
     document = read_config_file(file, "file of a fleet", keys, overrides=overrides)
@@ -228,7 +234,7 @@ def read_fleet(file: Path | str, overrides: Sequence[Override] = ()) -> FleetFil
 
 
 def _curve_at(url: str) -> CostCurve:
-    """Return the durations of batches that a server has measured as it ran."""
+    """Return the durations of batches that a running server has measured."""
     try:
         with RemoteAgent(url, timeout_s=_SERVER_S) as server:
             measured = server.metadata.get("batch_costs")

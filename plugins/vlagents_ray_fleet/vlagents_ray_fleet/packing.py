@@ -1,10 +1,10 @@
 """The assignment of replicas to GPUs, as an integer program that `scipy.optimize.milp` solves.
 
-The replicas of a model all reserve the same share of a GPU, as Ray knows one number for a
-deployment. A *layout* is what one GPU may hold: replicas with their shares, whose sum is at most 1
-and whose memory fits. The program chooses for each model how many replicas with which share it has,
-and how many GPUs have which layout: layouts have no order, so the program has no equal solutions
-that differ only in the numbers of the GPUs.
+All replicas of a model reserve the same share of a GPU, as Ray accepts one number for a deployment.
+A *layout* is the possible content of one GPU: replicas with their shares, whose sum is at most 1
+and whose memory fits. The program chooses the number of replicas of each model and their share, and
+the number of GPUs with each layout. Layouts have no order, so no two solutions differ only in the
+order of the GPUs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from vlagents_ray.errors import ConfigError
 
-_MOST_LAYOUTS = 20_000  # above this number a solution may take minutes
-_LOAD_WEIGHT = 1e-3  # weight of the sum of loads, beside the largest load
-_SOLVE_S = 60.0  # longest time for one solution, s
+_MOST_LAYOUTS = 20_000  # maximum number of layouts; with more, a solution may take minutes
+_LOAD_WEIGHT = 1e-3  # weight of the sum of loads relative to the largest load
+_SOLVE_S = 60.0  # time limit for one solution, s
 
 
 class Piece(NamedTuple):
     """A replica of a model with its share of a GPU."""
 
     model: str
-    parts: int  # number of the equal parts of a GPU
+    parts: int  # the share as a number of equal parts of a GPU
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Choice:
 
     piece: Piece
     replicas: int
-    load: float  # load of its fullest replica
+    load: float  # load of the replica with the highest load
 
 
 class Layout(NamedTuple):
-    """What one GPU holds: the number of replicas by piece."""
+    """The content of one GPU: the number of replicas by piece."""
 
     pieces: tuple[tuple[Piece, int], ...]
 
@@ -70,7 +70,7 @@ def layouts(
         gpu_memory_gb: The memory of a GPU, GB.
 
     Raises:
-        ConfigError: There are too many of them.
+        ConfigError: There are too many layouts.
     """
     by_model: dict[str, list[Piece]] = {}
     for piece in pieces:
@@ -117,7 +117,7 @@ def _has_room(
     free = parts - sum(piece.parts * count for piece, count in content)
     free_gb = gpu_memory_gb - sum(memory_gb[piece.model] * count for piece, count in content)
     for model, pieces in by_model.items():
-        # A model has one piece, so a layout with a second one of it is never used.
+        # A model has one piece, so a layout with two different pieces of a model is never used.
         smallest = held[model].parts if model in held else min(piece.parts for piece in pieces)
         if smallest <= free and memory_gb[model] <= free_gb + 1e-9:
             return True
@@ -136,7 +136,7 @@ def fewest_gpus(choices: Sequence[Choice], ways: Sequence[Layout]) -> Packing:
 
 
 def least_load(choices: Sequence[Choice], ways: Sequence[Layout], gpus: int) -> Packing:
-    """Return the packing on at most `gpus` GPUs whose fullest model has the least load."""
+    """Return the packing on at most `gpus` GPUs with the smallest maximum load of a model."""
     loads = _LOAD_WEIGHT * np.array([choice.load for choice in choices])
     cost = np.concatenate([loads, np.zeros(len(ways)), [1.0]])
     return _solve(choices, ways, cost, gpus)
@@ -145,7 +145,7 @@ def least_load(choices: Sequence[Choice], ways: Sequence[Layout], gpus: int) -> 
 def _solve(
     choices: Sequence[Choice], ways: Sequence[Layout], cost: np.ndarray, gpus: int | None
 ) -> Packing:
-    """Solve the program. Its variables are whether each choice is made, the number of GPUs with
+    """Solve the program. The variables are whether each choice is made, the number of GPUs with
     each layout, and the largest load of a model.
     """
     variables = len(choices) + len(ways) + 1
@@ -212,7 +212,7 @@ def _solve(
 def _without_surplus(
     choices: Mapping[str, Choice], ways: Sequence[Layout], counts: np.ndarray
 ) -> list[tuple[Layout, int]]:
-    """Return the GPUs by what they hold, without places for more replicas than were chosen."""
+    """Return the number of GPUs by layout, without places for more replicas than were chosen."""
     missing = {choice.piece: choice.replicas for choice in choices.values()}
     gpus: dict[Layout, int] = {}
     for way, count in zip(ways, counts, strict=True):

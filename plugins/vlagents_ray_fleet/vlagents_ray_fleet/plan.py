@@ -1,8 +1,8 @@
 """The plan of a fleet: replicas, batch sizes and shares of GPUs with which its robots are in time.
 
-The arithmetic of a replica is `vlagents_ray.serve.fleet`, which the server uses as well. A replica
-with a share of a GPU is assumed to compute that share as fast as on a whole one: kernels of several
-processes take turns, so that this holds while all of them have work.
+The arithmetic of a replica is in `vlagents_ray.serve.fleet`, which the server also uses. A replica
+with a share of a GPU is assumed to have that share of the speed of a whole GPU. Kernels of several
+processes alternate, so this is right while all processes have work.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from vlagents_ray_fleet.packing import (
     least_load,
 )
 
-_MOST_CHOICES = 24  # numbers of replicas that are compared for one share of a GPU
+_MOST_CHOICES = 24  # maximum number of replica counts that are compared for one share of a GPU
 
 
 @dataclass(frozen=True)
 class Use:
-    """The robots of one group at one model."""
+    """The robots of one group that use one model."""
 
     group: str
     need: RobotNeed
@@ -44,11 +44,11 @@ class Demand:
     """A model, and all robots that use it."""
 
     model: str
-    costs: CostCurve  # on a whole GPU
+    costs: CostCurve  # durations on a whole GPU
     memory_gb: float
     max_batch_size: int
-    gpu_fraction: float | None  # None: the plan chooses it
-    max_load: float  # max load of a replica
+    gpu_fraction: float | None  # share of a GPU; None if the plan chooses it
+    max_load: float  # maximum load of a replica
     uses: tuple[Use, ...]
 
     @property
@@ -58,7 +58,7 @@ class Demand:
 
     @property
     def transport_s(self) -> float:
-        """The longest transport of its robots, s."""
+        """The longest transport time of the model's robots, s."""
         return max(use.transport_s for use in self.uses)
 
     def costs_on(self, fraction: float) -> CostCurve:
@@ -71,7 +71,7 @@ class Demand:
         )
 
     def dealt(self, replicas: int) -> list[dict[RobotNeed, int]]:
-        """Return the robots of each replica, if they are dealt out in turns."""
+        """Return the robots of each replica if they are assigned to the replicas in turn."""
         hands: list[dict[RobotNeed, int]] = [{} for _ in range(replicas)]
         first = 0
         for use in self.uses:
@@ -84,7 +84,7 @@ class Demand:
         return hands
 
     def fullest(self, replicas: int, fraction: float) -> ReplicaLoad:
-        """Return the load of the fullest of these replicas."""
+        """Return the highest load of these replicas."""
         costs = self.costs_on(fraction)
         hands = {tuple(hand.items()): hand for hand in self.dealt(replicas)}
         loads = [
@@ -96,7 +96,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class GroupPlan:
-    """What the robots of one group are predicted to get from one model."""
+    """The prediction for the robots of one group and one model."""
 
     group: str
     robots: int
@@ -105,8 +105,8 @@ class GroupPlan:
     share: float  # share of ticks with an action in time
     target_share: float
     replan_ms: float  # time between two requests of a robot
-    slack_ms: float  # time by which an answer comes before the robot needs it
-    age_p95_ms: float  # 95th percentile of their ages
+    slack_ms: float  # time between the arrival of an answer and the tick that needs it
+    age_p95_ms: float  # 95th percentile of the ages of executed actions
     target_age_ms: float | None
 
 
@@ -118,7 +118,7 @@ class ModelPlan:
     replicas: int
     gpu_fraction: float
     batch_size: int
-    load: float  # load of its fullest replica
+    load: float  # load of the replica with the highest load
     latency_ms: float  # longest time from a request to its answer
     groups: tuple[GroupPlan, ...]
 
@@ -128,13 +128,13 @@ class FleetPlan:
     """The plan of a fleet, or of the largest part of it that the GPUs can serve."""
 
     models: tuple[ModelPlan, ...]
-    gpus: tuple[tuple[Layout, int], ...]  # what GPUs hold, and how many hold it
-    parts: int  # the equal parts of a GPU in which layouts count
+    gpus: tuple[tuple[Layout, int], ...]  # each layout, and the number of GPUs with it
+    parts: int  # the number of equal parts of a GPU in which layouts count
     gpus_at_hand: int
-    gpus_needed: int  # by the whole fleet
-    robots: Mapping[str, int]  # robots of each group, that are served
+    gpus_needed: int  # number of GPUs that the whole fleet needs
+    robots: Mapping[str, int]  # number of served robots in each group
     robots_wanted: Mapping[str, int]
-    demands: tuple[Demand, ...]  # demands of the robots that are served
+    demands: tuple[Demand, ...]  # demands of the served robots
 
     @property
     def is_complete(self) -> bool:
@@ -178,7 +178,7 @@ class FleetPlan:
 def plan(fleet: FleetFile) -> FleetPlan:
     """Compute the plan of a fleet.
 
-    If the GPUs are too few, the plan is that of the largest fleet that they serve, whose groups
+    If the GPUs are too few, the plan is for the largest fleet that they can serve, whose groups
     have the same proportions.
 
     Raises:
@@ -207,7 +207,7 @@ def plan(fleet: FleetFile) -> FleetPlan:
     if best is None:
         raise ConfigError(
             f"gpus: expected at least {needed.gpus} GPUs for these robots, got "
-            f"{fleet.gpus.count}, which serve none of them in time"
+            f"{fleet.gpus.count}, which serve none of the robots in time"
         )
     demands, packing, counts = best
     return _with_slack(demands, fleet.gpus, packing, needed.gpus, counts, robots_wanted)
@@ -245,7 +245,9 @@ def _demands(
 
 
 def _in_proportion(robots_wanted: Mapping[str, int], robots: int) -> dict[str, int]:
-    """Return `robots` robots in about the proportions of the wanted ones."""
+    """Return the numbers of robots by group, `robots` in total, in about the proportions of the
+    wanted robots.
+    """
     total = sum(robots_wanted.values())
     exact = {group: count * robots / total for group, count in robots_wanted.items()}
     counts = {group: math.floor(value) for group, value in exact.items()}
@@ -277,7 +279,8 @@ def _pieces(demand: Demand, pool: GpuPool, parts: int) -> Iterator[Piece]:
         return
     smallest = max(1, math.ceil(pool.finest_fraction * parts - 1e-9))
     for share in range(smallest, parts + 1, smallest):
-        # Replicas that fit no more often than larger ones only waste what is left.
+        # Replicas of which no more fit on a GPU than of larger ones would waste the remaining
+        # share.
         if share == parts or demand.memory_gb <= pool.memory_gb:
             yield Piece(demand.model, share)
 
@@ -298,7 +301,9 @@ def _fewest_replicas(demand: Demand, fraction: float) -> int | None:
 
 
 def _choices(demand: Demand, pool: GpuPool, parts: int) -> list[Choice]:
-    """Return the way to serve a model with the fewest replicas, by their share of a GPU."""
+    """Return, for each possible share of a GPU, the choice that serves a model with the fewest
+    replicas.
+    """
     choices = []
     for piece in _pieces(demand, pool, parts):
         fraction = piece.parts / parts
@@ -312,7 +317,7 @@ def _choices(demand: Demand, pool: GpuPool, parts: int) -> list[Choice]:
 
 
 def _too_slow(demand: Demand) -> str:
-    """Return why no replica can serve the robots of a model in time."""
+    """Return the reason why no replica can serve the robots of a model in time, with a cure."""
     fraction = demand.gpu_fraction or 1.0
     costs = demand.costs_on(fraction)
     for use in demand.uses:
@@ -334,7 +339,7 @@ def _too_slow(demand: Demand) -> str:
 
 
 def _fewest(demands: Sequence[Demand], pool: GpuPool) -> Packing:
-    """Return the packing of these robots on the fewest GPUs, however many are at hand."""
+    """Return the packing of these robots on the fewest GPUs, however many are available."""
     parts = _parts(pool, demands)
     choices: list[Choice] = []
     for demand in demands:
@@ -358,7 +363,7 @@ def _with_slack(
     counts: Mapping[str, int],
     robots_wanted: Mapping[str, int],
 ) -> FleetPlan:
-    """Return the plan on as many GPUs as the packing has, with the least load."""
+    """Return the plan with the smallest load on as many GPUs as the packing has."""
     parts = _parts(pool, demands)
     choices = []
     for demand in demands:
@@ -404,11 +409,9 @@ def _model_plan(demand: Demand, choice: Choice, parts: int) -> ModelPlan:
 
 
 def predicted(use: Use, fullest: ReplicaLoad, costs: CostCurve) -> GroupPlan:
-    """Predict what robots get from a replica.
-
-    A robot asks again after the share of its plan that the server states, at the next tick, and not
-    before the last answer is there. An overloaded replica answers a part of the requests that the
-    robots need.
+    """Predict the service of robots by a replica. A robot sends its next request after the share of
+    its plan that the server declares, at the next tick, and not before the last answer has arrived.
+    An overloaded replica answers only a part of the requests that the robots need.
     """
     need = use.need
     period_s = 1 / need.hz
@@ -418,12 +421,12 @@ def predicted(use: Use, fullest: ReplicaLoad, costs: CostCurve) -> GroupPlan:
     interval_s = need.interval_s(fullest.latency_s)
     share = 1.0 if fullest.in_time else min(1.0, USABLE / fullest.load)
     if need.rows == 1:
-        # It is executed at the first tick after its answer.
+        # The action is executed at the first tick after its answer.
         age_s = math.ceil(usual_s / period_s - 1e-6) * period_s
         slack_s = period_s - fullest.latency_s
     else:
-        # Between two answers the age of the executed actions grows from the duration of an answer
-        # to that of an answer and the time between two requests.
+        # Between two answers, the age of the executed actions grows from the duration of an answer
+        # to this duration plus the time between two requests.
         age_s = usual_s + 0.95 * replan_s
         slack_s = interval_s - replan_s
     return GroupPlan(

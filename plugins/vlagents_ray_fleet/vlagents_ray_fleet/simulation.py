@@ -1,13 +1,13 @@
 """A fleet in virtual time: robots that execute chunks, replicas with the batch queue of the server,
-and what happens to them.
+and their faults.
 
 The order of the requests, their batches and the pace of the robots are those of the server's own
-code, `FairQueue` and `ReplicaPace`. All else is arithmetic: a batch takes the time of the cost
-curve, a message the time of the transport, and a robot follows the rules of the chunk player in
-mode "async": one request at a time with the newest observation, sent at a tick, no earlier than the
-server allows unless the robot would starve; rows for executed ticks are skipped, and a robot
-without a row holds still, with its plan. Ticks are counted, not simulated: nothing but the rows
-that are left changes between two answers. The same seed gives the same result.
+code, `FairQueue` and `ReplicaPace`. Everything else is arithmetic. A batch takes the time of the
+cost curve, and a message the time of the transport. A robot follows the rules of the chunk player
+in mode "async": it sends one request at a time with the newest observation, at a tick, and no
+earlier than the server allows unless it would starve. Rows for ticks that have passed are skipped,
+and a robot without a row holds still. Ticks are counted, not simulated, since only the number of
+remaining rows changes between two answers. The same seed gives the same result.
 """
 
 from __future__ import annotations
@@ -31,37 +31,41 @@ from vlagents_ray.serve.requests import IncomingMessage, PendingRequest
 from vlagents_ray.serve.scaling.slo_load import slo_load
 
 _ACT = Request("act")
-_MESSAGE = IncomingMessage("simulation")  # message of all requests: nothing is delivered
-_DRAWN = 8192  # random delays, which are drawn once, as each message has one
+# The message of all requests, since no answer is delivered.
+_MESSAGE = IncomingMessage("simulation")
+_DRAWN = 8192  # number of random delays, which are drawn once because each message needs one
 _AGE_BIN_S = 0.001
 _AGE_BINS = 120_000
-_FLUSH = 200_000  # runs of ticks that are kept until they are added up
-# As in `vlagents_ray.serve.scaling.rebalancer`: interval of its comparisons, s, and the tolerated
-# excess of a load over the mean one.
+_FLUSH = 200_000  # maximum number of runs of ticks that are kept before they are added up
+# Interval of comparisons, s, and tolerated excess of a load over the mean load, as in
+# `vlagents_ray.serve.scaling.rebalancer`.
 _COMPARE_S = 3.0
 _TOLERATED = 1.25
-# Digits to which loads are rounded, and the tolerance with which they are compared.
+# The number of digits to which loads are rounded, and the tolerance with which they are compared.
 _DIGITS, _EXACT = 9, 1e-6
-# As in `vlagents_ray.serve.scaling.sibling_replicas`: replicas that one asks for their sessions.
+# Maximum number of replicas that a replica asks for their sessions, as in
+# `vlagents_ray.serve.scaling.sibling_replicas`.
 _MOST_ASKED = 32
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What messages, batches and lost replicas take.
+    """The durations of messages, batches and lost replicas, and the abilities of the server.
 
     Args:
         jitter: Standard deviation of the duration of a batch, as a share of it.
         transport_jitter_s: Mean of the time by which a message is late, s.
-        slack: Whether robots state their slack, and the queue uses it.
-        replan: Whether the server states when the next request of a robot is useful.
-        weighs_robots: Whether sessions are placed and moved by the needs of their robots, else by
-            their number.
-        act_cpu_s: CPU time of a request in the process of a replica, which reads one at a time, s.
+        slack: Whether robots report their slack, and the queue uses it.
+        replan: Whether the server tells robots when their next request is useful.
+        weighs_robots: Whether sessions are placed and moved according to the needs of their robots;
+            otherwise only their number counts.
+        act_cpu_s: CPU time of a request in the process of a replica, which reads one request at a
+            time, s.
         broken_s: Time until a robot whose connection ends has sent its request to another replica.
-        silent_s: The same for a replica whose machine is lost, so that nothing ends the connection.
-        move_s: Time by which the first request at another replica comes later, as its session
-            moves.
+        silent_s: The same time, s, for a replica whose machine is lost, so that the connection does
+            not end.
+        move_s: Additional delay of the first request at another replica, since its session moves,
+            s.
     """
 
     jitter: float = 0.03
@@ -79,12 +83,16 @@ USUAL = Behaviour()
 
 
 class Tally:
-    """Ticks in time and starved ones, by second, and the ages of the executed actions."""
+    """Counts of ticks in time and of starved ticks, by second, and of the ages of the executed
+    actions.
+    """
 
     def __init__(self) -> None:
         self.in_time = 0
         self.starved = 0
-        self._runs = array("d")  # runs of each run: its first tick, s, ticks, period, age or -1
+        # Runs of ticks: time of the first tick, s; number of ticks; period, s; age of its action,
+        # s, or -1.
+        self._runs = array("d")
         self._ages = np.zeros(_AGE_BINS, np.int64)
         self._seconds: dict[bool, np.ndarray] = {
             True: np.zeros(64, np.int64),
@@ -92,13 +100,13 @@ class Tally:
         }
 
     def add(self, first_s: float, ticks: int, period_s: float, age_s: float) -> None:
-        """Add ticks in a row.
+        """Add a run of ticks.
 
         Args:
-            first_s: The time of the first one, s.
-            ticks: Their number.
-            period_s: The time between two of them, s.
-            age_s: The age of the action at the first one, s; -1 if they had none.
+            first_s: The time of the first tick, s.
+            ticks: The number of ticks.
+            period_s: The time between two ticks, s.
+            age_s: The age of the action at the first tick, s; -1 if the ticks had no action.
         """
         if age_s < 0:
             self.starved += ticks
@@ -123,7 +131,7 @@ class Tally:
         return float(np.searchsorted(total, quantile * total[-1])) * _AGE_BIN_S
 
     def by_second(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ticks in time, and the starved ones, of each second."""
+        """Return the number of ticks in time, and of starved ticks, in each second."""
         self._flush()
         return self._seconds[True], self._seconds[False]
 
@@ -155,7 +163,9 @@ def _longer(counts: np.ndarray, size: int) -> np.ndarray:
 
 
 class _StreamRequest(PendingRequest):
-    """The request of a stream: the same object each time, as a stream has one at a time."""
+    """The request of a stream. The same object is used each time, as a stream has only one request
+    at a time.
+    """
 
     __slots__ = ("stream",)
 
@@ -211,35 +221,38 @@ class Stream:
         self.transport_s = transport_s
         self.tally = tally
         self.replica: Replica | None = None
-        self.weight = 1.0  # at its replica
+        self.weight = 1.0  # the stream's load on its replica
         self.ticks = 0
         self.starved = 0
-        self.late: list[tuple[float, int]] = []  # first times, s, and numbers of starved ticks
-        self.asks = 0  # numbers its requests, so that an answer to an abandoned one is known
-        self.slack_s = 0.0  # the slack that the last request states
+        # Times of the first tick, s, and lengths of runs of starved ticks.
+        self.late: list[tuple[float, int]] = []
+        # Number of the last request, with which the answer to an abandoned request is recognised.
+        self.asks = 0
+        self.slack_s = 0.0  # the slack that the last request reports
         self._period_s = 1 / need.hz
         self._phase_s = start_s
-        self._tick = 0  # the next tick that is not counted yet
-        self._executed = 0  # rows
-        self._left = 0  # rows of the plan
-        self._captured_s = 0.0  # capture time of the observation of the plan
+        self._tick = 0  # the next tick that has not been counted
+        self._executed = 0  # number of executed rows
+        self._left = 0  # number of remaining rows of the plan
+        self._captured_s = 0.0  # capture time of the plan's observation, s
         self._asked = 0  # the tick of the last request
-        self._asked_row = 0  # rows that were executed before it
+        self._asked_row = 0  # number of rows that were executed before the last request
         self._asked_at_s = 0.0
-        self._delay_s = 0.0  # by which its next message is late, s
-        self._begun = False  # whether the first answer is there
+        self._delay_s = 0.0  # additional delay of the next message, s
+        self._begun = False  # whether the first answer has arrived
 
     def begin(self) -> None:
         """Send the first request."""
         self._ask(0)
 
     def answered(self, arrives_s: float, replan_s: float, inference_s: float) -> None:
-        """Take the answer to the last request, and plan the next one.
+        """Process the answer to the last request, and plan the next request.
 
         Args:
             arrives_s: The time at which the answer arrives, s.
-            replan_s: The time from then on at which the next request is useful, s; 0: at once.
-            inference_s: The duration of its batch, s.
+            replan_s: The time after the arrival at which the next request is useful, s; 0 for
+                immediately.
+            inference_s: The duration of the answer's batch, s.
         """
         period_s = self._period_s
         tick = max(math.ceil((arrives_s - self._phase_s) / period_s), self._asked + 1)
@@ -260,7 +273,7 @@ class Stream:
         if replan_s > 0:
             allowed = math.ceil((arrives_s + replan_s - self._phase_s) / period_s)
             if allowed > tick:
-                # It waits no longer than an urgent request can be answered in time.
+                # The robot waits no longer than an urgent request could still be answered in time.
                 kept_rows = 2 + (inference_s + self.transport_s) / period_s
                 due = max(tick, min(allowed, tick + math.ceil(self._left - kept_rows)))
         self._ask(due)
@@ -270,19 +283,19 @@ class Stream:
         self._send(self.world.now)
 
     def delay_next(self, delay_s: float) -> None:
-        """Let the next message arrive later by this time, s."""
+        """Delay the next message by this time, s."""
         self._delay_s = delay_s
 
     def finish(self) -> None:
-        """Count the ticks until now."""
+        """Count the ticks until the current time."""
         if self._begun:
             tick = math.ceil((self.world.now - self._phase_s) / self._period_s)
             if tick > self._tick:
                 self._count_until(tick)
 
     def in_time_from_s(self, share: float) -> float:
-        """Return the time from which on at least that share of its ticks were in time, s; 0.0 if
-        that is so from its first tick on.
+        """Return the time since which at least this share of the stream's ticks were in time, s;
+        0.0 if it was so since the first tick.
         """
         late = 0
         for first_s, ticks in reversed(self.late):
@@ -292,7 +305,9 @@ class Stream:
         return 0.0
 
     def _ask(self, tick: int) -> None:
-        """Send a request with the observation of this tick, before its row is executed."""
+        """Send a request with the observation of this tick, before the row of the tick is
+        executed.
+        """
         if self._begun and tick > self._tick:
             self._count_until(tick)
         self._asked = tick
@@ -340,29 +355,29 @@ class Replica:
         self.model = model
         self.node = node
         self.alive = True
-        self.accepts = True  # whether new sessions may begin here
-        self.streams: dict[Stream, None] = {}  # its sessions, the oldest first
-        self.load = 0.0  # the sum of the weights of its sessions
-        self.surplus = 0.0  # load that is asked to reconnect
+        self.accepts = True  # whether the replica accepts new sessions
+        self.streams: dict[Stream, None] = {}  # the replica's sessions, the oldest first
+        self.load = 0.0  # the sum of the weights of the sessions
+        self.surplus = 0.0  # load of the sessions that are requested to reconnect
         self.batches = 0
         self.requests = 0
         self.busy_s = 0.0
         self.queue = FairQueue()
         sizes = range(1, max_batch_size + 1)
         self.queue.costs_s = [0.0, *(costs.cost_s(size) for size in sizes)]
-        self._detected_s = 0.0  # once it is lost: time until a robot notices it, s
+        self._detected_s = 0.0  # time until a robot notices the loss of the replica, s
         self._costs = costs
         self._largest = max_batch_size
         self._busy = False
         self._running: list[PendingRequest] = []
-        self._taken_s = 0.0  # duration of the running batch
-        self._read_s = 0.0  # time at which all requests that have arrived are read
+        self._taken_s = 0.0  # duration of the running batch, s
+        self._read_s = 0.0  # time at which all requests that have arrived will have been read, s
         self._weights: dict[RobotNeed, float] = {}
         self._pace = ReplicaPace(self._curve, self._plans, max_batch_size, world.clock, self._depth)
 
     @property
     def sessions(self) -> int:
-        """The number of its sessions."""
+        """The number of the replica's sessions."""
         return len(self.streams)
 
     def join(self, stream: Stream) -> None:
@@ -388,7 +403,7 @@ class Replica:
         return self._weights[need]
 
     def needed_load(self) -> float:
-        """Return what its robots need, as a share of a replica."""
+        """Return the load that the robots need, as a share of a replica."""
         needs = Counter(stream.need for stream in self.streams)
         return slo_load(self._costs, needs, self._largest)
 
@@ -402,7 +417,7 @@ class Replica:
         return self.queue.depth[Priority.ROBOT]
 
     def receive(self, stream: Stream, number: int) -> None:
-        """Read a request, after those that have arrived before it."""
+        """Read a request, after all requests that have arrived earlier."""
         world = self.world
         cpu_s = world.behaviour.act_cpu_s
         if cpu_s > 0:
@@ -433,10 +448,10 @@ class Replica:
         """Lose the replica.
 
         Args:
-            detected_s: Time until the robots whose requests are here notice it, s.
+            detected_s: Time until the robots with requests at the replica notice the loss, s.
 
         Returns:
-            Those robots.
+            The streams of these robots.
         """
         self.alive = self.accepts = False
         self._detected_s = detected_s
@@ -447,7 +462,7 @@ class Replica:
         return waiting
 
     def miss(self, stream: Stream, number: int) -> None:
-        """Leave a request unanswered, which its robot notices after a time."""
+        """Leave a request unanswered; its robot notices this after some time."""
         self.world.at(self.world.now + self._detected_s, self.world.resend, stream, number)
 
     def _take(self) -> None:
@@ -494,7 +509,7 @@ Event = tuple[float, int, Callable[..., None], Any, int]
 
 
 class World:
-    """Robots, replicas and the time."""
+    """The simulated robots and replicas, and the current time."""
 
     def __init__(
         self,
@@ -506,13 +521,13 @@ class World:
         """Begin at time 0.
 
         Args:
-            seed: Of all random numbers.
-            behaviour: What messages and faults take.
-            transport_s: The time of a request and its answer on the way, for the arithmetic of the
-                server.
-            least_loaded: Whether a session begins at the replica with the least load of those that
-                one replica asks; else at one by the hash of its id, as those of clients that know
-                HTTP alone.
+            seed: The seed of all random numbers.
+            behaviour: The durations of messages and faults.
+            transport_s: The transport time of a request and its answer, for the arithmetic of the
+                server, s.
+            least_loaded: Whether a session begins at the replica with the least load among those
+                that one replica asks. Otherwise the replica is random, as it is for clients that
+                only use HTTP, whose replica depends on the hash of the session's id.
         """
         self.now = 0.0
         self.behaviour = behaviour
@@ -544,12 +559,12 @@ class World:
         return max(0.5, self._draw.gauss(1.0, self.behaviour.jitter))
 
     def at(self, when: float, call: Callable[..., None], subject: Any, number: int) -> None:
-        """Call `call(subject, number)` at that time."""
+        """Schedule `call(subject, number)` for this time."""
         self._count += 1
         heapq.heappush(self._due, (when, self._count, call, subject, number))
 
     def run(self, until: float) -> None:
-        """Let the time pass until then, s."""
+        """Advance the time to `until`, s."""
         due = self._due
         while due and due[0][0] <= until:
             self.now, _, call, subject, number = heapq.heappop(due)
@@ -577,7 +592,7 @@ class World:
     def _begin(self, subject: tuple[Stream, str], _: int) -> None:
         stream, model = subject
         replica = self.choose(model)
-        if replica is None:  # it asks again
+        if replica is None:  # the robot asks again later
             self.at(self.now + 1.0, self._begin, subject, 0)
             return
         replica.join(stream)
@@ -595,7 +610,7 @@ class World:
         return self._draw.choice(accepting)
 
     def arrive(self, stream: Stream, number: int) -> None:
-        """Take a request of a robot, at its replica."""
+        """Process the arrival of a robot's request at its replica."""
         if stream.asks != number:
             return
         replica = stream.replica
@@ -607,7 +622,7 @@ class World:
             replica.miss(stream, number)
 
     def resend(self, stream: Stream, number: int) -> None:
-        """Send a request whose replica was lost to another one."""
+        """Send a request whose replica was lost to another replica."""
         if stream.asks != number:
             return
         if not self.move(stream):
@@ -616,7 +631,7 @@ class World:
         stream.resend()
 
     def move(self, stream: Stream) -> bool:
-        """Move a session to another replica; return False if there is none."""
+        """Move a session to another replica; return False if no replica accepts it."""
         old = stream.replica
         model = stream.session_id.rpartition("/")[0]
         replica = self.choose(model)
@@ -630,8 +645,8 @@ class World:
         return True
 
     def compare(self, model: str, _: int = 0) -> None:
-        """Ask the robots of replicas with a clearly too large load to reconnect, and again after
-        each interval.
+        """Request the robots of replicas with a clearly excessive load to reconnect; repeat this
+        after each interval.
         """
         accepting = [replica for replica in self.replicas[model] if replica.accepts]
         mean = sum(replica.load for replica in accepting) / max(1, len(accepting))
@@ -643,7 +658,7 @@ class World:
         self.at(self.now + _COMPARE_S, self.compare, model, 0)
 
     def finish(self) -> None:
-        """Count the ticks of all robots until now."""
+        """Count the ticks of all robots until the current time."""
         for stream in self.streams:
             stream.finish()
 
@@ -653,7 +668,7 @@ def _load_of(replica: Replica) -> float:
 
 
 def starved_streams(streams: Iterable[Stream], share: float) -> Sequence[Stream]:
-    """Return those with a smaller share of ticks in time."""
+    """Return the streams with a smaller share of ticks in time."""
     return [
         stream for stream in streams if stream.ticks and 1 - stream.starved / stream.ticks < share
     ]

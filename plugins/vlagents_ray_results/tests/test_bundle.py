@@ -1,5 +1,5 @@
-"""A bundle: what is checked holds for an honest one, is contradicted by a changed one, and a
-hostile one is rejected.
+"""Tests of bundles: an honest bundle passes all checks, a changed bundle is contradicted, and a
+hostile bundle is rejected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Change = Callable[[Path], None]
 
 
 class Still(Agent):
-    """Lifts the gripper's target a little, always the same."""
+    """Always returns the same action, which lifts the gripper's target a little."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         return {"checkpoint": "still", "weights": "sha256:5711"}
@@ -45,7 +45,7 @@ class Still(Agent):
 
 @pytest.fixture(scope="module")
 def tabletop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two recorded episodes of the tabletop."""
+    """Return the folder of two recorded episodes of the tabletop."""
     out = tmp_path_factory.mktemp("tabletop") / "run"
     options = {"max_steps": 8}
     play(
@@ -59,7 +59,7 @@ def tabletop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def line(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three recorded episodes of an environment that is registered nowhere."""
+    """Return the folder of three recorded episodes of an environment that is not registered."""
     out = tmp_path_factory.mktemp("line") / "run"
     play(flat_config(envs=[LINE], episodes=3, record="all", video="none", out=out))
     return out
@@ -67,7 +67,7 @@ def line(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def changed(line: Path, tmp_path: Path) -> Callable[[Change], Path]:
-    """A bundle of a copy of `line` in which something was changed before it was written."""
+    """Return a function that writes a bundle of a changed copy of `line`."""
 
     def make(change: Change) -> Path:
         shutil.copytree(line, tmp_path / "copy")
@@ -89,7 +89,7 @@ def details(found: Verification, subject: str) -> str:
 def rewritten(
     bundle: Path, target: Path, changes: dict[str, bytes], *, honest: bool = False
 ) -> Path:
-    """The bundle with other files; `honest` writes their digests into its manifest, as its
+    """Write a bundle with other files; `honest` also writes their digests into the manifest, as the
     author could.
     """
     with zipfile.ZipFile(bundle) as source:
@@ -142,7 +142,7 @@ def test_videos_are_in_it_if_that_is_asked_for(
     write_bundle(tabletop, tmp_path / "with.zip", videos=True)
     assert verify(tmp_path / "with.zip", into=tmp_path / "kept", replay=0).holds
     videos = sorted((tmp_path / "kept").rglob("*.mp4"))
-    assert len(videos) == 4  # of the report, and of what the policy saw
+    assert len(videos) == 4  # videos of the report, and of the policy's images
     with zipfile.ZipFile(bundle) as file:
         assert not [name for name in file.namelist() if name.endswith(".mp4")]
 
@@ -165,7 +165,7 @@ def test_other_actions_than_were_executed_have_another_outcome(
     write_bundle(tmp_path / "copy", tmp_path / "changed.zip")
     found = verify(tmp_path / "changed.zip")
     assert not found.holds
-    assert "the recorded actions are not those of the table's digest" in details(
+    assert "the recorded actions do not match the digest in the table" in details(
         found, "trajectories"
     )
     assert verdicts(found)["replay of tabletop#0@0"] == "other here"
@@ -173,14 +173,14 @@ def test_other_actions_than_were_executed_have_another_outcome(
 
 
 def other_actions(path: Path) -> bytes:
-    """The trajectory in a file, with another fourth action."""
+    """Return the trajectory in a file, with another fourth action."""
     recorded = Trajectory.load(path)
     recorded.actions[3] += 0.25
     return recorded.to_bytes()
 
 
 def recording(bundle: Path) -> str:
-    """The name of the first trajectory in a bundle."""
+    """Return the name of the first trajectory in a bundle."""
     with zipfile.ZipFile(bundle) as file:
         return next(name for name in file.namelist() if name.endswith(".npz"))
 
@@ -239,7 +239,7 @@ def test_an_environment_that_is_not_registered_is_made_for_those_who_trust_the_b
     write_bundle(line, tmp_path / "line.zip")
     subject = f"replay of {LINE}#0@0"
     assert details(verify(tmp_path / "line.zip"), subject).endswith(
-        "is no registered environment; --trust makes it, and runs its code"
+        "is not a registered environment; --trust creates it, and runs its code"
     )
     assert verdicts(verify(tmp_path / "line.zip", trust=True))[subject] == "equal"
 
@@ -306,7 +306,8 @@ def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(
     ):
         hostile = shutil.copy(bundle, tmp_path / f"{name}.zip")
         with zipfile.ZipFile(hostile, "a") as file, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(file, "_writecheck", lambda _member: None)  # it warns of duplicates
+            # `zipfile` warns of duplicates.
+            patch.setattr(file, "_writecheck", lambda _member: None)
             file.writestr(member, text)
         with pytest.raises(ConfigError, match=why):
             verify(hostile)

@@ -1,4 +1,4 @@
-"""`vlagents-ray export`: what goes into a dataset is chosen on the command line."""
+"""Tests of `vlagents-ray export`: the command line selects the content of a dataset."""
 
 from __future__ import annotations
 

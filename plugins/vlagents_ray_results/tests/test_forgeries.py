@@ -1,5 +1,5 @@
-"""A forged bundle is contradicted: each column and each recording is changed alone, as its
-author could.
+"""Tests that a forged bundle is contradicted: each column and each recording is changed separately,
+as the author could.
 """
 
 # ruff: noqa: S608 (the SQL is made of constants)
@@ -32,7 +32,7 @@ FAILED = "episode = (SELECT min(episode) FROM episodes WHERE NOT success_once)"
 
 
 class Versioned(ToZero):
-    """States its checkpoint, weights and version, as a served policy does."""
+    """Reports its checkpoint, weights and version, like a served policy."""
 
     def reset(
         self, obs: Obs, instruction: str | None = None, **kwargs: object
@@ -46,7 +46,7 @@ class Versioned(ToZero):
         return act
 
 
-# By column: the new values, as SQL, and the rows that get them.
+# By column: the new values, as SQL, and the rows in which they are set.
 FORGERIES: dict[str, list[tuple[str, str]]] = {
     "key": [("key || 'x'", SOLVED)],
     "case_id": [("'0123456789abcdef'", SOLVED)],
@@ -95,7 +95,7 @@ FORGERIES: dict[str, list[tuple[str, str]]] = {
     "run": [("7", SOLVED)],
 }
 _OF_THE_MACHINE = (
-    "a time or a count of that machine, which nothing else records; in no success rate"
+    "a time or a count of that machine, which nothing else records; affects no success rate"
 )
 UNKNOWN = {
     **dict.fromkeys(
@@ -104,12 +104,15 @@ UNKNOWN = {
     **dict.fromkeys(
         ("policy_ms", "policy_p95_ms", "policy_seconds", "timing_ms", "attempts"), _OF_THE_MACHINE
     ),
-    "acts": "the recording has actions, not the answers that they came in; in no success rate",
-    "transport": "the way of the observations, which nothing else records; in no success rate",
-    "revision": "known only on machines with the weights in the hub's cache; in no success rate",
-    "videos": "a bundle has videos only on request; they are for people",
+    "acts": "the recording has actions, but not the answers that contained them; affects no "
+    "success rate",
+    "transport": "the transport of the observations, which nothing else records; affects no "
+    "success rate",
+    "revision": "known only on machines with the weights in the hub's cache; affects no success "
+    "rate",
+    "videos": "a bundle has videos only on request; they are for viewing",
 }
-# By array of a recording: a change of it that keeps its shape.
+# By array of a recording: a change that keeps the array's shape.
 CHANGED_ARRAYS: dict[str, Callable[[Trajectory], object]] = {
     "actions": lambda recorded: recorded.actions + np.float32(0.25),
     "rewards": lambda recorded: recorded.rewards + 0.25,
@@ -122,7 +125,7 @@ CHANGED_ARRAYS: dict[str, Callable[[Trajectory], object]] = {
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded episodes, of which some are solved."""
+    """Return the folder of recorded episodes, some of which are solved."""
     out = tmp_path_factory.mktemp("honest") / "run"
     options = {"envs": [LINE], "episodes": EPISODES, "seed": 3, "record": "all", "video": "none"}
     results = play(flat_config(**options, out=out), Versioned)
@@ -133,8 +136,8 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def forged(honest: Path, tmp_path: Path) -> Forge:
-    """Verify a bundle in which something was changed, with a new manifest, as its author can
-    write it.
+    """Return a function that changes the files of a bundle, writes a new manifest, as the author
+    could, and verifies the bundle.
     """
 
     def make(change: Callable[[Path], None], replay: int = EPISODES) -> Verification:
@@ -184,14 +187,15 @@ def test_a_column_that_is_changed_alone_contradicts_the_bundle(
     forged: Forge, column: str, value: str, rows: str
 ) -> None:
     change = update(f"UPDATE episodes SET {column} = {value} WHERE {rows}")
-    with contextlib.suppress(ConfigError):  # also a contradiction: no evaluation writes this value
+    # This is also a contradiction, as no evaluation writes this value.
+    with contextlib.suppress(ConfigError):
         found = forged(change)
         assert not found.holds, [(one.subject, one.verdict) for one in found.findings]
 
 
 @pytest.fixture(scope="module")
 def in_real_time(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded episodes of a policy whose answers take two ticks."""
+    """Return the folder of recorded episodes of a policy whose answers take two ticks."""
     out = tmp_path_factory.mktemp("real_time") / "run"
     options = {"envs": [LINE], "episodes": 3, "seed": 3, "record": "all", "video": "none"}
     clock = {"latency": 0.2, "neutral": [0]}
@@ -269,7 +273,9 @@ OUTCOME = (
 def test_a_failure_with_outcome_and_recording_of_a_success_is_found_by_its_replay(
     forged: Forge,
 ) -> None:
-    """Table and recordings agree with each other, and every value is one that was measured."""
+    """The table and the recordings agree with each other, and every value was measured in some
+    episode.
+    """
 
     def copy(folder: Path) -> None:
         with closing(sqlite3.connect(folder / "results.db")) as db, db:

@@ -1,4 +1,4 @@
-"""The dataset holds what was recorded, frame by frame."""
+"""Tests that the dataset contains each recorded frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CAMERA = {"camera": [32, 48]}
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """Two episodes of a hand that rolls, of which the first is solved."""
+    """Return the results of two episodes of a hand that rolls; the first is solved."""
     out = tmp_path_factory.mktemp("rolled") / "out"
     return play(flat_config(envs=[ROLLER], episodes=2, record="all", out=out, video="none"), Turner)
 
@@ -49,7 +49,7 @@ def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(
     for number, episode in enumerate(results.cases[0].episodes):
         trajectory = Trajectory.load(results.out / str(episode.trajectory))
         rows = pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict()
-        # LeRobot wants no lists of one number.
+        # LeRobot stores a single number instead of a list of one number.
         assert rows["action"] == trajectory.actions[:, 0].tolist()
         assert rows["observation.state.position"] == trajectory.state["position"][:-1].tolist()
         assert rows["observation.state"] == rows["observation.state.position"]
@@ -99,9 +99,7 @@ def test_envs_that_differ_are_exported_one_by_one(config: Config, tmp_path: Path
     results = play(settings)
     with pytest.raises(ConfigError, match=r"has other features.*images.front.*--env"):
         to_lerobot(results, tmp_path / "both")
-    assert list(tmp_path.glob("both*")) == [], (
-        "the first env was written, and is no dataset of both"
-    )
+    assert list(tmp_path.glob("both*")) == [], "the first environment alone must leave no dataset"
     assert to_lerobot(results.only(env=OTHER_LINE), tmp_path / "one") == 1
 
 
@@ -150,14 +148,14 @@ def test_trajectories_are_in_memory_one_at_a_time(
     def counted(path: Path) -> Trajectory:
         trajectory = load(path)
         actions = trajectory.actions
-        # Views keep the base alive.
+        # The weak reference is to the base array, which views keep alive.
         loaded.append(weakref.ref(actions if actions.base is None else actions.base))
         alive.append(sum(one() is not None for one in loaded))
         return trajectory
 
     monkeypatch.setattr(Trajectory, "load", counted)
     assert to_lerobot(results, tmp_path / "dataset") == 4
-    assert max(alive) <= 2  # the last one, until the next one is read
+    assert max(alive) <= 2  # the last trajectory is alive until the next one has been read
 
 
 def test_a_folder_that_holds_something_and_results_without_trajectories_are_refused(
@@ -195,7 +193,7 @@ def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(
 def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
     results: Results, tmp_path: Path, both: bool
 ) -> None:
-    (tmp_path / "d").mkdir()  # may be there if it is empty
+    (tmp_path / "d").mkdir()  # the folder may exist if it is empty
     chosen = ["joints", "gripper"] if both else None
     to_lerobot(results, tmp_path / "d", cameras=[], state=chosen, environment_state=["joints"])
     features = info(tmp_path / "d")["features"]
@@ -264,7 +262,7 @@ def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(
 
 
 class Pushed(ToZero):
-    """Acts with further weights at each step."""
+    """Reports another version of the weights at each step."""
 
     def act(self, obs: Obs) -> Act:
         self.acts = getattr(self, "acts", 2) + 1
@@ -294,7 +292,8 @@ def test_angles_are_written_without_jumps_and_info_says_about_what(
     assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
     to_lerobot(results, tmp_path / "d")
     angles = info(tmp_path / "d")[INFO]["angles"]
-    assert list(angles) == ["5"]  # joints, joints, x, y, z, roll: the other angles do not jump
+    # The vector contains joint, joint, x, y, z and roll; only the roll jumps.
+    assert list(angles) == ["5"]
     written = rows(tmp_path / "d", 0)
     roll = np.array(written["observation.state"])[:, 5]
     assert np.abs(np.diff(roll)).max() == pytest.approx(Roller.TURN, abs=1e-5)

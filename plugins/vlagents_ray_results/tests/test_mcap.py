@@ -1,4 +1,6 @@
-"""The MCAP file contains what was recorded, with its times, as `mcap`'s own reader returns it."""
+"""Tests that the MCAP file contains the recorded values with their times, according to the reader
+of the package `mcap`.
+"""
 
 from __future__ import annotations
 

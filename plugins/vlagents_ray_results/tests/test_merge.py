@@ -1,5 +1,5 @@
-"""Results of several folders in one: each episode once, nothing that contradicts, and a folder
-like any other.
+"""Tests of merging several folders of results: each episode occurs once, contradictions are errors,
+and the new folder is usable like any other.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Config = Callable[..., EvalConfig]
 
 
 class Served(ToZero):
-    """Says what it is, as one on a server does."""
+    """Has metadata, like a policy on a server."""
 
     def __init__(self, checkpoint: str) -> None:
         super().__init__()
@@ -43,7 +43,9 @@ class Served(ToZero):
 
 @pytest.fixture
 def part(config: Config, tmp_path: Path) -> Callable[..., Path]:
-    """A folder of results, of the plan's episodes but those that are left out."""
+    """Return a function that makes a folder of results with the plan's episodes, except those that
+    are left out.
+    """
 
     def make(name: str, *left_out: int, chunk: int = 1, **changes: object) -> Path:
         settings = config(out=tmp_path / name, **changes)
@@ -169,7 +171,7 @@ def test_a_policy_with_another_checkpoint_or_other_weights_is_named(
         merge(tmp_path / "out", folders)
 
 
-# A statement of a value, by what it is about: of the policy's server (metadata), or of the env.
+# By subject: the statement of a value, by the policy's server (metadata) or by the environment.
 STATEMENTS: dict[str, Callable[[str], dict[str, object] | EnvInfo]] = {
     "program": lambda value: {"program": {"policy.py": value}},
     "settings": lambda value: {"config": {"gain": value}},
@@ -181,7 +183,7 @@ STATEMENTS: dict[str, Callable[[str], dict[str, object] | EnvInfo]] = {
 
 
 def stated(store: Store, subject: str, value: str) -> None:
-    """Record a statement; nothing is known of the subject if the value is empty."""
+    """Record a statement; an empty value means that nothing is known of the subject."""
     statement = STATEMENTS[subject](value)
     of_the_env = isinstance(statement, EnvInfo)
     metadata = {"policy": "act", "checkpoint": "a"}
@@ -279,7 +281,7 @@ def test_a_file_of_an_episode_that_is_gone_is_said_in_one_sentence_and_nothing_i
 
 
 def named(folder: Path, column: str, path: str) -> Path:
-    """`path` in place of what the first episode says of its files."""
+    """Set the path of the first episode's files in the database, and return the folder."""
     value = json.dumps([path]) if column == "videos" else path
     with closing(sqlite3.connect(folder / "results.db")) as db, db:
         db.execute(f"UPDATE episodes SET {column} = ? WHERE episode = 0", (value,))  # noqa: S608 - a constant
@@ -339,7 +341,7 @@ def test_symbolic_links_lead_no_further_than_their_folder(
         ),
     ):
         merge(tmp_path / "out", [theirs])
-    other = part("other", execute=2)  # beside the secret
+    other = part("other", execute=2)  # this folder is next to the secret file
     for results in (Results.load(theirs), combined([Results.load(theirs), Results.load(other)])):
         [path] = [video for case in results.cases for one in case.episodes for video in one.videos]
         with pytest.raises(ConfigError, match="got a symbolic link that leads out of it"):
@@ -372,7 +374,7 @@ def test_links_within_a_folder_and_to_it_are_followed(
 
 
 def with_weights(folder: Path, weights: str) -> Path:
-    """All its episodes as if these weights had run them."""
+    """Change the database as if these weights had run all episodes, and return the folder."""
     with closing(sqlite3.connect(folder / "results.db")) as db:
         db.execute("UPDATE episodes SET weights = ?", (weights,))
         db.commit()

@@ -1,4 +1,4 @@
-"""The table of episodes as Parquet."""
+"""Tests of the table of episodes as Parquet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the trackers' own readers find of an evaluation, offline."""
+"""Tests that read an evaluation with the trackers' own readers, offline."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ Config = Callable[..., EvalConfig]
 
 @pytest.fixture
 def told(config: Config) -> Callable[..., Results]:
-    """An evaluation of two checkpoints, told to one tracker, and told again by a run that
-    resumes it.
+    """Return a function that runs an evaluation, sends it to a tracker, and sends it again, as if
+    it were resumed.
     """
 
     def tell(tracker: str, **changes: Any) -> Results:
@@ -58,7 +58,7 @@ def rates(results: Results) -> list[float]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_service_left() -> Iterator[None]:
-    """wandb's own process lives as long as the one that wanted it, which here continues with other
+    """End wandb's process, which would otherwise live as long as this process, and so during other
     tests.
     """
     yield
@@ -97,7 +97,8 @@ class ReadRun:
     rows: list[dict[str, Any]] = field(default_factory=list)
     config: dict[str, Any] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)
-    artifacts: list[tuple[str, list[str]]] = field(default_factory=list)  # type, and files
+    # The type and the files of each artifact.
+    artifacts: list[tuple[str, list[str]]] = field(default_factory=list)
 
 
 def read_wandb(out: Path) -> ReadRun:
@@ -133,8 +134,8 @@ def wandb_records(file: Path) -> list[Any]:
 
 
 def log_records(log: bytes) -> Iterator[bytes]:
-    """Of a file in LevelDB's log format: records in pieces, none of which crosses the end of a
-    block.
+    """Yield the records of a file in LevelDB's log format. A record may be in several pieces, and
+    no piece crosses the end of a block.
     """
     at, record = 0, b""
     while at + 7 <= len(log):
@@ -142,11 +143,11 @@ def log_records(log: bytes) -> Iterator[bytes]:
             at += left
             continue
         length, kind = struct.unpack_from("<HB", log, at + 4)
-        if at + 7 + length > len(log):  # not yet written to its end
+        if at + 7 + length > len(log):  # the piece has not been written to its end yet
             return
         record += log[at + 7 : at + 7 + length]
         at += 7 + length
-        if kind in (1, 4):  # whole, or its last piece
+        if kind in (1, 4):  # a whole record, or its last piece
             yield record
             record = b""
 

@@ -1,3 +1,3 @@
-"""Results of evaluations for others: bundles and their checks, merged folders, exports, and
-trackers.
+"""Results of evaluations for other programs and people: bundles and their checks, merged folders,
+exports, and trackers.
 """

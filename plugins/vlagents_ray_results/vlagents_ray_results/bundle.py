@@ -1,11 +1,9 @@
-"""An evaluation in one file, which others can cite, check, replay in part, and merge with their
-own.
-
-The file is a ZIP archive whose first member lists the others with their digests. An archive may
-come from a stranger. Its list of members is checked before any is read: `pack` could have written
-every name, so that none leads out of the folder; no member is a link; the sizes are bounded, and no
-member yields more bytes than it states. Nothing is unpickled or imported. `verification` compares
-the content.
+"""An evaluation in one file, which other people can cite, check, replay in part, and merge with
+their own results. The file is a ZIP archive whose first member lists the other members with their
+digests. An archive may come from a stranger. The list of members is checked before any member is
+read: each name is one that `pack` could have written, so that none leads out of the folder; no
+member is a link; the sizes are bounded, and no member yields more bytes than its declared size.
+Nothing is unpickled or imported. `verification` compares the content.
 """
 
 from __future__ import annotations
@@ -32,18 +30,18 @@ from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results, reading
 
 MANIFEST = "bundle.json"
-MOST_BYTES = 16 * 10**9  # largest number of bytes of all members, unpacked
+MOST_BYTES = 16 * 10**9  # maximum number of bytes of all members, unpacked
 _MOST_MEMBERS = 200_000
-_MOST_MANIFEST = 64 * 2**20  # bytes
+_MOST_MANIFEST = 64 * 2**20  # maximum size of the manifest, bytes
 _CHUNK = 2**20
-# A part of a path, as `naming.plain` makes names: it does not begin with a dot.
+# A part of a path, as `naming.plain` creates names: it does not begin with a dot.
 _PART = r"[\w@-][\w.@-]{0,200}"
 _KNOWN = re.compile(
     rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{storage.PROVENANCE}/[0-9a-f]{{64}}\.diff"
     rf"|{storage.TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{storage.VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
 )
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
-_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
+_DISTRUST = "`vlagents-ray bundle` never writes this: do not trust the author of this bundle"
 
 
 class FileDigest(BaseModel):
@@ -52,7 +50,7 @@ class FileDigest(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    size: int = Field(ge=0)  # bytes
+    size: int = Field(ge=0)  # size, bytes
 
 
 class Manifest(BaseModel):
@@ -62,11 +60,11 @@ class Manifest(BaseModel):
 
     format: Literal["vlagents-ray bundle"] = "vlagents-ray bundle"
     version: Literal[1] = 1
-    files: dict[str, FileDigest]  # all others, by their paths
+    files: dict[str, FileDigest]  # all other files, by their paths
 
 
 def digest_of(path: Path) -> FileDigest:
-    """Return the SHA-256 and the size of a file, which is read in pieces."""
+    """Return the SHA-256 and the size of a file, which is read piece by piece."""
     sha256 = hashlib.sha256()
     size = 0
     with path.open("rb") as file:
@@ -77,8 +75,8 @@ def digest_of(path: Path) -> FileDigest:
 
 
 def pack(folder: Path, archive: Path) -> str:
-    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files
-    give the same bytes.
+    """Write all files of `folder` into the bundle `archive`; if that fails, no file is written. The
+    same files give the same bytes.
 
     Returns:
         The SHA-256 of the manifest, which identifies the content of the bundle.
@@ -107,7 +105,8 @@ def pack(folder: Path, archive: Path) -> str:
 
 
 def _member(name: str, compression: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
-    member = zipfile.ZipInfo(name)  # of 1980: the time is not part of the results
+    # The first date that ZIP allows, as the time is not part of the results.
+    member = zipfile.ZipInfo(name)
     member.compress_type = compression
     member.external_attr = (stat.S_IFREG | 0o644) << 16
     return member
@@ -133,12 +132,12 @@ def unpack(
     """Write the files of a bundle into `folder`, without its manifest.
 
     Returns:
-        The manifest, its SHA-256, and the differences between the manifest and the files, a
-        sentence each.
+        The manifest, its SHA-256, and the differences between the manifest and the files, each as a
+        sentence.
 
     Raises:
-        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out
-            of `folder`.
+        ConfigError: The file is not a bundle, or is larger than allowed, or has a name that leads
+            out of `folder`.
     """
     require_file(archive)
     try:
@@ -169,7 +168,7 @@ def unpack(
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by their names, after all checks that do not need their content."""
+    """Return the members by their names, after all checks that do not need the content."""
     listed = file.infolist()
     if len(listed) > _MOST_MEMBERS:
         raise ConfigError(
@@ -193,8 +192,7 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
         is_encrypted = member.flag_bits & 0x1
         if is_encrypted or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ConfigError(
-                f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; "
-                f"{_DISTRUST}"
+                f"{archive}: {name!r} is encrypted, or not compressed like a bundle; {_DISTRUST}"
             )
         members[name] = member
 
@@ -245,7 +243,7 @@ def _copy(
         size += len(chunk)
         if size > member.file_size:
             raise ConfigError(
-                f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}"
+                f"{archive}: {member.filename!r} has more bytes than its declared size; {_DISTRUST}"
             )
         sha256.update(chunk)
         target.write(chunk)
@@ -253,23 +251,22 @@ def _copy(
 
 
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
-    """Write the results in `folder` as one file that others can check (`verify`).
-
-    It holds the present results.db, the differences from the commits, and the trajectories, by
-    which episodes are run again, but nothing that is computed from these. The database names
-    only files in the bundle, so that its results can be merged with others.
+    """Write the results in `folder` as one file that others can check (`verify`). The bundle
+    contains the present results.db, the differences from the commits, and the trajectories, with
+    which episodes are replayed, but nothing that is computed from these. The database names only
+    files in the bundle, so that the bundle's results can be merged with others.
 
     Args:
         folder: A folder of results, to which an evaluation may be writing; nothing in it is
             changed.
-        videos: Whether the bundle also holds the videos: those of the report, and of the policy's
+        videos: Whether the bundle also contains the videos of the report and of the policy's
             images.
 
     Returns:
-        The SHA-256 of its manifest, which identifies its content.
+        The SHA-256 of the bundle's manifest, which identifies its content.
 
     Raises:
-        ConfigError: The folder has no results, or one of its files is outside of it.
+        ConfigError: The folder has no results, or one of its files is outside of the folder.
         StorageFailed: The disk is full, or cannot be written to.
     """
     with storage.storing(archive.parent):
@@ -278,7 +275,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             prefix=f"{archive.name}.part-", dir=archive.parent
         ) as temporary:
             stage = Path(temporary)
-            # The copy is one consistent state, even while an evaluation writes to the database.
+            # The copy is consistent, even while an evaluation writes to the database.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
 
@@ -288,7 +285,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
 
 
 def _forget_missing_files(stage: Path) -> None:
-    """Remove the names of files that are not in the folder from its database."""
+    """Remove names from the database whose files are not in the folder."""
     with closing(sqlite3.connect(stage / DATABASE)) as db, db:
         rows = db.execute("SELECT key, videos, trajectory FROM episodes").fetchall()
         for key, videos, trajectory in rows:
@@ -299,7 +296,9 @@ def _forget_missing_files(stage: Path) -> None:
 
 
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
-    """Link the files of the episodes and of the commits' differences into the folder `stage`."""
+    """Link the files of the episodes, and those with the differences from commits, into the folder
+    `stage`.
+    """
     paths: list[str] = []
     for case in results.cases:
         for episode in case.episodes:
@@ -315,5 +314,5 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
 
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)
-        if source.is_file():  # a folder that was copied without its videos can be bundled
+        if source.is_file():  # a folder that was copied without its videos can also be bundled
             storage.link_or_copy(source, stage / path)

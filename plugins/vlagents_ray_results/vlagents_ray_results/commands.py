@@ -24,7 +24,8 @@ def merge_command(
         bool,
         typer.Option(
             "--keep-first",
-            help="If folders have different outcomes of an episode, keep the first one's.",
+            help="If folders have different outcomes of an episode, keep the outcome of the first "
+            "folder.",
         ),
     ] = False,
     accept_changes: Annotated[
@@ -35,7 +36,7 @@ def merge_command(
         ),
     ] = False,
 ) -> None:
-    """Merge results: each episode once, by its key, with videos and trajectories."""
+    """Merge results, so that each episode occurs once, with its videos and trajectories."""
     from vlagents_ray.evaluate import print_summary
     from vlagents_ray_results.merge import merge
 
@@ -95,7 +96,8 @@ def verify_command(
         typer.Option("--out", metavar="FOLDER", help="Keep the results in this new folder."),
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Also create environments that name code or files.")
+        bool,
+        typer.Option("--trust", help="Also create environments whose settings name code or files."),
     ] = False,
     max_gb: Annotated[
         float,
@@ -112,7 +114,7 @@ def verify_command(
     """Check a bundle, and print which parts are equal, differ, or could not be checked.
 
     The bundle may come from a stranger. Different versions of software on this machine are listed,
-    and are no contradiction.
+    but do not contradict the bundle.
 
     Exit status: 0 if nothing contradicts the bundle, 1 if a digest, the table of results, a
     recording or the outcome of a replay does.

@@ -1,4 +1,4 @@
-"""Recorded trajectories as a LeRobotDataset v3.0, for viewing and for training."""
+"""Writes recorded trajectories as a LeRobotDataset v3.0, for viewing and for training."""
 
 from __future__ import annotations
 
@@ -72,20 +72,20 @@ def to_lerobot(
     One episode at a time is in memory.
 
     A frame is an observation and the action after it; the last observation of an episode is left
-    out. Angles and rotation vectors of the state that jump by a full turn are written about another
-    centre. The dataset's contract (`vlagents_ray.dataset_contract`) names it, so that the policy's
-    server does the same. If a policy named the version of its weights, each frame has that of its
-    action, or -1 if it is unknown.
+    out. Angles and rotation vectors of the state that jump by a full turn are written relative to
+    another centre. The dataset's contract (`vlagents_ray.dataset_contract`) names the centre, so
+    that the policy's server converts them in the same way. If a policy reported the version of its
+    weights, each frame has the version that chose its action, or -1 if it is unknown.
 
     Args:
         cameras: The cameras of the dataset; by default all.
         state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by
             default all that are not in `environment_state`, sorted, the gripper last.
         environment_state: The parts of `observation.environment_state` in this order: LeRobot's
-            policies need it if they get no camera.
+            policies need this feature if they have no camera.
         successes: Leave out episodes in which the task was never solved.
-        cut_idle: End each episode when, after the task was solved, neither state nor action changes
-            any more.
+        cut_idle: End each episode when neither state nor action changes any more after the task was
+            solved.
 
     Returns:
         The number of episodes in the dataset.
@@ -130,7 +130,8 @@ def to_lerobot(
                 )
                 env = demonstration.case.env
                 raise ConfigError(
-                    f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}"
+                    f"{env}: has other features than the envs before it ({', '.join(differing)}); "
+                    f"{_CURE}"
                 )
             dataset.save(finished)
 
@@ -145,8 +146,8 @@ def to_lerobot(
 
 
 _CURE = "export env by env (--env)"
-# At rest, changes between frames are below this share of the range of a part of the state, or of
-# the action.
+# Share of the range of a part of the state, or of the action, below which changes between frames
+# count as rest.
 _STILL = 0.01
 
 
@@ -156,17 +157,18 @@ class _Demonstration:
 
     case: CaseResults
     episode: Episode
-    contract: Contract  # contract of the env
-    actions: np.ndarray  # (N, A)
+    contract: Contract  # contract of the environment
+    actions: np.ndarray  # (N, A) actions
     rewards: np.ndarray  # (N,)
     success: np.ndarray  # (N,)
     parts: tuple[str, ...]  # parts of `observation.state`
     environment: tuple[str, ...]  # parts of `observation.environment_state`
-    state: dict[str, np.ndarray]  # (N, D) each
+    state: dict[str, np.ndarray]  # (N, D) values of each part
     gripper: np.ndarray | None  # (N,)
-    # (N,) of the weights that chose each action; None if no episode's policy named them.
+    # (N,) versions of the weights that chose each action; None if no episode's policy reported
+    # them.
     versions: np.ndarray | None
-    videos: dict[str, Path]  # by camera
+    videos: dict[str, Path]  # the video of each camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +180,12 @@ class _Selection:
     state: Sequence[str] | None
     environment_state: Sequence[str]
     cut_idle: bool
-    with_versions: bool  # of the weights
+    with_versions: bool  # whether frames have the version of the weights
 
     def demonstrations(
         self, recorded: Iterable[tuple[CaseResults, Episode]]
     ) -> Iterator[_Demonstration]:
-        """Read one recorded episode after the other; an episode without frames is left out."""
+        """Yield the recorded episodes one after the other, except episodes without frames."""
         for case, episode in recorded:
             demonstration = self._read(case, episode)
             # A policy that failed before it acted leaves an empty episode.
@@ -234,10 +236,8 @@ class _Selection:
 
 @contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is
-    complete.
-
-    It is beside `path` until then, and removed if writing fails.
+    """Yield a folder for writing, which is renamed to `path` when it is complete; `path` must be
+    missing or empty. Until then the folder is next to `path`; it is removed if writing fails.
     """
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -245,7 +245,7 @@ def _new_folder(path: Path) -> Iterator[Path]:
         unfinished = Path(temporary) / path.name
         unfinished.mkdir()
         yield unfinished
-        os.sync()  # one for all its files
+        os.sync()  # one sync for all files of the folder
         os.replace(unfinished, path)
 
 
@@ -254,7 +254,7 @@ def _fps(case: CaseResults) -> float:
 
 
 def _chosen(option: str, names: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
-    """Return the names that an option chooses, by default all known ones.
+    """Return the names that an option chooses, by default all known names.
 
     Raises:
         ConfigError: A name is unknown, or occurs twice.
@@ -283,7 +283,7 @@ def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int
     if not success.any():
         return frames
 
-    last = int(success.argmax())  # the frame whose action solved it
+    last = int(success.argmax())  # the frame whose action solved the task
     for values in moving:
         steps = np.abs(np.diff(values, axis=0)).max(axis=1, initial=0)
         moved = np.flatnonzero(steps > _STILL * np.ptp(values, axis=0).max(initial=0))
@@ -295,12 +295,13 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
     """Return the indices in `observation.state` of angles and rotation vectors that jump, with
     their centres.
     """
-    angles: dict[int, list[np.ndarray]] = {}  # by index; each (N,)
-    vectors: dict[int, list[np.ndarray]] = {}  # by the index of the first number; each (N, 3)
+    angles: dict[int, list[np.ndarray]] = {}  # values by index; each (N,)
+    # Rotation vectors by the index of the first number; each (N, 3)
+    vectors: dict[int, list[np.ndarray]] = {}
     for demonstration in demonstrations:
         index = 0
         for name in demonstration.parts:
-            values = demonstration.state.get(name)  # None: the gripper, which is one number
+            values = demonstration.state.get(name)  # None for the gripper, which is one number
             spec = (demonstration.contract.state or {}).get(name)
             if values is not None and spec is not None:
                 dim = values.shape[1]
@@ -321,7 +322,7 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
 def _finished(
     demonstration: _Demonstration, angles: Mapping[int, Centre], folder: Path
 ) -> FinishedEpisode:
-    """Return the episode in the dataset's form, after putting its videos into `folder`."""
+    """Return the episode in the dataset's form, and write its videos into `folder`."""
     keys = camera_keys(demonstration.videos)
     names = {key: camera for camera, key in keys.items()}
     env = demonstration.contract
@@ -333,8 +334,8 @@ def _finished(
     for name, values in demonstration.state.items():
         spec = (env.state or {}).get(name, StateSpec())
         state[name] = replace(spec, dim=values.shape[1])
-    # The contract of a policy that is trained on the dataset: its actions are those of the env,
-    # without bounds.
+    # The contract of a policy that is trained on the dataset: its actions are those of the
+    # environment, without bounds.
     contract = Contract(
         cameras=cameras,
         state=state,
@@ -356,7 +357,7 @@ def _finished(
             for frame in islice(container.decode(stream), len(demonstration.actions)):
                 statistics.add(convert(frame))
             images[key] = statistics.result()
-            pixels = stream.codec_context.pix_fmt  # "gbrp" if the recording has each pixel
+            pixels = stream.codec_context.pix_fmt  # "gbrp" if the recording is lossless
             features[key] = video_feature(
                 stream.height, stream.width, _fps(demonstration.case), pixels
             )
@@ -371,8 +372,8 @@ def _finished(
 def _numbers(
     demonstration: _Demonstration, about: DatasetContract
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return rows and features: the state in one vector and part by part, the action, and its
-    outcome.
+    """Return rows and features: the state as one vector and as separate parts, the action, and the
+    action's outcome.
     """
     dim = demonstration.actions.shape[1]
     together, names = state_vector(demonstration.state, demonstration.gripper, demonstration.parts)

@@ -1,7 +1,7 @@
 """Recorded episodes as one MCAP file, for Foxglove and other programs that read MCAP.
 
 Messages are JSON with a JSON schema, and images are `foxglove.CompressedImage`. A JPEG or PNG file
-of a dataset stays as it is; frames of videos are encoded as JPEG.
+of a dataset is written unchanged; frames of videos are encoded as JPEG.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from vlagents_ray_results.recorded import recorded_episodes
 
 DISTRIBUTION = "vlagents-ray-results"
 _JPEG_MAGIC = b"\xff\xd8\xff"
-_PAUSE_NS = 1_000_000_000  # between episodes that would overlap
+_PAUSE_NS = 1_000_000_000  # time between episodes that would otherwise overlap
 _NS_PER_S = 1_000_000_000
 
 _TIME = {
@@ -71,7 +71,7 @@ _EPISODE_PROPERTIES = {
     "instruction": {"type": "string"},
     "frames": {"type": "integer"},
 }
-# The schemas by name; that of images is Foxglove's own.
+# The schemas by name; the schema of images is Foxglove's own.
 _SCHEMAS: dict[str, Mapping[str, Any]] = {
     "foxglove.CompressedImage": _IMAGE_PROPERTIES,
     "vlagents_ray.Values": _VALUES_PROPERTIES,
@@ -86,9 +86,9 @@ class EpisodeStart:
 
     name: str
     instruction: str
-    start_ns: int  # since 1970, or from 0 if the time is not known
+    start_ns: int  # start time, ns since 1970, or from 0 if the time is not known
     frames: int
-    about: Mapping[str, str]  # the content of its MCAP metadata
+    about: Mapping[str, str]  # the content of the episode's MCAP metadata
 
 
 class McapFile:
@@ -120,7 +120,7 @@ class McapFile:
         self._add("/episode", "vlagents_ray.Episode", episode.start_ns, content)
 
     def add_image(self, camera: str, time_ns: int, image: np.ndarray | bytes) -> None:
-        """Write an image, (H, W, 3) uint8 RGB, or a JPEG or PNG file as it is."""
+        """Write an image, (H, W, 3) uint8 RGB, or the bytes of a JPEG or PNG file."""
         data = encode_jpeg(image, self._quality) if isinstance(image, np.ndarray) else image
         content = {
             "frame_id": camera,
@@ -173,16 +173,16 @@ class McapFile:
 
 
 def _json_number(value: float) -> float | None:
-    """Return a number for JSON, which has neither NaN nor infinity; None in place of them."""
+    """Return a number for JSON; None in place of NaN and infinity, which JSON lacks."""
     return float(value) if math.isfinite(value) else None
 
 
 @contextmanager
 def _new_file(path: Path, quality: int) -> Iterator[McapFile]:
-    """Yield a file for writing, which gets its name when it is complete.
+    """Yield a file for writing, which is renamed to its final name when it is complete.
 
     Raises:
-        ConfigError: `quality` is not one of JPEG's.
+        ConfigError: `quality` is not a quality of JPEG.
         MissingDependency: The package `mcap` is not installed.
     """
     if not 1 <= quality <= 100:
@@ -201,8 +201,9 @@ def results_to_mcap(
 ) -> int:
     """Write the recorded trajectories of an evaluation as one MCAP file.
 
-    The frames of an episode follow at the control rate, and end when the episode was recorded.
-    Episodes that ran in parallel are written one after the other, with a second between them.
+    The frames of an episode follow each other at the control rate; the last frame has the time at
+    which the episode was recorded. Episodes that ran in parallel are written one after the other,
+    with a second between them.
 
     Args:
         results: The results.
@@ -311,15 +312,15 @@ def dataset_to_mcap(
 ) -> int:
     """Write a LeRobotDataset, such as the recording of a robot or of a server, as one MCAP file.
 
-    A frame has the time at which it was captured. In a dataset without these times, frames follow
-    at the dataset's rate from 0. The sessions of a server's recording, which ran at the same time,
-    have topics of their own, such as `/session_0/action`.
+    A frame has the time at which it was captured. In a dataset without these times, frames begin at
+    0 and follow at the dataset's rate. The sessions of a server's recording, which ran at the same
+    time, have separate topics, such as `/session_0/action`.
 
     Args:
         folder: The folder of the dataset, or of several datasets.
         path: The file.
         cameras: The cameras of the file; by default all.
-        quality: The quality of the JPEG images that are made of videos, in [1, 100].
+        quality: The quality of the JPEG images that are encoded from videos, in [1, 100].
 
     Returns:
         The number of episodes.
@@ -355,7 +356,7 @@ def _write_episode(
 ) -> int:
     """Write one episode of a dataset, and return the time of its end, ns.
 
-    The episode is after the time `after_ns` if its frames have no time.
+    If its frames have no time, the episode begins after the time `after_ns`.
     """
     optional = (*OUTCOMES, WANTED_ACTION, INTERVENTION_COLUMN)
     names = [ACTION, *(name for name in optional if name in dataset.features)]

@@ -31,7 +31,7 @@ from vlagents_ray.evaluate.results.database import FILE, create, insert
 from vlagents_ray.evaluate.results.reader import Results, episode_of, reading, table
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 
-_SHOWN = 10  # conflicts in a message
+_SHOWN = 10  # maximum number of conflicts in a message
 Row = dict[str, Any]
 
 
@@ -53,24 +53,24 @@ def merge(
 ) -> Summary:
     """Merge the results of `folders` into the new folder `out`, which can be resumed.
 
-    An episode with the same outcome in several folders is taken from the first; a run one
-    replaces one that failed by infrastructure.
+    An episode with the same outcome in several folders is copied from the first folder; an episode
+    with an outcome replaces one that failed because of the infrastructure.
 
     Args:
-        out: A folder without results; it is made if it is missing.
+        out: A folder without results; it is created if it is missing.
         folders: Folders of results.
         keep_first: Whether the first folder wins for an episode with different outcomes.
-        accept_changes: Merge although files of a policy or an env, weights, or the description or
-            the contract of an env differ; the report shows it.
+        accept_changes: Whether to merge even if files of a policy or an environment, weights, or
+            the description or contract of an environment differ; the report shows the differences.
 
     Returns:
         The summary of the merged results.
 
     Raises:
-        ConfigError: Cases of one name have different settings, a policy or the files of an env are
-            not the same everywhere and `accept_changes` is off, an episode has different outcomes
-            and `keep_first` is off, or an episode's file is missing or outside of its folder, by
-            its path or by a symbolic link.
+        ConfigError: Cases with the same name have different settings; a policy or the files of an
+            environment differ between folders and `accept_changes` is off; an episode has different
+            outcomes and `keep_first` is off; or an episode's file is missing, or outside of its
+            folder because of its path or a symbolic link.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if (out / FILE).exists():
@@ -145,8 +145,8 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         difference = changed(before, now, swept=is_swept)
         if difference in ("policy", "checkpoint"):
             raise ConfigError(
-                f"{folder}: policy {row['name']!r} has {difference} {now.get(difference)!r}, that "
-                f"of the folders before it {before.get(difference)!r}; give one of them another "
+                f"{folder}: policy {row['name']!r} has {difference} {now.get(difference)!r}, the "
+                f"folders before it have {before.get(difference)!r}; give one of them another "
                 "name in its evaluation"
             )
         known["metadata"] = json.dumps(with_known(before, now))
@@ -158,7 +158,7 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
     changes: dict[Change, None] = {}
     names = {_name(row): row for row in merged.cases.values()}
     for row in table(db, "cases"):
-        # A suite may have a new name.
+        # A suite may have another name in this folder.
         known = merged.cases.get(row["case_id"]) or names.setdefault(_name(row), row)
         if known["case_id"] != row["case_id"]:
             before = json.loads(known["settings"])
@@ -176,7 +176,8 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
             raise ConfigError(
-                f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}"
+                f"{folder}: {where} stops early by {row['stop']}, but by {known['stop']} in the "
+                f"folders before it"
             )
 
         programs = []
@@ -189,8 +190,8 @@ def _add_cases(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
 
-        # An empty description or contract says nothing, so that a later one is compared with the
-        # first that does. An empty program is that of an installed environment.
+        # An empty description or contract contains no information, so a later one is compared with
+        # the first that is not empty. The program of an installed environment is empty.
         for name in ("described", "contract", "code"):
             if known[name] in (None, "{}"):
                 known[name] = row[name]
@@ -205,9 +206,7 @@ def _name(case: Row) -> tuple[str, str, str, str]:
 
 
 def _extend(case: Row, other: Row, folder: Path) -> None:
-    """Plan the seeds of both cases, with the larger of the two numbers of episodes for each
-    seed.
-    """
+    """Plan the seeds of both cases, each with the larger number of episodes per seed."""
     seeds, added = json.loads(case["seeds"]), json.loads(other["seeds"])
     episodes = max(case["planned"] // len(seeds), other["planned"] // len(added))
     seeds += [seed for seed in added if seed not in seeds]
@@ -215,8 +214,8 @@ def _extend(case: Row, other: Row, folder: Path) -> None:
     if any(high - low < episodes for low, high in itertools.pairwise(ordered)):
         raise ConfigError(
             f"{folder}: {case['env']}: expected seeds {episodes} or more apart, as each has "
-            f"{episodes} episodes, got {added}, together {ordered}, of which some episodes would "
-            "be played twice"
+            f"{episodes} episodes, got {added}, together {ordered}, with which some episodes "
+            f"would be run twice"
         )
     case |= {"seeds": canonical(seeds), "planned": episodes * len(seeds)}
 
@@ -254,12 +253,12 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
 
 
 def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
-    """Raise `ConfigError` for a case of several checkpoints, or a policy's checkpoint of several
+    """Raise `ConfigError` if a case has several checkpoints, or a checkpoint of a policy several
     weights.
     """
-    # The key of one episode of each checkpoint, by case.
+    # For each case: the key of one episode per checkpoint.
     checkpoints: dict[str, dict[str, str]] = {}
-    # The key of one episode of each version of the weights, by policy, step and checkpoint.
+    # For each policy, step and checkpoint: the key of one episode per version of the weights.
     weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}
     for row in merged.episodes.values():
         case = merged.cases[row["case_id"]]
@@ -279,11 +278,11 @@ def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> Non
 
 
 def _require_one(subject: str, kind: str, keys: dict[str, str]) -> None:
-    """Raise `ConfigError` if there are several; `keys` has the key of an episode of each."""
+    """Raise `ConfigError` if `keys` has several entries, each with the key of an episode."""
     if len(keys) > 1:
         raise ConfigError(
-            f"{subject}: was run by several {kind}: {keys}; merge those separately, or give one of "
-            "them another policy's `name` in its evaluation"
+            f"{subject}: was run by several {kind}: {keys}; merge these episodes separately, or "
+            f"set another `name` for one of the policies in its evaluation"
         )
 
 
@@ -303,6 +302,6 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
             name = f"{storage.PROVENANCE}/{diff.name}"
             sources[out / name] = storage.inside(folder, name)
 
-    # All files were checked above, before anything is written.
+    # All files have been checked above, before the first one is written.
     for target, source in sources.items():
         storage.link_or_copy(source, target)

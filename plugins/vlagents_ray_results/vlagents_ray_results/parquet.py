@@ -1,4 +1,4 @@
-"""The table of episodes as Parquet."""
+"""Writes the table of episodes as Parquet."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from vlagents_ray.registry import require
 
 
 def to_parquet(results: Results, path: Path) -> int:
-    """Write a typed table; nested values are JSON text. Returns the number of episodes."""
+    """Write a typed table, in which nested values are JSON text, and return the number of
+    episodes.
+    """
     require_folder_of(path)
     pa: Any = require("pyarrow")
     types = {

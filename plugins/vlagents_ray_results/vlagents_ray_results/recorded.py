@@ -10,7 +10,7 @@ def recorded_episodes(results: Results) -> list[tuple[CaseResults, Episode]]:
     """Return each episode that has a trajectory, with its case.
 
     Raises:
-        ConfigError: No episode has one.
+        ConfigError: No episode has a trajectory.
     """
     recorded = []
     for case in results.cases:

@@ -1,10 +1,12 @@
-"""What this distribution registers: an entry for each command, format of exports, and tracker."""
+"""The entries that this distribution registers: one for each command, format of exports, and
+tracker.
+"""
 
 from vlagents_ray.registry import RegistryEntry
 
 MERGE = RegistryEntry(
     "vlagents_ray_results.commands:merge_command",
-    "Merge results: each episode once, by its key.",
+    "Merge results, so that each episode occurs once.",
     examples=(
         "merge runs/a runs/b --out runs/all",
         "merge runs/node-* --out runs/all --keep-first",

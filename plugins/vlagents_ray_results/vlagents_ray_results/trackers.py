@@ -1,4 +1,4 @@
-"""Trackers of evaluations: wandb, trackio, TensorBoard."""
+"""Trackers of evaluations: wandb, trackio and TensorBoard."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from vlagents_ray.evaluate.trackers import TrackedPolicy
 from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
-STEP = "training_step"  # wandb's axis of the curves
-FOLDER = "tensorboard"  # folder of its event files, in the folder of results
+STEP = "training_step"  # the name of the x axis of the curves in wandb
+FOLDER = "tensorboard"  # folder of TensorBoard's event files, in the folder of results
 
 
 class WandbRun:
-    """A run of wandb whose curves are drawn against `training_step`; values without a step are
-    in its summary.
+    """A run of wandb whose curves are drawn against `training_step`; values without a step are in
+    the run's summary.
     """
 
     def __init__(self, subject: TrackedPolicy) -> None:
         self._wandb: Any = require("wandb")
         self._id = subject.id
-        # Code is in the config and in an artifact, as wandb would only read the driver's folder.
+        # Code is stored in the config and in an artifact, as wandb would only read the driver's
+        # folder.
         quiet = self._wandb.Settings(
             silent=True, console="off", disable_git=True, disable_code=True
         )
@@ -68,8 +69,8 @@ class WandbRun:
 
 
 class TrackioRun(WandbRun):
-    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio
-    identifies runs by name.
+    """A run of trackio, like one of wandb but without a summary and artifacts. Its name contains
+    the id, as trackio identifies runs by name.
     """
 
     def __init__(self, subject: TrackedPolicy) -> None:
@@ -94,7 +95,9 @@ class TrackioRun(WandbRun):
 
 
 class TensorboardRun:
-    """Scalars and texts. TensorBoard runs no MP4, so that the paths of videos are logged."""
+    """A run of TensorBoard, with scalars and texts. TensorBoard does not show MP4 files, so only
+    the paths of videos are logged.
+    """
 
     def __init__(self, subject: TrackedPolicy) -> None:
         self._event: Any = require("tensorboard.compat.proto.event_pb2").Event
@@ -109,7 +112,7 @@ class TensorboardRun:
         self._text("config", json.dumps(subject.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Log values as scalars at a training step; without one at 0."""
+        """Log values as scalars at a training step; without a step, at 0."""
         values = [
             self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()
         ]

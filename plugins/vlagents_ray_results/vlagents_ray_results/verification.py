@@ -1,6 +1,7 @@
 """Checks of a bundle: its digests, its database, its recordings, and a replay of some episodes.
 
-A replay runs recorded actions in their environment, and compares; no policy is needed.
+A replay executes recorded actions in their environment, and compares the results; it needs no
+policy.
 """
 
 from __future__ import annotations
@@ -41,18 +42,18 @@ from vlagents_ray.registry import env_suite, names
 from vlagents_ray_results.bundle import MANIFEST, MOST_BYTES, require_file, unpack
 
 Verdict = Literal["equal", "differs", "other here", "not checked"]
-MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
-_TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
-_SHOWN = 3  # differences in a finding
-_LENGTH = 80  # characters of a value in a finding
+MOST_TRAJECTORY = 2**30  # maximum size of a trajectory, unpacked, bytes
+# Relative tolerance: sums of floating-point numbers may differ in their last bits.
+_TOLERANCE = 1e-9
+_SHOWN = 3  # maximum number of differences in a finding
+_LENGTH = 80  # maximum number of characters of a value in a finding
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One check.
-
-    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other
-    here" means other software or numbers here, which alone is no fault of the bundle.
+    """The result of one check. "differs" means that the bundle contradicts itself, or that a replay
+    had another outcome. "other here" means other software or numbers on this machine, which alone
+    do not contradict the bundle.
     """
 
     subject: str
@@ -66,7 +67,7 @@ class Verification:
 
     digest: str  # SHA-256 of the bundle's manifest, which identifies its content
     findings: list[Finding]
-    seed: int  # by which the replayed episodes were drawn
+    seed: int  # seed with which the replayed episodes were drawn
 
     @property
     def holds(self) -> bool:
@@ -85,25 +86,26 @@ def verify(
 ) -> Verification:
     """Check a bundle, which may come from a stranger.
 
-    None of its text is run, imported or unpickled. Its environments are only made if they are
+    Nothing in it is run, imported or unpickled. Its environments are only created if they are
     registered here and their options are numbers and words, unless `trust` is set.
 
     Args:
-        bundle: The file.
-        into: A new folder for its results, which can be read, merged and exported as any others;
-            None: they are removed. Summary and report in it are written from the database.
-        replay: The number of episodes whose recorded actions are run again.
-        seed: The seed by which these episodes are drawn; None: a new one, which the author of the
-            bundle cannot know.
-        trust: Whether its environments may name any code and files.
-        most_bytes: The most bytes that its files may have together.
+        bundle: The file of the bundle.
+        into: A new folder for the bundle's results, which can be read, merged and exported like any
+            others; None removes the results. The folder's summary and report are written from the
+            database.
+        replay: The number of episodes whose recorded actions are executed again.
+        seed: The seed with which these episodes are drawn; None selects a new seed, which the
+            author of the bundle cannot know.
+        trust: Whether the bundle's environments may name any code and files.
+        most_bytes: The maximum size of all files of the bundle, bytes.
 
     Returns:
         The findings.
 
     Raises:
-        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read;
-            or `into` exists.
+        ConfigError: The file is not a bundle or is larger than allowed, its database cannot be
+            read, or `into` exists.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if into is not None and into.exists():
@@ -117,7 +119,8 @@ def verify(
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
-            folder = Path(temporary) / (into or bundle).name  # the name is in the report
+            # The report contains the folder's name.
+            folder = Path(temporary) / (into or bundle).name
             folder.mkdir()
 
             manifest, digest, differences = unpack(bundle, folder, most_bytes=most_bytes)
@@ -147,7 +150,7 @@ def verify(
 
 
 def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Finding]:
-    """Yield all findings except that of the digests; also write summary and report."""
+    """Yield all findings except that about the digests; also write summary and report."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(
             f"expected a bundle that `vlagents-ray bundle` wrote, got one without {DATABASE}"
@@ -163,7 +166,7 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
     yield _check_trajectories(results)
     yield _check_versions(results)
     if not replay:
-        yield Finding("replay", "not checked", "was not asked for (--replay 0)")
+        yield Finding("replay", "not checked", "was not requested (--replay 0)")
         return
 
     chosen = list(islice(_drawn_recordings(results, seed), replay))
@@ -186,8 +189,8 @@ def _drawn_recordings(
 
 
 def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]:
-    """Yield the finished episodes in a random order: one of each case in turns, so that each
-    case is checked.
+    """Yield the finished episodes in a random order, one of each case in turn, so that each case is
+    checked.
     """
     draw = random.Random(seed)
     cases = []
@@ -203,8 +206,8 @@ def _drawn(results: Results, seed: int) -> Iterator[tuple[CaseResults, Episode]]
 
 
 def _check_cases(results: Results) -> Finding:
-    """Check that cases and keys of episodes are those of their settings, and that nothing was
-    mixed or left out.
+    """Check that the keys of cases and episodes match their settings, and that nothing was mixed or
+    left out.
     """
     contradictions = []
     known_keys: set[str] = set()
@@ -245,15 +248,13 @@ _ONE_OF_A_CASE = ("checkpoint", "weights", "env_program", "policy_program")
 
 
 def _mixtures(results: Results, case: CaseResults) -> Iterator[str]:
-    """Yield the differences between the episodes of a case with which no evaluation would have
-    added them.
-    """
+    """Yield differences between the episodes of a case that no evaluation would have written."""
     for column in _ONE_OF_A_CASE:
         if results.accepted_changes and column != "checkpoint":
             continue
         if column.endswith("_program"):
             values = {getattr(episode, column) for episode in case.episodes if episode.counts}
-        else:  # unknown for an episode that failed in the policy's reset
+        else:  # the value is unknown for an episode that failed in the policy's reset
             values = {getattr(episode.result, column) for episode in case.episodes} - {None}
         if len(values) > 1:
             yield (
@@ -284,7 +285,7 @@ def _check_episodes(results: Results) -> Finding:
     """Check that the columns of each episode do not contradict each other."""
     contradictions: list[str] = []
     runs = {run.run for run in results.runs}
-    recordings: dict[str, int] = {}  # the number of episodes, by path
+    recordings: dict[str, int] = {}  # the number of episodes by path of the recording
     number = 0
     for case in results.cases:
         for episode in case.episodes:
@@ -357,7 +358,7 @@ def _inconsistent_ticks(case: CaseResults, result: EpisodeResult) -> Iterator[st
     """Yield the contradictions between the columns about ticks, and with the clock of the case."""
     has_clock = case.settings.get("clock") is not None
     if not has_clock and (result.ticks_waited, result.latency_ms) != (0, None):
-        yield "it waited for answers, but its environment stood still meanwhile"
+        yield "it waited for answers, but its environment did not advance in the meantime"
 
     ages_ms = [result.age_p50_ms, result.age_p95_ms, result.age_p99_ms]
     known_ages_ms = [age_ms for age_ms in ages_ms if age_ms is not None]
@@ -415,7 +416,7 @@ def _check_trajectories(results: Results) -> Finding:
         )
     fine = f"{checked} match the actions, rewards and outcomes in the database"
     if missing:
-        fine += f"; {missing} others have none, so that their outcomes are only stated"
+        fine += f"; {missing} others have no recording, so their outcomes cannot be checked"
     return _finding("trajectories", contradictions, fine)
 
 
@@ -443,9 +444,9 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
 
     try:
         return Trajectory.load(path)
-    except MemoryError as error:  # its header states a wrong size
+    except MemoryError as error:  # the file's header declares a wrong size
         raise ConfigError(
-            f"{episode.trajectory}: states a size that does not fit into memory"
+            f"{episode.trajectory}: declares a size that does not fit into memory"
         ) from error
 
 
@@ -456,32 +457,33 @@ def _contradictions(
     result = episode.result
     steps = len(trajectory.actions)
     if not _has_one_length(trajectory) or result.steps != steps:
-        yield f"{result.steps} steps in the table, other lengths in the recording"
+        yield f"{result.steps} steps in the table, another number in the recording"
         return
 
     actions = np.ascontiguousarray(trajectory.actions, "<f4").tobytes()
     if hashlib.sha256(actions).hexdigest() != result.actions_sha256:
-        yield "the recorded actions are not those of the table's digest"
+        yield "the recorded actions do not match the digest in the table"
     total = float(sum(trajectory.rewards.tolist()))
     if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
 
-    # An episode that an error of the policy ended counts as no success, whatever was recorded.
+    # An episode that ended with an error of the policy counts as unsuccessful, whatever was
+    # recorded.
     if result.status != "done":
         return
     outcome = (result.success_once, result.success_at_end, result.first_success)
     if _outcome(trajectory.success.astype(bool).tolist()) != outcome:
-        yield "the recorded success is not that of the table"
+        yield "the recorded success differs from the table"
     versions = [int(version) for version in trajectory.versions if version != NO_VERSION]
     acted = (versions[0], versions[-1]) if versions else (None, None)
-    # In real-time mode, an answer may be unused.
+    # In real-time mode, an answer may remain unused.
     if synchronous and acted != (result.first_policy_version, result.policy_version):
-        yield "the recorded versions of the weights are not those of the table"
+        yield "the recorded versions of the weights differ from the table"
 
 
 def _has_one_length(trajectory: Trajectory) -> bool:
-    """Return whether each step has its action, reward, success and version, and each observation
-    its numbers.
+    """Return whether each step has an action, a reward, a success and a version, and each
+    observation has its numbers.
     """
     steps = len(trajectory.actions)
     of_steps = [
@@ -494,8 +496,8 @@ def _has_one_length(trajectory: Trajectory) -> bool:
 
 
 def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
-    """Return success once, success at the end, and the number of steps after which it was first
-    solved.
+    """Return whether the task was solved once, whether it was solved at the end, and the number of
+    steps after which it was first solved.
     """
     first = next((number for number, solved in enumerate(success, 1) if solved), None)
     return first is not None, bool(success and success[-1]), first
@@ -538,35 +540,39 @@ def _commit(versions: Mapping[str, Any]) -> str:
     return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
 
 
-# Options that choose code, although they may be words.
+# Options that choose code, even if their values are words.
 _CODE = re.compile("trust.*|module|source_dir")
-_WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
+_WORD = re.compile(r"\w[\w.+-]{0,63}")  # a text value that is not a path, URL or "module:Class"
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """The recorded actions in an environment here, compared with the recording step by step."""
+    """The result of executing recorded actions in an environment here, compared with the recording
+    step by step.
+    """
 
-    success: list[bool]  # after each step
+    success: list[bool]  # success after each step
     ending: Ending
-    instruction: str  # several are joined with semicolons
-    # The largest difference of a number, by the step that differs; 0 is the reset.
+    instruction: str  # the instructions; several are joined with semicolons
+    # The largest difference of a number, for each step that differs; step 0 is the reset.
     differences: dict[int, float]
-    described: Mapping[str, Any]  # by the environment here
+    described: Mapping[str, Any]  # the description of the environment here
 
 
 class _Comparison(EpisodeObserver):
     """Compares an episode with its recording, step by step."""
 
     def __init__(self, recorded: Trajectory) -> None:
-        self.success: list[bool] = []  # after each step
-        # The largest difference of a number, by the step that differs; 0 is the reset.
+        self.success: list[bool] = []  # success after each step
+        # The largest difference of a number, for each step that differs; step 0 is the reset.
         self.differences: dict[int, float] = {}
         self._recorded = recorded
-        self._obs: Obs | None = None  # the newest
+        self._obs: Obs | None = None  # the newest observation
 
     def add_observation(self, obs: Obs) -> None:
-        """Compare the observation of the reset; that of a step waits for the step's outcome."""
+        """Compare the observation of the reset; the observation of a step is compared together with
+        the step's outcome.
+        """
         if self._obs is None:
             self._note(0, _difference(self._recorded, 0, obs, None))
         self._obs = obs
@@ -587,15 +593,14 @@ class _Comparison(EpisodeObserver):
 def _difference(
     recorded: Trajectory, number: int, obs: Obs, outcome: tuple[float, bool] | None
 ) -> float | None:
-    """Return the largest difference of a step's numbers, or of those of the reset; None if they are
-    bit-identical.
-
-    It is infinite if there are other numbers, and 0 if only the success differs.
+    """Return the largest difference of the numbers of a step or the reset; None if they are
+    bit-identical. The difference is infinite if names or shapes differ, and 0 if only the success
+    differs.
 
     Args:
         recorded: The recording.
         number: The number of steps so far; 0 for the reset.
-        obs: The observation after them.
+        obs: The observation after these steps.
         outcome: Reward and success of the last step; None for the reset.
     """
     if obs.state.keys() != recorded.state.keys():
@@ -626,7 +631,8 @@ def _difference(
 
 
 def require_harmless(case: CaseResults) -> None:
-    """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
+    """Raise `ConfigError` if creating this environment could run other code than that of a
+    registered environment.
 
     A bundle may come from a stranger: "module:Class" would be imported, and an option that is a
     path or a nested value could name files or code of this machine. `trust_remote_code` from a
@@ -634,7 +640,7 @@ def require_harmless(case: CaseResults) -> None:
     """
     if env_suite(case.env) not in names("envs") or ":" in case.env:
         raise ConfigError(
-            f"{case.env}: is no registered environment; --trust makes it, and runs its code"
+            f"{case.env}: is not a registered environment; --trust creates it, and runs its code"
         )
     for kind in ("env_options", "reset_options"):
         risky = {}
@@ -649,9 +655,9 @@ def require_harmless(case: CaseResults) -> None:
 
 
 def replay_actions(case: CaseResults, episode: Episode, trajectory: Trajectory) -> Replayed:
-    """Play the actions of `trajectory` in the environment of `case`, from the episode's seed on.
-
-    Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
+    """Execute the actions of `trajectory` in the environment of `case`, beginning with the
+    episode's seed. State, gripper, rewards and success are compared bit by bit; images are neither
+    rendered nor compared.
 
     Raises:
         ConfigError: The environment rejects these options, or is unknown here; also
@@ -701,7 +707,7 @@ def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trus
         return Finding(
             subject,
             "differs",
-            "its recording has actions and observations of different numbers of steps",
+            "its recording has different numbers of actions and observations",
         )
 
     try:
@@ -750,5 +756,5 @@ def _replay(case: CaseResults, episode: Episode, trajectory: Trajectory, *, trus
                 f"{name} {str(description_here)[:_LENGTH]}, there {str(description)[:_LENGTH]}"
             )
     if differing:
-        detail += f"; the environment says of itself here: {'; '.join(differing)}"
+        detail += f"; the environment describes itself here as: {'; '.join(differing)}"
     return Finding(subject, "equal" if first is None else "other here", detail)

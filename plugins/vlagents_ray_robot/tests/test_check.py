@@ -169,7 +169,7 @@ def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name_befor
     [finding] = report.findings
     assert (finding.check, finding.when) == ("order", "before any motion")
     assert finding.got == "'panda_joint3' as joint 2 of the arm"
-    assert finding.want == "'panda_joint4', as the contract states"
+    assert finding.want == "'panda_joint4', as the contract declares"
 
 
 def test_limits_of_another_number_of_joints_are_an_error() -> None:

@@ -87,7 +87,7 @@ def test_a_wrong_model_is_an_error_with_its_cure(
     with pytest.raises(ConfigError, match="did you mean 'so101'"):
         MujocoArm("so1o1")
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
-    with pytest.raises(ConfigError, match="MENAGERIE_ROOT names a folder"):
+    with pytest.raises(ConfigError, match="set MENAGERIE_ROOT to a folder"):
         MujocoArm("so101")
 
 

@@ -1,4 +1,4 @@
-"""Checks a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
+"""Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves,
 joint by joint.
 
 Nothing moves without --move. With it, each motion begins only after the operator at the robot has

@@ -257,7 +257,6 @@ def _evaluation(words: list[str]) -> tuple[EvalConfig, list[EvalCase]]:
     config = config_from_options(eval_options)
     if eval_options.out is None and eval_options.source is not None:
         raise ConfigError(
-            "--out: expected a folder, in which a repeated or requeued job continues, got none; "
-            "add it"
+            "--out: expected a folder, which a repeated or requeued job continues, got none; add it"
         )
     return config, plan_cases(resolve_policies(config, ask=False)[0])

@@ -15,5 +15,7 @@ collect_ignore = not_here(Path(__file__).parent)
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Each of them loads torch or JAX, some a simulator; of these folders alone."""
+    """Mark the tests in these folders as `sim`: each loads torch or JAX, and some load a
+    simulator.
+    """
     item.add_marker("sim")

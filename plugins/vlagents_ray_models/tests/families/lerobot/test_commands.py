@@ -272,7 +272,7 @@ def test_images_are_sent_as_the_bytes_that_the_camera_gave_and_states_by_their_n
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"url": ""}, "policy.url: expected the server's, got none"),
+        ({"url": ""}, "policy.url: expected the server's URL, got none"),
         ({"state": []}, "expected the parts ['joints', 'gripper'] of the policy"),
         ({"state": ["joints"]}, "expected ['joints'] of the policy"),
         ({"cameras": {"top": "tpo"}}, "did you mean 'top'"),
@@ -308,7 +308,7 @@ def test_other_actions_a_missing_task_and_training_are_refused(
     with pytest.raises(ConfigError, match=r"--policy\.instruction"):
         made.select_action(batch(1) | {"task": [""]})
     for train in (made.get_optim_params, made.config.get_optimizer_preset):
-        with pytest.raises(ConfigError, match="expected a policy whose weights are here"):
+        with pytest.raises(ConfigError, match="expected a policy whose weights are on this machine"):
             train()
 
 

@@ -1,4 +1,4 @@
-"""What of LeRobot's tests runs without Ray."""
+"""Collects the tests with LeRobot that can run if Ray is not installed."""
 
 from __future__ import annotations
 

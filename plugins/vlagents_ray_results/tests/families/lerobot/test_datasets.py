@@ -1,4 +1,4 @@
-"""Datasets of ours, read by LeRobot itself."""
+"""Tests in which LeRobot itself reads our datasets."""
 
 from __future__ import annotations
 
