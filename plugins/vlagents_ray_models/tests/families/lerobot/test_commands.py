@@ -308,7 +308,9 @@ def test_other_actions_a_missing_task_and_training_are_refused(
     with pytest.raises(ConfigError, match=r"--policy\.instruction"):
         made.select_action(batch(1) | {"task": [""]})
     for train in (made.get_optim_params, made.config.get_optimizer_preset):
-        with pytest.raises(ConfigError, match="expected a policy whose weights are on this machine"):
+        with pytest.raises(
+            ConfigError, match="expected a policy whose weights are on this machine"
+        ):
             train()
 
 
