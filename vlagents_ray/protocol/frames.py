@@ -218,8 +218,8 @@ def check_request(request: Request, limits: MessageLimits) -> Request:
         reset_fields = [name for name in _OF_RESET if getattr(request, name)]
         if reset_fields:
             raise MalformedMessage(
-                f"{request.op}: expected no {reset_fields}, which only a reset may set, got them; "
-                "leave them out"
+                f"{request.op}: expected no {reset_fields}, which only a reset may set, got "
+                "them; leave them out"
             )
     if request.obs is None and request.op in _WITH_OBS and not request.prepared:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")

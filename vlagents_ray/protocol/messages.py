@@ -175,7 +175,7 @@ class MessageLimits:
     cameras: int = 16
     state_values: int = 4096  # values in one part of the state
     depth: int = 8  # nesting depth of `info` and `kwargs`
-    items: int = 10_000  # values in `info` and `kwargs` together
+    items: int = 10_000  # total number of values in `info` and `kwargs`
     text: int = 16_384  # length of an instruction
     requests: int = 512  # requests in one frame
     history: int = 256  # observations sent with a reset

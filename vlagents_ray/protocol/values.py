@@ -280,7 +280,7 @@ def as_camera(name: str, image: Any, limits: MessageLimits) -> np.ndarray:
     if image.shape[0] * image.shape[1] > limits.pixels:
         raise MessageTooLarge(
             f"camera {name!r}: expected at most {limits.pixels} pixels, got {image.shape[:2]}; "
-            "send it smaller, or raise `limits.pixels`"
+            "send a smaller image, or raise `limits.pixels`"
         )
     return image
 
@@ -310,7 +310,7 @@ def as_state(name: str, values: Any, limits: MessageLimits) -> np.ndarray:
             return array.astype(np.float32)
     except FloatingPointError as error:
         raise InvalidObservation(
-            f"state {name!r}: expected numbers within float32, got a larger one"
+            f"state {name!r}: expected numbers within float32, got a larger number"
         ) from error
 
 
@@ -333,7 +333,8 @@ def require_obs(obs: Any) -> None:
         if not hasattr(image, "dtype"):
             raise InvalidObservation(
                 f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out "
-                "a camera that has no picture, and convert others: np.asarray(image, np.uint8)"
+                "a camera that has no picture, and convert other types with np.asarray(image, "
+                "np.uint8)"
             )
     for name, values in obs.state.items():
         if not hasattr(values, "dtype") or values.dtype.kind not in "fiub":

@@ -677,7 +677,7 @@ class KeyMapping:
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
     """Log the cameras of a client that the mapping does not read."""
     logger.warning(
-        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not "
-        f"receive, as the mapping reads only {list(read)}; if the policy needs them, add them to "
+        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not receive, "
+        f"since the mapping reads only {list(read)}; if the policy needs them, add them to "
         "mapping.cameras"
     )

@@ -153,7 +153,7 @@ def test_no_nonsense_in_the_file_gets_out_and_before_long_nobody_gets_in(
     with pytest.raises(ConfigError):
         Keys.from_file(file)
     caller.take_request()
-    assert "the keys stay as they were for 300 s more" in caplog.text
+    assert "the current keys stay valid for 300 s more" in caplog.text
     now += api_keys._CLOSE_S - 1
     keys.check(token, "noop").take_request()
     assert keys.unreadable_s == api_keys._CLOSE_S - 1

@@ -420,7 +420,7 @@ def test_another_user_is_not_let_in(
     pid, answer = result.stdout.split()
     assert answer == "b''"
     assert len(served[0].sessions) == 0
-    assert f"the process {pid} of user 65534 tried to connect" in caplog.text
+    assert f"rejected the process {pid} of user 65534, since" in caplog.text
 
 
 def test_what_could_not_be_sent_keeps_no_memory() -> None:

@@ -203,7 +203,12 @@ def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
     ask(engine, "chosen", "close")
     assert waiting.get(timeout=10).error is None
     assert library.closed == ["b/2"]
-    assert caplog.text.count("the next checkpoint waits until one of 2 leaves the GPU") == 1
+    assert (
+        caplog.text.count(
+            "the next checkpoint waits until one of the 2 loaded checkpoints leaves the GPU"
+        )
+        == 1
+    )
     assert "'reserved': 20, 'free': 5} bytes; set checkpoints: {loaded: 2}" in caplog.text
 
 

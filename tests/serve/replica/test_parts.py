@@ -303,7 +303,7 @@ def test_an_error_of_the_part_of_another_replica_is_raised_here(totals: Totals) 
 def test_other_replicas_call_only_the_methods_that_a_part_names(context: PartContext) -> None:
     parts = open_parts(args(Totals={}), context)
     for method in ("secret", "close", "open", "__init__", "siblings"):
-        with pytest.raises(LookupError, match=f"got '{method}', which it does not have"):
+        with pytest.raises(LookupError, match=f"got '{method}', which the part does not have"):
             asyncio.run(parts.call(f"{HERE}:Totals", method))
 
 

@@ -219,7 +219,7 @@ class Keys:
                 self._hung = reader if reader.is_alive() else None
             elif self._hung.is_alive():
                 self._handle_unreadable(
-                    TimeoutError(f"no answer of its file system for {_WAIT_S:g} s"), now
+                    TimeoutError(f"its file system has not answered for {_WAIT_S:g} s"), now
                 )
             else:
                 self._hung = None
@@ -259,7 +259,7 @@ class Keys:
             )
         elif is_first or now - self._reminded >= _REMIND_S:
             if left_s > 0:
-                consequence = f"the keys stay as they were for {left_s:.0f} s more"
+                consequence = f"the current keys stay valid for {left_s:.0f} s more"
             else:
                 consequence = "all keys are rejected"
             logger.error("the key file cannot be read; %s: %s", consequence, error)
@@ -380,11 +380,11 @@ class Caller:
         key = self._keys.key(self._digest)
         if key is None or key.revoked:
             raise Unauthorized(
-                f"key {self.name!r} was revoked; ask the operator of the server for another"
+                f"key {self.name!r} was revoked; ask the operator of the server for another key"
             )
         if key.expires is not None and time.time() >= key.expires:
             raise Unauthorized(
-                f"key {self.name!r} has expired; ask the operator of the server for another"
+                f"key {self.name!r} has expired; ask the operator of the server for another key"
             )
         if key.apps and self.app not in key.apps:
             raise Forbidden(f"key {self.name!r} is for {sorted(key.apps)}, not for {self.app!r}")

@@ -133,7 +133,7 @@ class Account:
         """Return how long the server must not read from the client, s; 0 if the key is within its
         rate.
 
-        The pause slows down clients of a key whose messages are rejected in any case.
+        The pause slows down clients of a key whose messages would be rejected anyway.
         """
         return self.caller.throttled_s() if isinstance(self.caller, Caller) else 0.0
 

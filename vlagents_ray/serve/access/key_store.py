@@ -46,7 +46,7 @@ class Key:
     sha256: str  # SHA-256 of the key's UTF-8 text, 64 hexadecimal digits
     apps: tuple[str, ...] = ()  # applications for which the key is valid; empty for all
     rate: float | None = None  # maximum rate, requests/s
-    sessions: int | None = None  # maximum number of sessions at once
+    sessions: int | None = None  # maximum number of simultaneous sessions
     # "simulation" applies to all requests of the key; otherwise each request sets its priority.
     priority: PriorityName | None = None
     scopes: tuple[str, ...] = ()  # a subset of `SCOPES`
@@ -165,11 +165,11 @@ def read_text(file: Path) -> str:
     except OSError as error:
         raise ConfigError(
             f"keys file {file}: cannot be read ({error.strerror}); `vlagents-ray keys create` "
-            "makes one"
+            "creates it"
         ) from error
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"keys file {file}: cannot be read, as it is not UTF-8 ({error.reason})"
+            f"keys file {file}: cannot be read, since it is not UTF-8 ({error.reason})"
         ) from error
 
 

@@ -38,7 +38,7 @@ class DialectConfig(BaseModel, extra="forbid"):
     )
     priority: PriorityName = Field(
         default="robot",
-        description="Priority of its requests. Robots are served before simulations.",
+        description="Priority of the client's requests. Robots are served before simulations.",
     )
 
     @field_validator("mapping")
@@ -59,7 +59,7 @@ class PortConfig(DialectConfig):
     port: int = Field(
         ge=1,
         le=65535,
-        description="Port to which clients connect. The deployment fails if it is in use.",
+        description="Port to which clients connect. The deployment fails if the port is in use.",
     )
     host: str | None = Field(
         default=None,
@@ -75,8 +75,8 @@ class KeylessPortConfig(PortConfig):
 
     without_key: bool = Field(
         default=False,
-        description="Accept clients of this protocol without an API key, as it has no field for "
-        "one.",
+        description="Accept clients without an API key, since this protocol has no field for a "
+        "key.",
     )
 
 

@@ -329,9 +329,9 @@ class PortDialect(Dialect):
             isinstance(context.check, NoKey) or config.without_key
         ):
             raise ConfigError(
-                f"dialects.{name}: expected a protocol with API keys, as the server requires "
-                "them, got one without; remove the dialect, or accept all clients that reach its "
-                "port, with without_key: true"
+                f"dialects.{name}: expected a protocol with API keys, since the server requires "
+                "keys, got a protocol without keys; remove the dialect, or accept all clients "
+                "that reach its port, with without_key: true"
             )
 
     @classmethod
@@ -402,7 +402,7 @@ async def decoded(
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
-    """Accept a WebSocket; return False if it was rejected, as the policy is not ready or the
+    """Accept a WebSocket; return False if it was rejected, because the policy is not ready or the
     replica is full.
     """
     try:
@@ -524,7 +524,9 @@ async def act_together(
     """
     charge = message.charge
     if charge is None:
-        raise TypeError("message: expected one with a charge, as `RouteDialect.arrived` creates it")
+        raise TypeError(
+            "message: expected a message with a charge, as `RouteDialect.arrived` creates it"
+        )
     charge.cover(len(observations))
 
     beginning = [

@@ -23,7 +23,7 @@ from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
 
-_LOADING_S = 3600.0  # time limit for loading the policy; a failure is raised at once
+_LOADING_S = 3600.0  # time limit for loading the policy; a failure is raised immediately
 _ANSWER_S = 30.0
 
 

@@ -6,10 +6,10 @@ protected in the same way. Some paths require no key: `/healthz` reports only wh
 ready, or the step of loading that it has reached, and the `public` paths are pages without data. A
 WebSocket is rejected before it is accepted.
 
-When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels
-requests over HTTP. None of the client's waiting requests is executed then. When the replica stops
-(`Shutdown`), the messages that have arrived are answered before a WebSocket ends. Both are done by
-`vlagents_ray.serve.endpoints.asgi_websocket`.
+When the client of a WebSocket leaves, the task that serves the WebSocket is cancelled, just as
+Serve cancels requests over HTTP. None of the client's waiting requests is executed then. When the
+replica stops (`Shutdown`), the messages that have arrived are answered before a WebSocket ends.
+Both are done by `vlagents_ray.serve.endpoints.asgi_websocket`.
 """
 
 from __future__ import annotations

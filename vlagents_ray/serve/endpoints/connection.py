@@ -565,7 +565,7 @@ def has_hung_up(connection: socket.socket) -> bool:
     """
     poller = select.poll()
     try:
-        # A full hang-up is reported in any case.
+        # The mask is 0, since a full hang-up is always reported.
         poller.register(connection, getattr(select, "POLLRDHUP", 0))
     except ValueError:  # this process has closed the connection
         return True

@@ -12,7 +12,8 @@ from collections.abc import Callable
 
 logger = logging.getLogger(__name__)
 
-_SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
+# Maximum time without progress for a client that does not read all replies immediately.
+_SLOW_S = 10.0
 
 
 class SendBuffer:
@@ -42,7 +43,7 @@ class SendBuffer:
         self._unsent = bytearray()
         self._thread: threading.Thread | None = None  # sends unsent bytes to a slow client
         self._slow = False  # whether the thread is sending unsent bytes
-        self._last = False  # whether the unsent bytes are the last ones of the connection
+        self._last = False  # whether no further bytes may be sent on the connection
         self._closed = False
 
     def send(self, data: bytes, *, last: bool = False) -> None:

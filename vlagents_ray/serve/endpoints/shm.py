@@ -124,7 +124,8 @@ class UnixServer(PolledServer["UnixConnection"]):
         pid, uid = peer_process(connection)
         if uid != os.getuid():
             logger.warning(
-                "the process %d of user %d tried to connect, which is not this server's user",
+                "rejected the process %d of user %d, since this server accepts only processes of "
+                "its own user",
                 pid,
                 uid,
             )

@@ -41,8 +41,8 @@ _DEFAULT = EngineSettings()
 
 
 class Engine:
-    """Serves an agent, or agents of several checkpoints, to many sessions, from `start` (which
-    loads) to `close`.
+    """Serves an agent, or agents of several checkpoints, to many sessions, from `start`, which
+    loads the policy, to `close`.
 
     `intake` checks and queues requests, `runner` runs the batches, and `models` loads checkpoints.
     `health` contains the reason if the policy cannot act, and `moves` moves sessions between
@@ -181,8 +181,8 @@ class Engine:
             return
 
         # The policy may still process the running batch, so its requests must not be sent again,
-        # unlike waiting requests. This is repeated at each call, since a request may be queued
-        # after this call although it was checked before.
+        # unlike waiting requests. Each call does this again, since a request that was checked
+        # before a call may be queued after it.
         running, waiting = self.queue.clear()
         for pending in running:
             pending.fail(OutcomeUnknown(hanging.description))

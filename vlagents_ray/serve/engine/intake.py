@@ -376,8 +376,8 @@ def _stated_slo(option: object) -> Slo | None:
 def _latest_episode(pending: PendingRequest, session: Session[LoadedModel]) -> int:
     """Return the step at which the episode of an act began, if the act's connection has no episode.
     The act then belongs to the latest episode of the session. An act without a step is rejected if
-    this episode has begun too late: after the connection was opened or, over HTTP, after the act
-    arrived, while the act waited for a search for its session.
+    this episode began after the connection was opened. Over HTTP, it is rejected if the episode
+    began after the act arrived, while the act waited for a search for its session.
     """
     if pending.request.step is None and session.last_reset > pending.latest_begin:
         raise session.wrong_episode()

@@ -104,7 +104,7 @@ class MetricsBuffer:
             kinds = kinds[:1]
         for (op, priority), reply in zip(kinds, message.replies, strict=True):
             if reply.error is None:
-                # Replies that are too large together are sent as errors, without times.
+                # Replies whose total size is too large are sent as errors, without times.
                 times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
                 self.handled((op, message.transport, priority, "ok"), times)
             else:
@@ -169,7 +169,7 @@ class MetricsBuffer:
 
     @property
     def replays(self) -> int:
-        """The number of replays of CUDA graphs, also in the other processes of the replica."""
+        """The number of replays of CUDA graphs in all processes of the replica."""
         return CudaGraph.replays + self._replayed_elsewhere
 
     def add_gpu_work(self, work: GpuWork) -> None:

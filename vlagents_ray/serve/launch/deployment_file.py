@@ -128,8 +128,8 @@ def read_deployment(
     if path.suffix in YAML_SUFFIXES:
         if args:
             raise ConfigError(
-                f"expected no settings besides the file {source!r}, got {sorted(args)}; edit the "
-                "file"
+                f"expected no settings in addition to the file {source!r}, got {sorted(args)}; "
+                "edit the file"
             )
         return _deployment_of_file(path, overrides, app, step_follows=step_follows)
 
@@ -263,7 +263,8 @@ def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> 
     apps = our_apps(changed)
     if len(apps) != 1:
         raise ConfigError(
-            f"--{name}-port: expected a file with one policy, got {len(apps)}; write the port there"
+            f"--{name}-port: expected a file with one policy, got {len(apps)}; set the port in the "
+            "file"
         )
 
     args = apps[0].args

@@ -199,8 +199,8 @@ def haproxy_binary() -> str | None:
 def ingress_environment(
     folder: Path, binary: str, listener: PublicListener | None = None
 ) -> dict[str, str]:
-    """Return the environment variables of a cluster whose ingress is this HAProxy, with files in
-    `folder`.
+    """Return the environment variables of a cluster that uses this HAProxy as its ingress, with
+    HAProxy's files in `folder`.
     """
     replicas = free_block(_REPLICA_PORTS)
     # These ports must be free on all addresses, since HAProxy's metrics and statistics listen on

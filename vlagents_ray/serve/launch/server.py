@@ -174,8 +174,8 @@ def running_server(
     """
     if ":" in host:
         raise ConfigError(
-            f"host: expected an IPv4 address, got {host}; use one, or 0.0.0.0 for all of this "
-            "machine"
+            f"host: expected an IPv4 address, got {host}; use an IPv4 address, or 0.0.0.0 for all "
+            "addresses of this machine"
         )
     private.check_ray()
     config = with_gateways_at(config, host)
@@ -409,7 +409,7 @@ def _ray(
     has_haproxy = os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1"
     if has_haproxy and address is None and host not in (LOOPBACK, "localhost", EVERYWHERE):
         raise ConfigError(
-            f"host {host}: with HAProxy Serve would find no replica at a single address; "
+            f"host {host}: with HAProxy, Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
     with session.joined(address):

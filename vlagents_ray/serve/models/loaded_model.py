@@ -316,8 +316,8 @@ class Loader:
     def load_deferred(self, model: LoadedModel) -> None:
         """Continue the deferred loading of a model, between two of its calls.
 
-        The lock of pushes, which a capture needs, comes first: a push also holds it when it waits
-        for the model.
+        The lock of pushes, which a capture needs, is acquired first, since a push also holds this
+        lock while it waits for the model.
         """
         with CAPTURES.pushes, model.busy:
             if model.deferred is None or model.closed:

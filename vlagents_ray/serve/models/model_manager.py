@@ -451,7 +451,8 @@ class ModelManager:
         if self._full and not full:
             cure = f"set checkpoints: {{loaded: {loaded}}}, or smaller batch.sizes"
             logger.warning(
-                "the next checkpoint waits until one of %d leaves the GPU: %s bytes; %s",
+                "the next checkpoint waits until one of the %d loaded checkpoints leaves the "
+                "GPU: %s bytes; %s",
                 loaded,
                 memory,
                 cure,

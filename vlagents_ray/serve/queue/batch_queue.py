@@ -29,7 +29,7 @@ from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.requests import PendingRequest
 
 _SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
-_LONG_BATCH_S = 0.5  # duration of a batch after which another thread polls in any case
+_LONG_BATCH_S = 0.5  # duration of a batch after which another thread always polls, s
 # Interval between two requests below which the next request is expected after the same interval.
 _DENSE_S = 500e-6
 

@@ -110,19 +110,25 @@ class Exporter:
             Counter, "out_of_memory", "Forward passes that did not fit into memory."
         )
         self._uncompiled = make(
-            Gauge, "uncompiled", "Batch sizes that run without the compilation that is set."
+            Gauge, "uncompiled", "Batch sizes that run without the configured compilation."
         )
         # The next five series describe robots that report their ticks.
         self._ticks = make(
-            Counter, "ticks", "Ticks at which the policy was to act, as robots report.", "priority"
+            Counter,
+            "ticks",
+            "Ticks at which the policy had to act, as reported by robots.",
+            "priority",
         )
         self._starved = make(
-            Counter, "starved_ticks", "Those of these ticks without an action in time.", "priority"
+            Counter,
+            "starved_ticks",
+            "Ticks without an action in time, as reported by robots.",
+            "priority",
         )
         self._executed_age = make(
             Histogram,
             "executed_age_ms",
-            "Age of executed actions, as robots report.",
+            "Age of executed actions, as reported by robots.",
             "priority",
             boundaries=MS_BOUNDARIES,
         )
@@ -141,7 +147,7 @@ class Exporter:
         self._slo_load = make(
             Gauge,
             "slo_load",
-            "Share of a replica that its robots need to be in time, by their SLOs.",
+            "Share of a replica that its robots need to be in time, according to their SLOs.",
         )
         self._unreadable = make(
             Gauge, "keys_unreadable_s", "Time in which the key file could not be read."

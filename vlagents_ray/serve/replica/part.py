@@ -254,8 +254,8 @@ class ReplicaParts:
         opened = self._parts.get(part)
         if opened is None or method not in opened.sibling_methods:
             raise LookupError(
-                f"part {part!r}: expected a method for other replicas, got {method!r}, which it "
-                "does not have"
+                f"part {part!r}: expected a method for other replicas, got {method!r}, which the "
+                "part does not have"
             )
         call = getattr(opened, method)
         if inspect.iscoroutinefunction(call):

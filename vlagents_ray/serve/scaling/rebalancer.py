@@ -351,7 +351,7 @@ class Rebalancer:
             chosen = choose_connections(movable, excess.amount)
             drain_list.mark(set(sorted(chosen)[:_AT_ONCE]))
             logger.info(
-                "%d sessions, %s more than a fair share: sending some away",
+                "%d sessions, %s more than a fair share: some clients are requested to reconnect",
                 mine.sessions,
                 excess.text,
             )
