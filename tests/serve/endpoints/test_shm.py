@@ -16,12 +16,14 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from api_key_replica import plasma_server
 from eval_fakes import wait_for
 from open_resources import descriptors, running_threads
 from shm_client import LIMITS, Keeper, call, client, request
@@ -41,7 +43,8 @@ from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request, peer_uid
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.access.charges import REFUSALS
-from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.endpoints.plasma import PlasmaServer, Pool
+from vlagents_ray.serve.endpoints.shm import ShmServer, UnixServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.settings import EngineSettings
 
@@ -473,3 +476,69 @@ def test_a_client_whose_key_is_refused_is_answered_a_few_times_and_then_ended() 
     wait_for(lambda: not endpoint._clients)
     engine.close()
     endpoint.close()
+
+
+def _malformed_messages(server: UnixServer, seconds: float) -> tuple[int, socket.socket]:
+    """Send malformed messages as fast as the server reads them; return the number of answers, and
+    the connection.
+    """
+    message, address = bytes(200_000), "\0"
+    if isinstance(server, ShmServer):
+        message = LocalAddress.REQUEST.pack(LocalAddress.FILES + 1, 0, 100)
+        address += server.address.socket
+    elif isinstance(server, PlasmaServer):
+        address = server.plasma.socket
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    connection.connect(address)
+    connection.setblocking(False)
+    answers, end = 0, time.monotonic() + seconds
+    while time.monotonic() < end:
+        sent = received = False
+        with contextlib.suppress(BlockingIOError):
+            sent = connection.send(message) > 0
+        with contextlib.suppress(BlockingIOError):
+            received = len(connection.recv(4096)) > 0
+            answers += received
+        if not (sent or received):
+            time.sleep(0.001)
+    return answers, connection
+
+
+@pytest.mark.parametrize("endpoint", ["shm", "plasma"])
+def test_malformed_messages_of_a_client_are_read_at_a_low_rate_and_disturb_no_other_client(
+    served: tuple[Engine, ShmServer],
+    endpoint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine, near = served
+    with contextlib.ExitStack() as stack:
+        server: UnixServer = near
+        if endpoint == "plasma":
+            server = plasma_server(engine, LIMITS, monkeypatch, tmp_path)
+            monkeypatch.setattr(server.pool, "claim", Pool(LIMITS).claim)
+            server.open()
+            stack.callback(server.close)
+        with ThreadPoolExecutor(1) as executor, contextlib.closing(client(near)) as robot:
+            flood = executor.submit(_malformed_messages, server, 1.5)
+            call(robot, request("reset"), 5)
+            while not flood.done():
+                assert call(robot, request("act", 3), 5).act is not None
+            answers, connection = flood.result()
+        with connection:
+            assert 8 <= answers <= 60  # thousands, if each is read
+            connection.setblocking(True)
+            connection.settimeout(30)
+            connection.send(LocalAddress.PING)
+            answer = b""
+            while answer != LocalAddress.PONG:  # after those of the messages that wait
+                answer = connection.recv(4096)
+                assert answer, "the connection was ended"
+
+
+def test_a_flood_of_connections_that_are_not_accepted_does_not_fill_the_log(
+    served: tuple[Engine, ShmServer], caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(1000):
+        served[1].warn("client %d", number)
+    assert [record.getMessage() for record in caplog.records] == [f"client {n}" for n in range(10)]

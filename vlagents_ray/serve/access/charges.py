@@ -44,6 +44,10 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 
 # Number of consecutive messages over the rate of the key after which a connection ends.
 REFUSALS = 8
+# Malformed messages of a connection that are answered at once, and further ones of each second. A
+# client of this package sends none; without a key, a rate does not limit them.
+_MALFORMED = 8
+_MALFORMED_PER_S = 10.0
 REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
@@ -54,7 +58,7 @@ class Account:
     use it.
     """
 
-    __slots__ = ("_control_frames", "_free", "_refused", "caller")
+    __slots__ = ("_control_frames", "_free", "_malformed", "_refused", "caller")
 
     def __init__(self, caller: Identity | None = None) -> None:
         """Open the account of a client; `caller` is None until the client is identified."""
@@ -62,6 +66,7 @@ class Account:
         self._free: Charge | None = None  # charge of all messages of a client without a key
         self._refused = 0  # number of consecutive messages over the rate
         self._control_frames: TokenBucket | None = None  # created with the first control frame
+        self._malformed: TokenBucket | None = None  # created with the first malformed message
         if caller is not None:
             self.identify(caller)
 
@@ -123,6 +128,17 @@ class Account:
         if isinstance(self.caller, Caller):
             with contextlib.suppress(VLAgentsError):
                 self.caller.take_request()
+
+    def malformed_s(self) -> float:
+        """Count a malformed message; return how long the server must not read from the client, s.
+
+        Otherwise a client that repeats malformed messages would take the time of the thread that
+        reads them, which also answers robots.
+        """
+        now = time.monotonic()
+        if self._malformed is None:
+            self._malformed = TokenBucket(_MALFORMED_PER_S, now, _MALFORMED)
+        return self._malformed.take(now)
 
     @property
     def refused_too_often(self) -> bool:

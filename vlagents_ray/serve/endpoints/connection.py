@@ -50,12 +50,16 @@ _ENDED_AT_ONCE = 64
 # Maximum number of unanswered messages of a client; further messages stay unread.
 MOST_UNANSWERED = 256
 POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
+# Number of warnings about clients that a server logs at once, and further ones of each second. A
+# client that connects again and again would fill the log.
+_WARNINGS, _WARNINGS_PER_S = 10, 0.1
 # Maximum number of connections that a server accepts in a second; accepting a connection takes some
 # time of the policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
 BACKLOGGED = "too much of it is unanswered"
+MALFORMED = "it sends malformed messages"
 
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
 _STAMP = struct.Struct("@qq")  # wall clock, s and ns
@@ -181,6 +185,17 @@ class PolledConnection(ABC):
         """End the pause for this reason; poll the connection again if no other reason is left."""
         self._unpolled_for.discard(reason)
         self._continue()
+
+    def _pause_for(self, reason: str, seconds: float) -> None:
+        """Stop polling the connection for a time; call this on the polling thread."""
+        self._pause(reason)
+        self._call_later(seconds, partial(self._end_pause, reason))
+
+    def _end_pause(self, reason: str) -> None:
+        """Poll the connection again, unless its client has hung up, or another reason is left."""
+        if not self._ended and has_hung_up(self._connection):
+            self.disconnect()
+        self._resume(reason)
 
     def _throttle(self) -> bool:
         """Pause the connection while the client's key is over its rate; return whether the key is
@@ -414,6 +429,7 @@ class PolledServer(ConnectionOwner[C], ABC):
         self.check_key = check_key
         self._listener = listener
         self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
+        self._warnings = TokenBucket(_WARNINGS_PER_S, time.monotonic(), _WARNINGS)
         # Without a free descriptor a client could not even be rejected, and the listener would stay
         # readable.
         self._spare = _spare_descriptor()
@@ -454,7 +470,7 @@ class PolledServer(ConnectionOwner[C], ABC):
             return
         except OSError as error:
             self._accepting.give_back()
-            logger.warning("a client was not accepted: %s", error)
+            self.warn("a client was not accepted: %s", error)
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._spare.close()
                 with contextlib.suppress(OSError):
@@ -471,6 +487,11 @@ class PolledServer(ConnectionOwner[C], ABC):
         except Exception:
             logger.exception("a client was not accepted")
             connection.close()
+
+    def warn(self, text: str, *values: object) -> None:
+        """Log a warning about a client that was not accepted, unless there were many of them."""
+        if self._warnings.take(time.monotonic()) == 0:
+            logger.warning(text, *values)
 
     def _listen_again(self) -> None:
         self.poller.watch(self._listener, self.accept)

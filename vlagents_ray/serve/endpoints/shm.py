@@ -47,6 +47,7 @@ from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     BACKLOGGED,
     DECODING,
+    MALFORMED,
     MOST_UNANSWERED,
     POLICY_VIOLATION,
     STAMP_SPACE,
@@ -123,7 +124,7 @@ class UnixServer(PolledServer["UnixConnection"]):
     def _add_client(self, connection: socket.socket) -> None:
         pid, uid = peer_process(connection)
         if uid != os.getuid():
-            logger.warning(
+            self.warn(
                 "rejected the process %d of user %d, since this server accepts only processes of "
                 "its own user",
                 pid,
@@ -297,6 +298,10 @@ class UnixConnection(PolledConnection):
     def _refuse(self, message: IncomingMessage, error: VLAgentsError) -> None:
         message.refuse(error)
         self.deliver(message)
+        if isinstance(error, MalformedMessage):
+            wait_s = self.account.malformed_s()
+            if wait_s > 0 and not self._ended:
+                self._pause_for(MALFORMED, wait_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
         """Identify the client by the key in its first message.
