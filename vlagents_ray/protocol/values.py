@@ -350,7 +350,7 @@ def require_obs(obs: Any) -> None:
 
 
 def _as_float32(name: str, values: Any) -> np.ndarray:
-    """Convert a part of the state; raise `InvalidObservation` if it has no numbers."""
+    """Convert a part of the state; raise `InvalidObservation` if its values are not numbers."""
     try:
         array = np.asarray(values)
         # Without this check, text and complex numbers would also be converted.

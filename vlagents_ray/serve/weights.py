@@ -145,7 +145,7 @@ class ModelWeights:
         digest: str = "",
         model: tuple[str, str] = ("", ""),
     ) -> None:
-        """Make the weights of an initialized agent version 0.
+        """Create the versions of an initialized agent, whose current weights are version 0.
 
         Args:
             agent: The agent, which uses one version at a time.

@@ -519,7 +519,7 @@ async def act_together(
     reset again. That is safe, since the policy has not received the observation.
 
     Raises:
-        TooManyRequests: The client's key is over its rate; nothing was acted on.
+        TooManyRequests: The client's key is over its rate; the policy has received nothing.
         VLAgentsError: The first error among the replies.
     """
     charge = message.charge

@@ -204,7 +204,7 @@ class AsgiWebSocket:
         await self._over.wait()
 
     def _on_end(self) -> None:
-        """Cancel the application, as the connection has ended; called on the polling thread."""
+        """Cancel the application, since the connection has ended; called on the polling thread."""
         self._client.ended()
         with contextlib.suppress(RuntimeError):  # the event loop is closed
             self._loop.call_soon_threadsafe(self._cancel)

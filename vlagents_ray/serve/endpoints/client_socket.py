@@ -154,7 +154,7 @@ class ClientSocket:
         """Return a `send` after which uvicorn reads an accepted WebSocket that is not claimed."""
 
         async def send_and_read(message: Message) -> None:
-            """Send a message as uvicorn's `send`."""
+            """Send a message as uvicorn's `send` does."""
             is_accepted = message["type"] == "websocket.accept"
             try:
                 await send(message)

@@ -278,7 +278,7 @@ class HttpConnection(MessageConnection):
         self._left = 0  # number of missing bytes of that body; -1 if the body has chunks
         self._parts: list[bytes] = []  # received parts of that body
         self._size = 0  # number of bytes in these parts
-        self._is_dropped = False  # whether the body is discarded, as the request is rejected
+        self._is_dropped = False  # whether the body is discarded because the request is rejected
         self._answering: HttpHead | None = None  # request whose answer is awaited
         self._request_id = ""  # request id in the headers of the answer
         self._name = ""  # request id in the document of an error

@@ -236,12 +236,12 @@ class MessageConnection(PolledConnection):
             self._end_for(error)
 
     def _end_for(self, error: VLAgentsError) -> None:
-        """End the connection for an error of an incomplete message."""
+        """End the connection because of an error in an incomplete message."""
         code = TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION
         self.end(str(error), code)
 
     def _give_up(self) -> None:
-        """End the connection, as a complete message needs the memory; called on any thread."""
+        """End the connection, since a complete message needs the memory; called on any thread."""
         reason = "a complete message needs the memory"
         self._call_soon(lambda: self.end(reason, TRY_AGAIN_LATER))
 

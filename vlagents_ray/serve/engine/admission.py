@@ -291,7 +291,7 @@ class ArrivingBytes:
         Args:
             key: The name of the connection's key; None without a key.
             robot: Whether the bytes reserved for robots may be used.
-            give_up: Ends the connection, as a complete message needs the memory; called on any
+            give_up: Ends the connection if a complete message needs the memory; called on any
                 thread.
         """
         self.key, self.robot, self.give_up = key, robot, give_up

@@ -1,8 +1,8 @@
 """Timings of requests and batches: reported in each reply, and buffered for the metrics exporter.
 
-Per request this costs two readings of the clock and one addition to a sample. The exporter thread
-(`vlagents_ray.serve.replica.metrics`) has little work left, since requests may wait while it holds
-the interpreter lock.
+Each request costs two readings of the clock and one addition to a sample. The exporter thread
+(`vlagents_ray.serve.replica.metrics`) does as little as possible, since requests may wait while it
+holds the interpreter lock.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ def build_reply(
             the policy itself returns a version (as a proxy does).
 
     Returns:
-        The reply; it has an error if the policy raised one, or if its result is invalid or too
-        large.
+        The reply. It contains an error if the policy raised an error, or if the policy's result is
+        invalid or too large.
     """
     request_id = pending.request.request_id
     try:

@@ -256,8 +256,8 @@ class Sender:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
         If a pause of the process delayed a request, the delay counts towards its deadline. A busy
-        event loop may have delayed it as well. When the caller stops waiting (deadline,
-        disconnect), its requests that are not in a batch yet are withdrawn.
+        event loop may also have delayed the request, by an unknown time. When the caller stops
+        waiting (deadline, disconnect), its requests that are not in a batch yet are withdrawn.
         """
         loop = asyncio.get_running_loop()
         waiting = WaitingTask()

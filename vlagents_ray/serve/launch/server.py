@@ -543,7 +543,7 @@ def wait_until_ready(
             again every 30 s.
 
     Raises:
-        ConfigError: An application failed to deploy, or a policy to load.
+        ConfigError: An application failed to deploy, or a policy failed to load.
         PolicyUnavailable: The deadline has passed.
     """
     remind_at = 0.0

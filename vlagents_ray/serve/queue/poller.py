@@ -73,7 +73,7 @@ class Poller:
     def call_later(self, seconds: float, call: Callable[[], None]) -> None:
         """Schedule `call` to run as a callback after `seconds`. Called in a callback.
 
-        No thread is started, since a flood makes many connections wait at once.
+        No thread is started for the wait, since in a flood many connections wait at the same time.
         """
         heapq.heappush(self._timers, (time.monotonic() + seconds, next(self._timer_numbers), call))
 
