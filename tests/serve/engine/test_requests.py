@@ -290,7 +290,7 @@ def test_an_observer_that_fails_costs_no_answer(
 
     served.engine.observers.add(Broken())
     assert served.ask(served.first, "act").act is not None
-    assert "Broken: a request is left out" in caplog.text
+    assert "Broken: the observer has failed and left out a request" in caplog.text
 
 
 class Noting(Observer):

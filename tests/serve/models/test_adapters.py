@@ -151,7 +151,7 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
         ),
         (
             {"checkpoint": "stack", "adapter": "pour"},
-            "expected one of them, got 'pour' and 'stack'",
+            "expected only one of these options, got 'pour' and 'stack'",
         ),
     ],
 )
