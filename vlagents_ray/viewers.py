@@ -50,12 +50,13 @@ _NICE = 5  # niceness of the writing thread, so that its priority is lower than 
 
 @dataclass(frozen=True, slots=True)
 class ViewerFrame:
-    """An observation, the chunk planned from it and the action executed next; its arrays do not
-    change later.
+    """An observation, the chunk that was planned from it, and the action that was executed next.
+
+    The arrays must not change later.
     """
 
     tick: int  # tick of the episode
-    time: float  # s since 1970, of the observation
+    time: float  # time of the observation, s since 1970
     cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
     # (D,) float32 by name; the gripper is also a part.
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -99,7 +100,9 @@ class RerunRecordings:
     """
 
     def __init__(self, target: str) -> None:
-        """Write `TARGET/EPISODE.rrd`, or send to the viewer at an address; see `open_viewer`."""
+        """Write files `TARGET/EPISODE.rrd`, or send episodes to the viewer at an address; see
+        `open_viewer`.
+        """
         is_live = target == "live" or target.startswith("rerun+")
         if "://" in target and not is_live:
             raise ConfigError(
@@ -126,7 +129,9 @@ class RerunRecordings:
                 ) from error
 
     def _require_listener(self) -> None:
-        """Raise `ConfigError` if nothing listens at the address: the SDK would retry forever."""
+        """Raise `ConfigError` if nothing listens at the address, since the SDK would retry
+        forever.
+        """
         address = urlsplit(self.target)
         try:
             host, port = address.hostname or "", address.port or _PORT
@@ -137,8 +142,9 @@ class RerunRecordings:
             ) from error
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        """Begin an episode; `name` is also the name of its file, and an empty `instruction` is
-        not shown.
+        """Begin an episode.
+
+        `name` is also the name of its file, and an empty `instruction` is not shown.
         """
         recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
@@ -199,7 +205,7 @@ def open_viewer(target: str) -> EpisodeViewer:
         The viewer, which the caller closes.
 
     Raises:
-        ConfigError: The target is another address, or nothing listens there.
+        ConfigError: The target is not a valid address, or nothing listens at the address.
         MissingDependency: The extra "rerun" is not installed.
     """
     return EpisodeViewer(RerunRecordings(target))
@@ -255,7 +261,7 @@ class EpisodeViewer:
             self._queue.put(None)
 
     def add(self, frame: ViewerFrame) -> None:
-        """Queue a frame to be shown; never waits."""
+        """Add a frame to the queue without waiting."""
         if not self.has_room:
             self.dropped += 1
             return
@@ -263,8 +269,9 @@ class EpisodeViewer:
         self._queue.put(frame)
 
     def close(self) -> None:
-        """Write the queued frames, and close the target; a live viewer has two seconds to
-        receive them.
+        """Write the queued frames, and close the target.
+
+        A live viewer has two seconds to receive them.
         """
         if not self._closed:
             self._closed = True
@@ -327,7 +334,7 @@ class LoopView:
 
     def __init__(self, viewer: EpisodeViewer | None) -> None:
         self._viewer = viewer
-        self._chunk: np.ndarray | None = None  # the last chunk that was shown
+        self._chunk: np.ndarray | None = None  # chunk that was shown last
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:

@@ -1,1 +1,3 @@
-"""Chunks of actions: the tick of each row, and their execution while the next chunk is computed."""
+"""Chunks of actions: the tick of each row, and the execution of a chunk while the next one is
+computed.
+"""

@@ -37,8 +37,9 @@ from vlagents_ray.interface import (
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Combines the action of the older chunks, (D,), with that of a newer one, (D,), for one tick;
-returns (D,).
+"""Combines the action of the older chunks with the action of a newer chunk for the same tick.
+
+Both actions and the result are (D,).
 """
 
 # The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS;
@@ -51,21 +52,21 @@ MERGES: Mapping[str, Merge] = {
 }
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
-"""The m of the weights exp(-m * i), i = 0 for the oldest, as in Zhao et al. 2023 (ACT,
-https://arxiv.org/abs/2304.13705) and under `temporal_agg` in their code.
+"""The m of the weights exp(-m * i), where i = 0 is the oldest chunk, as in Zhao et al. 2023 (ACT,
+https://arxiv.org/abs/2304.13705) and in `temporal_agg` of their code.
 """
 
 
 class Chunk(NamedTuple):
     """A chunk of actions in an answer of the policy."""
 
-    number: int  # 0 for the first of an episode
-    step: int  # `ChunkBuffer.executed` at its observation: the position of its first row
+    number: int  # 0 for the first chunk of an episode
+    step: int  # `ChunkBuffer.executed` at the chunk's observation: the position of the first row
     rows: np.ndarray  # (H, D) float32
     done: bool = False
     info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
     tick: int = 0  # the tick of the observation
-    seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
+    seen_at: float = 0.0  # capture time of the observation, s of `time.monotonic`
 
     @property
     def end(self) -> int:
@@ -77,11 +78,13 @@ class Step(NamedTuple):
     """The action of one step of the plan."""
 
     action: np.ndarray  # (D,) float32
-    chunk: Chunk  # the newest chunk of the action
-    row: int  # the row of that chunk
+    chunk: Chunk  # newest chunk with a row for this step
+    row: int  # index of the row in that chunk
 
     def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
-        """Return `action` in place of the planned one for a tick, with the info of its chunk."""
+        """Return `action` instead of the planned action of a tick, with the info of the planned
+        action's chunk.
+        """
         chunk = self.chunk
         chunk_info = {
             AGE: tick - chunk.tick,
@@ -99,21 +102,21 @@ class ChunkBuffer:
     """The chunks of a plan, positioned by the number of actions that the robot had executed at
     their observation.
 
-    Row r of a chunk is for r executed actions after its observation. Rows that were replaced by
-    rows of earlier chunks are therefore skipped, however late the answer arrives. While the robot
-    holds still, the plan waits with it, and no row is skipped for those ticks. If ticks were
-    counted instead, the rows after a stall would begin ahead of the robot's position: absolute
-    targets would make it jump, and relative ones would omit a part of the path. (LeRobot's
-    real-time chunking has the same rule since huggingface/lerobot#4454.)
+    Row r of a chunk is to be executed after r further actions since the chunk's observation. Rows
+    whose step was executed with rows of earlier chunks are therefore skipped, however late the
+    answer arrives. While the robot holds still, the plan waits, and no row is skipped. If ticks
+    were counted instead, the rows after a stall would begin ahead of the robot's position: absolute
+    targets would make the robot jump, and relative targets would omit a part of the path.
+    (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
     """
 
     def __init__(self, merge: str | Merge = "newest", ensemble_m: float = ENSEMBLE_M) -> None:
         """Begin a plan without chunks; raises `ConfigError` if `merge` is an unknown name.
 
         Args:
-            merge: The combination of the rows that several chunks have for one step: a name of
-                `MERGES`, "ensemble", or a function that is folded over them from the oldest to the
-                newest.
+            merge: The method that combines the rows of several chunks for one step: a name of
+                `MERGES`, "ensemble", or a function that is folded over the rows from the oldest
+                chunk to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
@@ -127,10 +130,11 @@ class ChunkBuffer:
         self._chunks: deque[Chunk] = deque()
 
     def add(self, chunk: Chunk) -> bool:
-        """Add a chunk; return False if it has no row left to execute, or came too late (`outruns`).
+        """Add a chunk; return False if it has no row left to execute, or arrived too late
+        (`outruns`).
 
-        If no other row is left, the last row may be executed one step late: an answer with a single
-        action has no other row, and arrives after the previous action has been executed.
+        If the last row is the only row left, it may be executed one step late: an answer with a
+        single action has no other row, and arrives after the previous action was executed.
         """
         while self._chunks and self._chunks[0].end <= self.executed:
             self._chunks.popleft()
@@ -146,12 +150,12 @@ class ChunkBuffer:
 
     @property
     def next(self) -> Step | None:
-        """The action to execute now; None if no chunk reaches that far."""
+        """The step to execute now; None if no chunk has a row for it."""
         return self._at(self.executed)
 
     @property
     def after(self) -> np.ndarray | None:
-        """The action behind `next`, (D,); None if no chunk reaches that far."""
+        """The action after `next`, (D,); None if no chunk has a row for it."""
         step = self._at(self.executed + 1)
         return None if step is None else step.action
 
@@ -161,12 +165,12 @@ class ChunkBuffer:
         return max((chunk.end for chunk in self._chunks), default=self.executed) - self.executed
 
     def advance(self) -> None:
-        """Count `next`, or an action in its place, as executed."""
+        """Count `next`, or an action that replaces it, as executed."""
         self.executed += 1
 
     def take(self) -> Step:
-        """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that
-        far.
+        """Return `next` and count it as executed; raises `PolicyFailed` if no chunk has a row for
+        it.
         """
         step = self.next
         if step is None:
@@ -175,7 +179,7 @@ class ChunkBuffer:
         return step
 
     def replace(self, rows: np.ndarray, step: int | None = None, tick: int = 0) -> None:
-        """Replace all chunks by one.
+        """Replace all chunks with a single chunk.
 
         Args:
             rows: Its rows, (H, D).
@@ -195,8 +199,9 @@ class ChunkBuffer:
         return np.stack(rows) if rows else None
 
     def continuation(self, delay: int) -> dict[str, Any]:
-        """Return the `Obs.info` of a request with real-time chunking, whose answer is expected
-        in `delay` ticks.
+        """Return the `Obs.info` of a request with real-time chunking.
+
+        The answer is expected in `delay` ticks.
         """
         leftover = self.leftover()
         if leftover is None:
@@ -205,7 +210,7 @@ class ChunkBuffer:
 
     def outruns(self, step: int, info: Mapping[str, Any]) -> bool:
         """Return whether more rows were executed since the observation of an answer than the policy
-        was given (`GIVEN`).
+        received as a leftover plan (`GIVEN`).
 
         Args:
             step: The number of executed actions at the observation.
@@ -214,8 +219,8 @@ class ChunkBuffer:
         return bool(self.executed - step > info.get(GIVEN, math.inf))
 
     def drop(self, before: float = math.inf) -> bool:
-        """Drop chunks with observations from before a time, s of `time.monotonic`; return
-        whether there were any.
+        """Drop chunks whose observations are older than a time, s of `time.monotonic`; return
+        whether any chunk was dropped.
         """
         count = len(self._chunks)
         self._chunks = deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
@@ -245,23 +250,23 @@ class ChunkBuffer:
         return Step(action, newest, row)
 
 
-# The number of answers that may include a cold start: the first ones that continue a plan may run
-# passes and sizes of batches that are not compiled yet.
+# The number of answers that may include a cold start: the first answers that continue a plan may
+# need forward passes and batch sizes that are not compiled yet.
 _COLD_ANSWERS = 2
-# The number of answers in the estimate. At 10 ms to 1 s each, it follows a slower network within
-# seconds.
+# The number of answers in the estimate. At 10 ms to 1 s for each answer, the estimate adapts to a
+# slower network within seconds.
 _RECENT_ANSWERS = 10
-# The estimate is not the median: if it is too short, the robot jumps; if it is too long, the robot
-# only reacts later.
+# The quantile of the estimate is above the median: an estimate that is too short makes the robot
+# jump, while one that is too long only makes it react later.
 _QUANTILE = 0.9
 
 
 class DelayEstimate:
-    """Estimates the delay of the next answer, in ticks, from those of recent answers.
+    """Estimates the delay of the next answer, in ticks, from the delays of recent answers.
 
-    It is their 0.9 quantile, rounded down to a measured one, so that one slow answer among others
-    does not count. The first two answers may include a cold start, of seconds; they are left out as
-    soon as there is another one.
+    The estimate is their 0.9 quantile, rounded down to a measured delay, so that a single slow
+    answer has no effect. The first two answers may include a cold start of several seconds. They
+    are excluded as soon as there is a third answer.
     """
 
     def __init__(self) -> None:
@@ -277,25 +282,25 @@ class DelayEstimate:
 
     @property
     def ticks(self) -> int:
-        """The delay to expect; 0 before the first answer."""
+        """The expected delay in ticks; 0 before the first answer."""
         if not self._recent:
             return 0
         return sorted(self._recent)[int(_QUANTILE * (len(self._recent) - 1))]
 
 
-SKEW_S = 0.1  # the largest lead of the clock of a sensor's computer over this machine's clock, s
+SKEW_S = 0.1  # largest accepted lead of a sensor computer's clock over this machine's clock, s
 
 
 class CaptureClock:
     """Computes the capture time of an observation, in s of `time.monotonic`.
 
-    `captured_at` is `time.time`, since it is sent to other machines, and that clock may be set at
-    any moment. So it is read once, when a new `captured_at` is first seen; from then on,
-    `time.monotonic` measures the age. If the same observation is passed again, for instance because
-    a camera hangs, it ages regardless of the clock. A jump of the clock affects only the
-    observation during which it happens: after a jump forward the observation is too old; after one
-    backward it lies in the future (by more than `SKEW_S`), and also counts as too old, since its
-    age is unknown.
+    `captured_at` is a time of `time.time`, since it is sent to other machines. This clock may be
+    set at any moment, so it is read only once, when a new `captured_at` first appears. After that,
+    the age is measured with `time.monotonic`. If the same observation is passed again, for instance
+    because a camera hangs, its age increases regardless of the clock. A jump of the clock affects
+    only the observation during which it happens. After a jump forward, the observation is too old.
+    After a jump backward by more than `SKEW_S`, the observation is in the future, and also counts
+    as too old, since its age is unknown.
     """
 
     def __init__(self) -> None:
@@ -303,8 +308,10 @@ class CaptureClock:
         self._at = 0.0
 
     def __call__(self, obs: Obs) -> float:
-        """Return the capture time; the current time if the observation has none; `-math.inf` for
-        an impossible one.
+        """Return the capture time, s of `time.monotonic`.
+
+        It is the current time if the observation has no `captured_at`, and `-math.inf` if the
+        `captured_at` is impossible.
         """
         now = time.monotonic()
         stamp = obs.info.get(CAPTURED)

@@ -1,6 +1,4 @@
-"""The control of a robot: one state for its stops, pauses, takeovers and episodes, held on the
-robot's computer.
-"""
+"""The control state of a robot, on its computer: stops, pauses, takeovers and episodes."""
 
 from __future__ import annotations
 
@@ -20,40 +18,43 @@ ControlState = Literal["autonomous", "paused", "human", "stopped"]
 Outcome = Literal["success", "failure"]
 PAUSED = "paused by an operator"
 COMMAND_S = 0.02
-"""The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz. A command
-takes less than a millisecond, and a stop must not wait for one that hangs.
+"""The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz.
+
+A command takes less than a millisecond, and a stop must not wait for a command that hangs.
 """
 
 
 class Leader(Protocol):
     """The interface of an operator's device: a keyboard, a SpaceMouse, a second arm.
 
-    A device that adds up its motions to absolute targets also has a method `rebase(last)`, which is
-    called when its action was not executed. The next target then begins at `last`, the executed
-    command, (D,) float32, or at the robot's measured pose if `last` is None. Otherwise, the
-    targets would move on while the guard rejects them.
+    A device that sums its motions to absolute targets also has a method `rebase(last)`, which is
+    called when the device's action was not executed. The next target then begins at `last`, the
+    executed command, (D,) float32, or at the robot's measured pose if `last` is None. Otherwise,
+    the targets would move on while the guard rejects them.
     """
 
     def engaged(self) -> bool:
-        """Return whether the operator moves the robot at this tick; must not block."""
+        """Return whether the operator moves the robot at this tick. The method must not block."""
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the operator's action for a tick with `engaged()`; must not block.
+        """Return the operator's action for a tick at which `engaged()` is true.
+
+        The method must not block.
 
         Returns:
             (D,) float32 in the contract's units.
 
         Raises:
-            InvalidAction: The device has no action at this tick; the robot holds still.
+            InvalidAction: The device has no action at this tick, so the robot holds still.
         """
 
 
 class RobotControl:
     """The state machine of a robot.
 
-    | state | source of motion | ends by |
+    | state | source of motion | ends with |
     |---|---|---|
-    | "autonomous" | the policy | any of the others |
+    | "autonomous" | the policy | any of the other states |
     | "human" | the engaged leader | its release: the policy continues, or the robot is paused |
     | "paused" | nothing | `resume`, or an engaged leader |
     | "stopped" | nothing | `restart` |
@@ -61,8 +62,8 @@ class RobotControl:
     `update` sets the state once per tick. All methods may be called from any thread: a pause takes
     effect at the next action, a stop at once. Stops and pauses persist from one run of the control
     loop to the next. Only `pause`, `stop` and `mark` are called over a network (see
-    `vlagents_ray.client.commands`): `resume` and `restart` are for the operator at the robot, and
-    for its own program.
+    `vlagents_ray.client.commands`): `resume` and `restart` are for the operator at the robot and
+    for the robot's own program.
 
     Args:
         leader: The operator's device, or None.
@@ -73,18 +74,21 @@ class RobotControl:
         self.stops: list[str] = []
         """The reasons of all stops, oldest first."""
         self.running = False
-        """Whether `run_loop` drives the robot, which commands nothing while it is paused or
-        stopped.
+        """Whether `run_loop` drives the robot.
+
+        The loop sends no command while the robot is paused or stopped.
         """
-        self._lock = threading.RLock()  # a signal handler may interrupt its owner
-        self._commanding = threading.RLock()  # held during a command, and acquired before `_lock`
-        self._stopping = 0  # calls of the robot's `stop` in progress
+        # Reentrant, since a signal handler may interrupt the thread that owns it.
+        self._lock = threading.RLock()
+        # Locked during a command, always acquired before `_lock`.
+        self._commanding = threading.RLock()
+        self._stopping = 0  # number of calls of the robot's `stop` in progress
         self._state: ControlState = "autonomous"
         self._stop: str | None = None  # the reason of a commanded stop
         self._barked = False  # whether a silence stopped the robot
         # Sources whose silence stopped the robot and that are still silent.
         self._silent: set[str] = set()
-        self._unseen = False  # whether the loop has yet to hold the robot for the last stop
+        self._unseen = False  # whether the loop has not yet held the robot still for the last stop
         self._auto = False  # whether the end of a silence ends the stop that it caused
         self._pause: str | None = None  # the reason of a pause
         self._pauses = 0  # the number of pauses so far
@@ -92,7 +96,7 @@ class RobotControl:
         self._outcome: Outcome | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotControl:
-        return RobotControl(copy.deepcopy(self.leader, memo))  # the copy controls another robot
+        return RobotControl(copy.deepcopy(self.leader, memo))  # The copy controls another robot.
 
     @property
     def state(self) -> ControlState:
@@ -101,8 +105,8 @@ class RobotControl:
 
     @property
     def reason(self) -> str | None:
-        """The reason why the robot is paused, or will be when the operator releases the device;
-        None if it is not.
+        """The reason why the robot is paused, or will be paused when the operator releases the
+        device; None if there is no pause.
         """
         return self._pause
 
@@ -118,25 +122,26 @@ class RobotControl:
             return sorted(self._silent)
 
     def pause(self, reason: str = PAUSED) -> None:
-        """Hold the robot still until `resume` or a takeover; a takeover in progress is not
-        interrupted.
+        """Hold the robot still until `resume` or a takeover.
+
+        A takeover in progress is not interrupted.
         """
         with self._lock:
             self._pause = reason
             self._pauses += 1
 
     def resume(self) -> None:
-        """Continue with the policy from the next tick on, with a new answer."""
+        """Continue with the policy at the next tick, with a new answer."""
         with self._lock:
             self._pause = None
 
     def stop(self, reason: str, *, silent: str | None = None) -> None:
-        """Stop the robot until `restart`: the control loop begins no further command, and calls the
+        """Stop the robot until `restart`: the control loop sends no further command, and calls the
         robot's `stop`.
 
         Args:
             reason: The reason, for `stops`.
-            silent: The source whose silence is the reason; `heard` ends the silence.
+            silent: The source whose silence is the reason. A call of `heard` ends the silence.
         """
         with self._lock:
             self._unseen = True
@@ -149,11 +154,12 @@ class RobotControl:
 
     @contextlib.contextmanager
     def stopping(self) -> Iterator[None]:
-        """Call the robot's `stop` within this context, on any thread, after `stop` of this object.
+        """The context in which any thread calls the robot's `stop`, after it has called `stop` of
+        this object.
 
-        It begins when a command in progress has ended, or after `COMMAND_S` if that hangs. The loop
-        begins no command within the context, also not after `restart`, and afterwards holds the
-        robot for at least one tick.
+        The context begins when a command in progress has ended, or after `COMMAND_S` if the command
+        hangs. The loop sends no command within the context, even after `restart`. After the
+        context, the loop holds the robot still for at least one tick.
         """
         with self._lock:
             self._stopping += 1
@@ -180,11 +186,12 @@ class RobotControl:
             self._silent.discard(source)
 
     def restart(self) -> bool:
-        """Allow motion again after a stop, unless a source is `silent`; may also be called from a
-        signal handler.
+        """Allow motion again after a stop, unless a source is `silent`.
+
+        A signal handler may call this method.
 
         Returns:
-            Whether motion is allowed; if it is not, call this again after the silence.
+            Whether motion is allowed. If it is not, call the method again after the silence.
         """
         with self._lock:
             if not self._silent:
@@ -199,7 +206,7 @@ class RobotControl:
             self._outcome = "success" if label == "success" else "failure"
 
     def adopt(self, other: RobotControl) -> None:
-        """Copy the stop and the pause of another control, which is no longer used."""
+        """Copy the stop and the pause of another `RobotControl`, which is no longer used."""
         with other._lock, self._lock:
             self._stop, self._barked = self._stop or other._stop, self._barked or other._barked
             self._silent |= other._silent
@@ -208,14 +215,15 @@ class RobotControl:
             self._pause = self._pause or other._pause
 
     def begin(self, *, auto: bool) -> None:
-        """Begin a run of the loop; with `auto`, the end of a silence ends the stop that it
-        caused.
+        """Begin a run of the loop.
+
+        With `auto`, the end of a silence also ends the stop that the silence caused.
         """
         with self._lock:
             self._auto, self._outcome, self.running = auto, None, True
 
     def end(self) -> str:
-        """End a run; return its outcome, "" if there is none."""
+        """End a run of the loop, and return its outcome, or "" if there is none."""
         with self._lock:
             self.running = False
             return self._outcome or ""
@@ -250,8 +258,8 @@ class RobotControl:
 
     @property
     def held(self) -> Held | None:
-        """The reason why the robot must not move, from the last `update` and later events; None
-        if it may move.
+        """The reason why the robot must not move, according to the last `update` and later events;
+        None if it may move.
         """
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen or self._stopping:
@@ -266,9 +274,10 @@ class RobotControl:
             return None
 
     def hold(self) -> Held | None:
-        """Return `held`, once per tick of a control loop that commands nothing while held.
+        """Return `held`, the reason why the robot must not move.
 
-        After any stop the loop holds the robot for at least one tick, and so drops the earlier
+        A control loop calls this once per tick, and sends no command while the robot is held. After
+        any stop, the loop holds the robot for at least one tick, and therefore drops the earlier
         plan.
         """
         with self._lock:

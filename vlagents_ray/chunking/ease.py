@@ -1,5 +1,5 @@
-"""The ease-in of a motion: a slow way from rest to the first action, then the plan's path with
-rising speed.
+"""The ease-in of a motion: a slow approach from rest to the first action, then the plan's path with
+increasing speed.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ _ROUNDING = 1e-9
 
 
 class EaseIn:
-    """Commands from a pose at rest onto the path of a plan, whose rows are executed later instead
-    of faster.
+    """Computes commands that lead from a pose at rest onto the path of a plan.
 
-    For `approach` ticks the command goes straight to the first row, by the quintic of least jerk
-    (Flash & Hogan 1985), at rest at both ends. Then the speed along the rows rises from zero to
-    theirs within `ramp` ticks, in which half as many rows are executed; so the ramp ends exactly at
-    a row. The motion begins at rest, at the first row: if the ramp began before it, a robot that is
-    already there would meet the second row at an arbitrary speed.
-
-    If fewer rows are known, such as those of a short chunk, the ramp has a section for each chunk,
-    which ends exactly at its last row. The next section begins with the speed of the last one. If
-    the full speed is out of reach, a section ends with a speed at which the next one, for as many
-    rows, need not brake.
+    The rows are executed later, never faster. For `approach` ticks, the command moves straight to
+    the first row along the minimum-jerk quintic polynomial (Flash & Hogan 1985), at rest at both
+    ends. Then the speed along the rows increases from zero to full speed within `ramp` ticks. Half
+    as many rows are executed in these ticks, so the ramp ends exactly at a row. The ramp begins at
+    rest, at the first row. If it began earlier, a robot that is already at the first row would
+    reach the second row at an arbitrary speed. If too few rows are known, for example with short
+    chunks, the ramp has a section for each chunk, which ends exactly at the chunk's last row. Each
+    section begins with the final speed of the previous section. If a section cannot reach full
+    speed, it ends with a speed at which the next section, with the same number of rows, need not
+    brake.
 
     Args:
-        start: The pose at rest, (D,), in the action's units; its deltas are not used.
-        approach: The number of ticks to the first row; at least 1 if it is a pose, 0 if it has only
-            deltas.
-        ramp: The number of ticks until the full speed; an even number.
+        start: The pose at rest, (D,), in the action's units. Its values in delta columns are not
+            used.
+        approach: The number of ticks until the first row: at least 1 if the row is a pose, 0 if the
+            row has only deltas.
+        ramp: The number of ticks until full speed, an even number.
         deltas: The columns that are deltas, which are scaled instead of approached.
-        at_once: The columns of grippers without limits, which take the values of the rows
-            unchanged.
+        at_once: The columns of grippers without limits. Their commands are the unchanged values of
+            the rows.
     """
 
     def __init__(
@@ -49,29 +49,30 @@ class EaseIn:
         self._from = start
         self._approach, self._ramp = approach, ramp
         self._deltas, self._at_once = list(deltas), list(at_once)
-        # A row of deltas is a motion, so that the ramp begins before it.
+        # A row of deltas is a motion, so the ramp begins before the row.
         self._is_motion = bool(self._deltas)
-        self._tick = -approach  # the tick of the ramp; negative during the approach
-        self._speed = 0.0 if ramp else 1.0  # rows a tick
-        self._rise = 0.0  # the increase of the speed a tick
+        self._tick = -approach  # tick of the ramp, negative during the approach
+        self._speed = 0.0 if ramp else 1.0  # rows per tick
+        self._rise = 0.0  # increase of the speed per tick
         self._position = 0.0  # the position on the plan, in rows since the beginning of the section
         self._rows = 0  # the number of rows of the section
-        self._ticks = 0  # the number of ticks that are left of the section
+        self._ticks = 0  # number of ticks that are left in the section
 
     @property
     def arrived(self) -> bool:
-        """Whether the way to the first row is done."""
+        """Whether the approach to the first row is complete."""
         return self._tick >= 0
 
     @property
     def over(self) -> bool:
-        """Whether the full speed is reached."""
+        """Whether full speed is reached."""
         return self.arrived and self._ticks == 0 and self._is_full(self._speed)
 
     @property
     def may_end(self) -> bool:
-        """Whether the next row may be tried at full speed: between two sections, after the time
-        of a whole ramp.
+        """Whether the next row may be tried at full speed.
+
+        This is true between two sections, once the time of a whole ramp has passed.
         """
         return self._ticks == 0 and self._tick >= self._ramp
 
@@ -82,7 +83,7 @@ class EaseIn:
 
         Args:
             action: The next row of the plan, (D,).
-            after: The row behind it, (D,); None if there is none.
+            after: The row after `action`, (D,); None if there is none.
             known: The number of rows from `action` to the end of the plan.
 
         Returns:
@@ -111,7 +112,8 @@ class EaseIn:
 
         self._from = action
         if after is None or share == 0.0:
-            self._ticks = self._ticks if after is not None else 0  # a shorter plan ends the section
+            # A shorter plan ends the section.
+            self._ticks = self._ticks if after is not None else 0
             command = action.copy()
             command[self._deltas] = (row - before) * action[self._deltas]
             return command, 1
@@ -121,7 +123,7 @@ class EaseIn:
         return command, 1
 
     def _begin_section(self, known: int) -> None:
-        """Begin the section of the ramp that ends at full speed, or at the last known row."""
+        """Begin a section of the ramp, which ends at full speed or at the last known row."""
         self._position = 0.0
         first = math.ceil((1.0 - self._speed**2) * self._ramp / 2)
         for rows in range(max(1, first), known + 1):
@@ -137,15 +139,16 @@ class EaseIn:
         self._rise = self._rise_of(self._rows, self._ticks)
 
     def _next_position(self) -> float:
-        """Return the position after this tick, during which the speed rises evenly."""
+        """Return the position after this tick, during which the speed increases evenly."""
         self._ticks -= 1
         position = self._position + self._speed + self._rise / 2
         self._speed += self._rise
         return float(self._rows) if self._ticks == 0 else position
 
     def _ticks_until_end(self, rows: int) -> int:
-        """Return the ticks until the last known row, with the largest speed that the next
-        section can keep.
+        """Return the number of ticks until the last known row.
+
+        The final speed is the largest one that the next section can keep.
         """
         ticks = 1
         while ticks * self._speed + ticks**2 / (2 * self._ramp) < rows - _ROUNDING:
@@ -159,15 +162,17 @@ class EaseIn:
         return ticks
 
     def _rise_of(self, rows: int, ticks: int) -> float:
-        """Return the rise of the speed a tick, with which these ticks execute the rows."""
+        """Return the increase of the speed per tick with which the rows are executed in this
+        number of ticks.
+        """
         return 2 * (rows - ticks * self._speed) / ticks**2
 
     def _is_full(self, speed: float) -> bool:
-        """Return whether a speed is within one rise of that of the rows."""
+        """Return whether a speed is at most one tick's increase below full speed."""
         return speed * self._ramp >= self._ramp - 1 - _ROUNDING
 
     def _between(self, action: np.ndarray, share: float) -> np.ndarray:
-        """Return the pose at a share of the way to an action, (D,) float32."""
+        """Return the pose at a fraction of the path to an action, (D,) float32."""
         if share == 1.0:
             return action.copy()
         command = np.asarray(self._from + share * (action - self._from), np.float32)

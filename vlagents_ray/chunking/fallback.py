@@ -1,4 +1,6 @@
-"""The safe action of a robot, used if the policy's is late, and the checks of each command."""
+"""The safe action of a robot, which replaces late actions of the policy, and the checks of each
+command.
+"""
 
 from __future__ import annotations
 
@@ -25,21 +27,22 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    # The last answer has no rows left, and the next one is pending; not counted as `safe`.
+    # The last answer has no rows left, and the next answer is pending. This is not counted as
+    # `safe`.
     "waiting",
-    "late",  # the answer arrived too late for all its rows, or for those that it was given
+    "late",  # the answer arrived after all its rows, or the leftover rows in its request, were due
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
     "lost",  # the server did not answer: no connection, or not in time
     "failed",  # the policy raised an error
     "limits",  # the guard rejected the action: beyond a limit
-    "max_step",  # the guard rejected the action: too far from the last one, or too fast
+    "max_step",  # the guard rejected the action: too far from the last action, or too fast
     "dynamics",  # the guard rejected the action: too much acceleration or jerk
     "invalid",  # the action is NaN, has a wrong shape, or was rejected by another check
     "leader",  # the operator's device returned no action
     "robot",  # the robot must not move (`holds`), for instance because a camera hangs
     "stopped",  # the robot was stopped and not restarted yet
-    "paused",  # counted separately
+    "paused",  # the robot is paused; counted separately
     "other",  # an agent other than the chunk player gave a safe action
 ]
 
@@ -48,7 +51,7 @@ class Held(NamedTuple):
     """The reason why a robot holds still at a tick."""
 
     cause: Cause
-    reason: str  # in words, with numbers
+    reason: str  # text with the numbers that matter
 
 
 WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
@@ -72,7 +75,7 @@ _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
 def refused(error: InvalidAction) -> Held:
-    """Return why the robot holds still in place of a rejected action."""
+    """Return why the robot holds still instead of executing a rejected action."""
     return Held(error.cause, str(error))
 
 
@@ -88,22 +91,22 @@ class SafeAction:
     """Computes the action that holds a robot still, which depends on the meaning of its actions.
 
     "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion,
-    which is right for deltas and velocities; the columns in `grippers` keep the last action's
-    value, since 0 would half open a gripper whose command is a position; before the first action, a
-    single gripper has the measured opening. "auto" chooses by the contract's `ActionSpec`. An array
-    (D,), or a function of the observation that returns one (for instance of the measured joints),
-    is used unchanged.
+    which is right for deltas and velocities. The columns in `grippers` keep the value of the last
+    action, since 0 would half open a gripper whose command is a position. Before the first action,
+    a single gripper keeps its measured opening. "auto" chooses according to the contract's
+    `ActionSpec`. An array (D,), or a function of the observation that returns one (for instance of
+    the measured joints), is used unchanged.
 
     Args:
         safe: The name, array or function of the safe action.
         spec: The actions of the contract.
-        grippers: The columns of the grippers; default: `ActionSpec.gripper_columns`.
+        grippers: The columns of the grippers, by default `ActionSpec.gripper_columns`.
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues
             the motion, and zeros as joint targets move the arm to its zero position. Only "hold" is
-            allowed if the contract does not describe the actions. Or the arms of the contract do
-            not share its numbers equally.
+            allowed if the contract does not describe the actions. The error is also raised if the
+            numbers of an action cannot be divided equally among the contract's arms.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
@@ -142,8 +145,9 @@ class SafeAction:
         """Whether repeating the last action keeps the robot in place."""
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
-        """Return the safe action, (D,) float32, given any last command; raises `InvalidAction`
-        if it needs one.
+        """Return the safe action, (D,) float32.
+
+        It may depend on the last command; raises `InvalidAction` if there is none.
         """
         if callable(self._make):
             return np.asarray(self._make(obs), np.float32)
@@ -181,7 +185,8 @@ class SafeAction:
         grippers = self._gripper_columns(spec.dim)
         if grippers:
             closed, opened = spec.gripper_closed, spec.gripper_open
-            # An observation has a single opening, which is not enough for several grippers.
+            # An observation contains the opening of a single gripper, which is not sufficient for
+            # several grippers.
             if len(grippers) > 1 or obs.gripper is None or closed is None or opened is None:
                 return None
             action[grippers] = closed + obs.gripper * (opened - closed)
@@ -196,8 +201,9 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return an action without motion for relative actions, (D,) float32, with open grippers if
-    `spec` states how.
+    """Return an action without motion for relative actions, (D,) float32.
+
+    The grippers are open if `spec` defines the value for it.
     """
     dim = spec.dim if dim is None else dim
     if dim is None:
@@ -211,13 +217,13 @@ def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
 
 
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
-"""Returns the action to execute, given the action and the one before it, (D,) each, or raises
-`InvalidAction`.
+"""Receives an action and the previous action, (D,) each, and returns the action to execute, or
+raises `InvalidAction`.
 """
 
 
 class Motion:
-    """The motion of a robot in an episode: every action passes the check against the one before it.
+    """The motion of a robot in an episode: every action is checked against the previous action.
 
     Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a
     `safe` action, an error is raised instead.
@@ -227,10 +233,10 @@ class Motion:
         self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None
     ) -> None:
         self._check, self._contract, self._safe = check, contract, safe
-        self.can_hold = safe is not None  # whether an action is known that keeps the robot still
-        self._ease: EaseIn | None = None  # while a motion begins from rest
+        self.can_hold = safe is not None  # whether the action that keeps the robot still is known
+        self._ease: EaseIn | None = None  # the ease-in, while a motion begins from rest
         self._last: np.ndarray | None = None  # the last commanded action
-        self._before: np.ndarray | None = None  # the last one of earlier ticks
+        self._before: np.ndarray | None = None  # last commanded action of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
     @property
@@ -239,10 +245,10 @@ class Motion:
         return self._last is not None
 
     def keeps(self, plan: ChunkBuffer) -> bool:
-        """Return whether the plan must stay: a robot that comes from rest is on its way to the next
-        row.
+        """Return whether the plan must not be replaced, since a robot that began at rest is
+        approaching the next row.
 
-        Another answer would begin elsewhere, which the command would jump to.
+        Another answer would begin at another pose, to which the command would jump.
         """
         if self._ease is None or self._ease.over:
             return False
@@ -253,18 +259,18 @@ class Motion:
         self._before = self._last
 
     def stop(self) -> None:
-        """Record that the robot was stopped, and did not execute a command of this tick."""
+        """Record that the robot was stopped, and did not execute this tick's command."""
         self._last, self._ease = self._before, None
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return an action of policy or operator, (D,) float32; raises `InvalidAction` if it
-        must not be sent.
+        """Return the checked action of the policy or the operator, (D,) float32; raises
+        `InvalidAction` if it must not be sent.
         """
         self._ease = None
 
-        # Try to continue from the last target; but the robot may have been moved since, or never
-        # have arrived there.
+        # First try to continue from the last target. The check may fail, since the robot may have
+        # been moved, or may never have reached that target.
         if self._state == "held":
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"
@@ -275,10 +281,11 @@ class Motion:
         return self._last
 
     def follow(self, plan: ChunkBuffer, obs: Obs) -> tuple[np.ndarray, int]:
-        """Return the command on the way of a plan, (D,) float32, and the number of rows that it
+        """Return the next command of a plan, (D,) float32, and the number of rows that it
         completes.
 
-        From rest, the check's `ease_in` leads the robot onto the plan; its rows wait meanwhile.
+        If the robot is at rest, the check's `ease_in` first leads it onto the plan, whose rows wait
+        meanwhile.
 
         Args:
             plan: The plan, which has a next row.
@@ -303,8 +310,8 @@ class Motion:
         if ease is None or ease.over:
             return self.move(action, obs), 1
         if ease.may_end:
-            # The chunks are too short to reach the full speed: use it as soon as the check accepts
-            # it.
+            # The chunks are too short to reach full speed, so full speed is used as soon as the
+            # check accepts it.
             with contextlib.suppress(InvalidAction):
                 self._last, self._ease = self._checked(action, self._last), None
                 return self._last, 1
@@ -314,13 +321,13 @@ class Motion:
         return self._last, rows
 
     def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
-        """Return the action that keeps the robot still, (D,) float32, and why; raises
-        `InvalidAction` without one.
+        """Return the action that keeps the robot still, (D,) float32, and the reason; raises
+        `InvalidAction` if there is no such action.
         """
         if self._safe is None:
             raise InvalidAction(f"no action for this tick: {why.reason}")
         self._ease = None
-        if self._last is None:  # the first command was rejected
+        if self._last is None:  # The first command was rejected.
             self._state = "stopped"
 
         last = self._standing(obs) if self._state == "stopped" else self._last

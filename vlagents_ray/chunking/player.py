@@ -69,19 +69,19 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 _CLOSE_S = 2.0
-# The largest number of actions between two requests that are recorded as executed in place of the
-# policy's.
+# The largest number of actions between two requests that are recorded as replacements of the
+# policy's actions.
 _MAX_REPLACEMENTS = 256
-_TIMED_TICKS = 10  # the number of ticks from whose intervals the rate of the loop is measured
-_KEPT_WIRE = 0.9  # the part of the longest time on the way that is left after another answer
-_LONGEST_REPLAN_MS = 1e9  # the longest delay of a request that a server may ask for
+_TIMED_TICKS = 10  # number of recent ticks from which the period of the loop is computed
+_KEPT_WIRE = 0.9  # factor by which the longest transfer time decreases with each answer
+_LONGEST_REPLAN_MS = 1e9  # longest delay of a request that a server may require, ms
 
 
 class AsyncCaller:
     """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
 
-    Only one thread may use it, and nothing else may use the agent during a request; `settle` waits
-    for its end.
+    Only one thread may use the caller, and nothing else may use the agent during a request.
+    `settle` waits for the end of the request.
     """
 
     def __init__(self, agent: Agent) -> None:
@@ -91,7 +91,9 @@ class AsyncCaller:
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
         self._thread.start()
         self.idle = True
-        """Whether there is no request in progress and no answer to take."""
+        """Whether there is neither a request in progress nor an answer that `take` has not
+        returned yet.
+        """
 
     @property
     def busy(self) -> bool:
@@ -99,12 +101,15 @@ class AsyncCaller:
         return not self.idle and self._answers.empty()
 
     def ask(self, obs: Obs) -> None:
-        """Begin a request, only while `idle`. The caller must not change `obs` afterwards."""
+        """Begin a request, which is allowed only while `idle`.
+
+        `obs` must not be changed afterwards.
+        """
         self.idle = False
         self._jobs.put(obs)
 
     def take(self, wait_s: float = 0.0) -> Act | Exception | None:
-        """Return the policy's answer or its error within `wait_s` seconds, or None."""
+        """Return the policy's answer or error; None if there is none within `wait_s` seconds."""
         try:
             answer = self._answers.get(timeout=wait_s) if wait_s else self._answers.get_nowait()
         except queue.Empty:
@@ -121,7 +126,7 @@ class AsyncCaller:
             self.idle = True
 
     def close(self) -> None:
-        """Close the agent as soon as its request is over; wait at most two seconds for that."""
+        """Close the agent as soon as its request is over, and wait at most two seconds for this."""
         self._jobs.put(None)
         self._thread.join(_CLOSE_S)
 
@@ -137,50 +142,59 @@ class AsyncCaller:
 class _Request(NamedTuple):
     """The last request to the policy."""
 
-    tick: int = -1  # the tick of its observation
-    # `ChunkBuffer.executed` at its observation: the position of the answer's first row.
+    tick: int = -1  # tick of the request's observation
+    # `ChunkBuffer.executed` at the request's observation: the position of the answer's first row.
     step: int = 0
-    seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
+    seen_at: float = 0.0  # capture time of the observation, s of `time.monotonic`
 
 
 @dataclass(frozen=True)
 class PlayerSettings:
-    """The settings of a `ChunkPlayer`: its requests to the policy, and its use of the answers.
+    """The settings of a `ChunkPlayer`: when it sends requests to the policy, and how it uses the
+    answers.
 
     Raises:
         ConfigError: A setting is out of range, or settings contradict each other.
     """
 
     mode: Mode = "open_loop"
-    """With "open_loop", execute `execute` rows, then send a request and wait for the answer. With
-    "ensemble", send one at each tick, and average the actions of all chunks with the weights exp(-m
-    * i), oldest first (ACT's temporal ensembling). With "async", send requests in the background,
-    one at a time, with the newest observation.
+    """With "open_loop", the player executes `execute` rows, then sends a request and waits for the
+    answer.
+
+    With "ensemble", it sends a request at each tick, and averages the actions of all chunks with
+    the weights exp(-m * i), oldest first (ACT's temporal ensembling). With "async", it sends
+    requests in the background, one at a time, with the newest observation.
     """
-    # The number of rows of a chunk between two requests (default: all), or in "async" the number of
-    # ticks (default: 1).
+    # The number of rows of a chunk between two requests (default: all); in "async", the number of
+    # ticks between two requests (default: 1).
     execute: int | None = None
     merge: str | Merge = "newest"
-    """The combination of several chunks' rows for one tick, in "async": "newest", "average",
-    "weighted_average", "conservative", "ensemble", or a function (see
+    """The method that combines the rows of several chunks for one tick in "async".
+
+    It is "newest", "average", "weighted_average", "conservative", "ensemble", or a function (see
     `vlagents_ray.chunking.buffer`).
     """
-    ensemble_m: float = ENSEMBLE_M  # the m of the weights
+    ensemble_m: float = ENSEMBLE_M  # m of the weights of "ensemble"
     real_time_chunking: bool = False
-    """Whether each request contains the rest of the plan and the measured delay (`LEFTOVER`,
-    `DELAY` in `vlagents_ray.interface`), for policies that use them; in "async" only.
+    """Whether each request contains the remaining plan and the measured delay (`LEFTOVER`, `DELAY`
+    in `vlagents_ray.interface`), for policies that use them.
+
+    It requires "async".
     """
-    deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
-    timeout_s: float | None = None  # time limit of a request; by default the agent's
-    # The largest number of rows of a chunk to execute; a chunk with `done` is executed whole.
+    # Time limit of `act`; default: 0 in "async", otherwise no limit.
+    deadline_s: float | None = None
+    timeout_s: float | None = None  # time limit of a request; default: the limit of the agent
+    # The largest number of rows of a chunk that are executed. A chunk with `done` is executed
+    # completely.
     horizon: int | None = None
     max_age_s: float | None = None
-    """The largest age of the observation of an executed action. The age counts from
-    `info["captured_at"]`, that of the sensor read first, or from the call of `act` (see
-    `CaptureClock`).
+    """The largest age of the observation of an executed action.
+
+    The age is the time since `info["captured_at"]`, which is the time of the sensor that was read
+    first, or since the call of `act` (see `CaptureClock`).
     """
-    safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
-    # The columns of the action that are grippers (see `SafeAction`).
+    safe: Safe = "auto"  # action that replaces a missing one (see `SafeAction`)
+    # The columns of grippers in an action (see `SafeAction`).
     grippers: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
@@ -203,26 +217,28 @@ class PlayerSettings:
 
 
 class ChunkPlayer(Agent):
-    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one per
-    control tick.
+    """An `Agent` around another agent, local or remote, whose `act` returns single actions, (D,),
+    one per control tick.
 
-    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the
-    chunk's observation, whenever the chunk arrives: rows for ticks at which others were executed
-    are skipped, except while the robot holds still (see
+    Each call of `act` is a tick. Row r of a chunk is to be executed after r further actions since
+    the chunk's observation, whenever the chunk arrives. Rows whose step was already executed are
+    skipped. While the robot holds still, no row is skipped (see
     `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode and, with
     a deadline, waits for the first chunk.
 
-    In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the
-    policy's action, or the `safe` one if that is missing, with the reason in `act.info["safe"]` and
-    its kind in `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and
-    `silent_s`, the time since the oldest unanswered request. Errors that another request cannot
-    cure (`InvalidInput`, and any that is not this package's) are raised by the next `act`; the
-    others are the reason of safe actions until the policy answers. Without a deadline, errors are
-    raised.
+    In mode "async", and in the other modes with `deadline_s`, `act` returns within `deadline_s`. It
+    returns the policy's action, or the `safe` action if the policy's action is missing. The reason
+    is then in `act.info["safe"]`, and its kind in `act.info["safe_cause"]`. `info` also has
+    `age_ticks`, `chunk`, `row`, and `silent_s`, the time since the oldest unanswered request. The
+    next `act` raises errors that another request cannot cure: `InvalidInput`, and errors of other
+    packages. After other errors, safe actions are returned until the policy answers. Without a
+    deadline, all errors are raised.
     """
 
     statistics: dict[str, Any] | None = None
-    """The ranges of the policy's training, once it is initialized; see `HasStatistics`."""
+    """The ranges of values in the policy's training, once the policy is initialized; see
+    `HasStatistics`.
+    """
 
     control: RobotControl
     """The state of the robot, which selects the source of motion at each `act`."""
@@ -242,14 +258,13 @@ class ChunkPlayer(Agent):
 
         Args:
             agent: The policy, in this process or a `RemoteAgent`.
-            settings: The requests to the policy, and the use of its answers; default:
-                `PlayerSettings()`.
+            settings: When requests are sent, and how answers are used; default: `PlayerSettings()`.
             check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`.
-                If it rejects an action of the policy, the safe one replaces it, and the plan is
-                dropped. If it rejects a safe action, the last action replaces it if that holds the
-                robot still; otherwise `act` raises `InvalidAction`. The check also receives the
-                last action. A `Guard` with `measure` uses the measured pose if there is none, and
-                after safe actions.
+                If the check rejects an action of the policy, the safe action is returned instead,
+                and the plan is dropped. If it rejects a safe action, the last action is returned if
+                repeating it holds the robot still; otherwise `act` raises `InvalidAction`. The
+                check also receives the last action. If there is no last action, and after safe
+                actions, a `Guard` with `measure` uses the measured pose.
             override: The operator's device. While it is engaged, `act` returns its actions with
                 `info["intervention"]` and, if known, `info["policy_action"]`. `check` also applies
                 to them.
@@ -267,26 +282,28 @@ class ChunkPlayer(Agent):
 
     def _begin(self) -> None:
         self._plan.drop()
-        self._tick: int | None = None  # the tick of the next `act`; None outside an episode
+        self._tick: int | None = None  # tick of the next `act`; None outside of an episode
         self._request = _Request()  # the last request
-        self._drops_answer = False  # whether the answer to it must not be executed
-        # The actions, (D,), that were executed in place of the policy's since the last request.
+        self._drops_answer = False  # whether the answer to the last request must not be executed
+        # The actions, (D,), that replaced the policy's actions since the last request.
         self._replacements = deque[np.ndarray](maxlen=_MAX_REPLACEMENTS)
-        self._is_replaced = False  # whether this tick has such an action
+        self._is_replaced = False  # whether the policy's action of this tick was replaced
         self._chunks = 0  # the number of answers
-        # When the oldest unanswered request was sent, s of `time.monotonic`; None if there is none.
+        # The time at which the oldest unanswered request was sent, s of `time.monotonic`; None if
+        # there is none.
         self._waiting_since: float | None = None
-        self._reason = WAITING  # why the plan has no row, if it has none
-        # Whether the policy has yet to answer after the plan was dropped, as the robot was stopped
-        # or moved, or the guard rejected a row.
+        self._reason = WAITING  # reason why the plan has no row, if it has none
+        # Whether the policy has not yet answered since the plan was dropped. The plan is dropped if
+        # the robot is stopped or moved, or if the guard rejects a row.
         self._begins_again = False
         self.timeliness = Timeliness()
-        self._executed_age_ms: float | None = None  # of the last row since the last request
-        # When the last ticks began, s of `time.monotonic`.
+        # Age of the last row that was executed since the last request.
+        self._executed_age_ms: float | None = None
+        # The begin times of the last ticks, s of `time.monotonic`.
         self._tick_begins: deque[float] = deque(maxlen=_TIMED_TICKS)
-        self._wire_ms = 0.0  # the longest time that a request and its answer were on the way, ms
-        self._inference_ms = 0.0  # the time of the last batch, ms
-        # Time before which the server needs no further request, s of `time.monotonic`.
+        self._wire_ms = 0.0  # longest recent transfer time of a request and its answer, ms
+        self._inference_ms = 0.0  # duration of the last batch, ms
+        # The time before which the server needs no further request, s of `time.monotonic`.
         self._replan_at = 0.0
         self._captured = CaptureClock()
         self._motion = Motion(self.check)
@@ -294,13 +311,16 @@ class ChunkPlayer(Agent):
     @property
     def contract(self) -> Contract | None:
         """The policy's contract, with single actions."""
-        # During an episode the policy is busy, and a call to a remote one might block.
+        # During an episode the policy is busy, and a call of a remote policy might block.
         if self._tick is None:
             self._contract = self._agent.contract
         return None if self._contract is None else replace(self._contract, chunk=1)
 
     def initialize(self) -> None:
-        """Initialize the policy; wait for a request in progress, if the policy was used before."""
+        """Initialize the policy.
+
+        A request in progress is awaited first, if the policy was used before.
+        """
         if self._caller is not None:
             self._caller.settle()
         self._agent.initialize()
@@ -309,12 +329,12 @@ class ChunkPlayer(Agent):
         self._choose_safe()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, without a time limit; the plan and pending requests are dropped."""
+        """Begin an episode, without a time limit. The plan and pending requests are dropped."""
         if self._caller is not None:
             self._caller.settle()
         self._begin()
         obs = stamped(obs, {})
-        self._captured(obs)  # before the reset of the policy, which may take long
+        self._captured(obs)  # called before the reset of the policy, which may take long
         slo = kwargs.get(SLO)
         if slo is not None and self.settings.horizon is not None:
             kwargs[SLO] = {"rows": self.settings.horizon, **slo}
@@ -338,15 +358,15 @@ class ChunkPlayer(Agent):
         return reads is not None and reads.reads_slo
 
     def interrupt(self) -> None:
-        """Drop the plan: the robot was stopped or moved, and did not execute the last action of
-        `act`.
+        """Drop the plan after the robot was stopped or moved, and did not execute the last action
+        of `act`.
 
-        Answers to earlier observations are discarded, and the policy is queried again. `run_loop`
-        calls this at each tick at which it holds the robot; call it in your own loop when you stop
-        or take over the robot.
+        Answers to earlier observations are discarded, and a new request is sent to the policy.
+        `run_loop` calls this method at each tick at which it holds the robot. Call it in your own
+        loop when you stop the robot or take it over.
         """
         self._begin_again(STOPPED)
-        if self._is_replaced:  # its action was not executed
+        if self._is_replaced:  # The replacing action was not executed.
             self._replacements.pop()
             self._is_replaced = False
         self._motion.stop()
@@ -357,9 +377,9 @@ class ChunkPlayer(Agent):
 
         Args:
             obs: The observation.
-            action: The action that the robot executed in place of the policy's, (D,), if your own
-                loop chose it. It counts as a tick, and the next request contains it (`EXECUTED` in
-                `vlagents_ray.interface`).
+            action: The action that the robot executed instead of the policy's action, (D,), if your
+                own loop chose it. It counts as a tick, and the next request contains it (`EXECUTED`
+                in `vlagents_ray.interface`).
 
         Raises:
             InvalidAction: The check rejects the action.
@@ -402,13 +422,13 @@ class ChunkPlayer(Agent):
             self._executed_age_ms = act.info.get(AGE_MS, self._executed_age_ms)
             return act
         act = self._operator_act(obs)
-        if SAFE not in act.info:  # the operator's action is executed in place of a row
+        if SAFE not in act.info:  # The operator's action replaces a row.
             self._record_replacement(act.action)
             self._plan.advance()
         return act
 
     def close(self) -> None:
-        """Close the policy, at once or as soon as the request in progress is over."""
+        """Close the policy, immediately or as soon as the request in progress is over."""
         if self._caller is not None:
             self._caller.close()
             self._caller = None
@@ -417,8 +437,8 @@ class ChunkPlayer(Agent):
         self._begin()
 
     def _update_plan(self, obs: Obs, tick: int, begun: float) -> None:
-        """Take the policy's answer, send the next request if it is due, and wait as long as
-        allowed and needed.
+        """Receive the policy's answer, send the next request if it is due, and wait for an answer
+        if necessary, within the deadline.
         """
         caller = self._caller
         if caller is None or self.settings.deadline_s is None:
@@ -456,7 +476,7 @@ class ChunkPlayer(Agent):
         self._motion = Motion(self.check, self._contract, safe)
 
     def _record_replacement(self, action: np.ndarray) -> None:
-        """Record an action that is executed in place of the policy's."""
+        """Record an action that replaces the policy's action."""
         self._replacements.append(action)
         self._is_replaced = True
 
@@ -470,7 +490,7 @@ class ChunkPlayer(Agent):
         return max_age_s is not None and seen_at < time.monotonic() - max_age_s
 
     def _next(self) -> Step | None:
-        """Return the current action from chunks whose observations are recent enough."""
+        """Return the current step of the plan, from chunks whose observations are recent enough."""
         max_age_s = self.settings.max_age_s
         if max_age_s is not None and self._plan.drop(time.monotonic() - max_age_s):
             self._reason = OLD
@@ -486,7 +506,7 @@ class ChunkPlayer(Agent):
         if self.settings.mode == "open_loop":
             return self.settings.execute is not None and step.row >= self.settings.execute
 
-        # This also holds for every answer with a single action.
+        # An answer with a single action has only a last row.
         is_last_row = step.chunk.end == self._plan.executed + 1
         if is_last_row:
             return True
@@ -494,13 +514,15 @@ class ChunkPlayer(Agent):
             return False
         if time.monotonic() >= self._replan_at:
             return True
-        # It waits no longer than an urgent request can be answered in time. The wait in the queue
-        # does not count: otherwise robots would ask the more often the longer the queue is.
+        # The request is sent while an urgent request can still be answered in time. The waiting
+        # time in the server's queue is not considered: otherwise, robots would send more requests
+        # when the queue is longer.
         return self._slack_ms() <= self._inference_ms + 2 * self._period_ms()
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
-        """Add the answer of the policy to the plan, if there is one; raise an error that another
-        request cannot cure.
+        """Add the policy's answer to the plan, if there is an answer.
+
+        Raise errors that another request cannot cure.
         """
         if answer is None:
             return
@@ -521,9 +543,11 @@ class ChunkPlayer(Agent):
         self._begins_again = False
 
     def _record_timing(self, answer: Act) -> None:
-        """Record how long an answer was on the way, and when the server needs the next request."""
+        """Record the transfer time of an answer, and the time at which the server needs the next
+        request.
+        """
         timing = answer.info.get("timing")
-        if isinstance(timing, Mapping):  # else it is not that of a `RemoteAgent`
+        if isinstance(timing, Mapping):  # otherwise the agent is not a `RemoteAgent`
             self._wire_ms = max(timing.get("wire_ms", 0.0), _KEPT_WIRE * self._wire_ms)
             self._inference_ms = timing.get("inference_ms", 0.0)
         replan_ms = answer.info.get(REPLAN)
@@ -532,13 +556,14 @@ class ChunkPlayer(Agent):
             self._replan_at = time.monotonic() + replan_ms / 1e3
 
     def _slack_ms(self) -> float:
-        """Return the time, ms, that the server has for the answer to a request of this tick: until
-        the tick after the last row that is left, without the time on the way.
+        """Return the time, ms, that the server has to answer a request of this tick.
+
+        It ends at the tick after the last remaining row, and excludes the transfer time.
         """
         return max(0.0, self._plan.known * self._period_ms() - self._wire_ms)
 
     def _period_ms(self) -> float:
-        """Return the period of the loop, ms, from its last ticks; 0 before the second one."""
+        """Return the period of the loop, ms, from its last ticks; 0 before the second tick."""
         intervals_s = sorted(end - begin for begin, end in itertools.pairwise(self._tick_begins))
         return 1e3 * intervals_s[len(intervals_s) // 2] if intervals_s else 0.0
 
@@ -546,7 +571,8 @@ class ChunkPlayer(Agent):
         """Add the chunk of an answer to the plan."""
         info = {key: value for key, value in act.info.items() if key not in OF_THE_LOOP}
         rows = Act(check_action(act.action, self._contract)).rows()
-        if not act.done:  # the task is done with the last row of this chunk, not before
+        # With `done`, the task ends with the last row of the chunk, so no row is cut off.
+        if not act.done:
             rows = rows[: self.settings.horizon]
 
         tick, step, seen_at = self._request
@@ -564,20 +590,20 @@ class ChunkPlayer(Agent):
         if self.settings.timeout_s is not None:
             info[DEADLINE] = self.settings.timeout_s * 1e3
 
-        if self._caller is not None:  # otherwise the robot waits for each answer
+        if self._caller is not None:  # without a caller, the robot waits for each answer
             info[SLACK] = self._slack_ms()
             info[TICKS] = self.timeliness.report()
             if self._executed_age_ms is not None:
                 info[EXECUTED_AGE] = self._executed_age_ms
                 self._executed_age_ms = None
 
-        # While an operator acts, their actions replace those of the plan.
+        # While an operator moves the robot, their actions replace the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
             info |= self._plan.continuation(self._delay.ticks)
         return info
 
     def _operator_act(self, obs: Obs) -> Act:
-        """Return the operator's action, or the safe one if the guard rejects it."""
+        """Return the operator's action, or the safe action if the guard rejects it."""
         # A silent policy does not stop an operator.
         info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}
         planned = self._next()
@@ -592,19 +618,23 @@ class ChunkPlayer(Agent):
             action = self._motion.move(action, obs)
         except InvalidAction as error:
             action, why = self._motion.hold(obs, refused(error))
-            del info[INTERVENTION]  # the safe action is not the operator's
+            del info[INTERVENTION]  # the safe action is not an action of the operator
             info |= {SAFE: why.reason, CAUSE: why.cause}
             self._rebase_leader(action)
         return Act(action.copy(), info=info)
 
     def _rebase_leader(self, last: np.ndarray | None) -> None:
-        """Report to the operator's device that its action was not executed (see `Leader`)."""
+        """Report to the operator's device that the device's action was not executed (see
+        `Leader`).
+        """
         rebase = getattr(self.control.leader, "rebase", None)
         if rebase is not None:
             rebase(last)
 
     def _policy_act(self, obs: Obs, tick: int) -> Act:
-        """Return the policy's action, or the safe one if that is missing or rejected."""
+        """Return the policy's action, or the safe action if the policy's action is missing or
+        rejected.
+        """
         control_held = self.control.held
         step = None if control_held is not None else self._next()
         why = control_held or (STALE if self._is_old(self._captured(obs)) else self._reason)
@@ -625,23 +655,23 @@ class ChunkPlayer(Agent):
             else:
                 act = step.played(action, tick, self._silent_s())
                 act.info.update(timing)
-                if not rows:  # on the way to the row
+                if not rows:  # the command is still approaching the row
                     return replace(act, done=False)
                 self._plan.advance()
                 return act
 
-        if control_held is not None and self.control.running:  # the loop commands nothing
+        if control_held is not None and self.control.running:  # the loop sends no command
             action = np.zeros(0, np.float32)
         else:
             try:
                 action, why = self._motion.hold(obs, why)
             except InvalidAction:
-                # The loop commands nothing to a robot that stands, such as one whose grippers'
-                # openings are unknown.
+                # The loop sends no command to a robot at rest without a safe action, for example if
+                # its grippers' openings are unknown.
                 if self._motion.begun or not self.control.running or not self._motion.can_hold:
                     raise
                 action = np.zeros(0, np.float32)
-            if control_held is not None:  # the policy's action will not be executed
+            if control_held is not None:  # The policy's action will not be executed.
                 self._record_replacement(action)
         info = {SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s(), **timing}
         return Act(action, info=info)

@@ -1,8 +1,9 @@
 """The share of a robot's ticks that had an action in time, and the ages of those actions.
 
-A tick counts if the policy was to act at it: not while the robot is paused, stopped or moved by an
-operator, nor while it waits for the first answer after one of these. It is *starved* if no answer
-had a row for it. What becomes of the row, such as a refusal by the guard, does not matter here.
+A tick counts if an action of the policy is due at it. Ticks do not count while the robot is paused,
+stopped or moved by an operator, and while it waits for the first answer after that. A tick is
+*starved* if no answer had a row for it. Later events, such as a rejection of the row by the guard,
+do not matter here.
 
 Chunk players, the control loop of a robot, evaluations in real time and replicas all count with
 `Timeliness`, or report a `TimeShare`.
@@ -35,17 +36,19 @@ def counts_ticks(error: Exception | None) -> bool:
 
 
 class TimeShare(NamedTuple):
-    """How well a robot, or several, were served in some time."""
+    """The share of ticks in time, and the ages of actions, of one or several robots over a
+    period.
+    """
 
-    ticks: int  # ticks at which the policy was to act
-    starved: int  # those of them without a row of an answer
-    age_p50_ms: float | None = None  # age of executed actions; None if none is known
+    ticks: int  # ticks at which an action of the policy was due
+    starved: int  # ticks without a row of an answer
+    age_p50_ms: float | None = None  # age of executed actions; None if no age is known
     age_p95_ms: float | None = None
     age_p99_ms: float | None = None
 
     @classmethod
     def from_ages(cls, ticks: int, starved: int, ages_ms: Iterable[float]) -> TimeShare:
-        """Return the figures of ticks with the ages of their executed actions, ms."""
+        """Return the figures for a number of ticks and the ages of their executed actions, ms."""
         ordered = sorted(ages_ms)
         p50, p95, p99 = (_quantile(ordered, share) for share in (0.5, 0.95, 0.99))
         return cls(ticks, starved, p50, p95, p99)
@@ -61,21 +64,21 @@ class TimeShare(NamedTuple):
 
 
 class Timeliness:
-    """Counts ticks; see the module for what is counted."""
+    """Counts ticks, as the docstring of the module defines them."""
 
     def __init__(self) -> None:
-        self.ticks = 0  # at which the policy was to act
-        self.starved = 0  # those of them without a row
+        self.ticks = 0  # ticks at which an action of the policy was due
+        self.starved = 0  # ticks without a row of an answer
         self._ages_ms: deque[float] = deque(maxlen=KEPT_AGES)
         # Ticks and starved ticks that requests have reported, with and without the last request.
         self._reported = self._reported_before = (0, 0)
 
     def add(self, *, in_time: bool, age_ms: float | None = None) -> None:
-        """Count a tick at which the policy was to act.
+        """Count a tick at which an action of the policy was due.
 
         Args:
             in_time: Whether an answer had a row for it.
-            age_ms: The age of its executed action, ms; None if none was executed.
+            age_ms: The age of the tick's executed action, ms; None if no action was executed.
         """
         self.ticks += 1
         if not in_time:
@@ -84,30 +87,34 @@ class Timeliness:
             self._ages_ms.append(age_ms)
 
     def count(self, info: Mapping[str, Any]) -> None:
-        """Count a tick of a chunk player, if the policy was to act at it.
+        """Count a tick of a chunk player, if an action of the policy was due at it.
 
         Args:
-            info: The info of its action.
+            info: The info of the tick's action.
         """
         in_time = info.get(IN_TIME)
         if in_time is not None:
             self.add(in_time=in_time, age_ms=info.get(AGE_MS))
 
     def count_missed(self, ticks: int) -> None:
-        """Count ticks that passed while the loop was busy, such as with waiting for an answer."""
+        """Count ticks that passed while the loop was busy, for example while it waited for an
+        answer.
+        """
         self.ticks += ticks
         self.starved += ticks
 
     def report(self) -> list[int]:
-        """Return the ticks, and the starved ones, since the last report, for the next request."""
+        """Return the number of ticks and of starved ticks since the last report, for the next
+        request.
+        """
         self._reported_before = self._reported
         self._reported = self.ticks, self.starved
         ticks, starved = self._reported_before
         return [self.ticks - ticks, self.starved - starved]
 
     def failed(self, error: Exception) -> None:
-        """Report the ticks of the last request again with the next one, if no replica has counted
-        them, as this error of the request shows.
+        """Report the ticks of a failed request again with the next request, if the error shows that
+        no replica has counted them.
         """
         if not counts_ticks(error):
             self._reported = self._reported_before
@@ -119,7 +126,7 @@ class Timeliness:
 
 
 def in_words(time_share: TimeShare) -> str:
-    """Return the figures as people read them; there must be a tick."""
+    """Return the figures as text. At least one tick must have been counted."""
     text = f"in time: {time_share.share:.2%} of {time_share.ticks} ticks of the policy"
     if time_share.age_p50_ms is not None:
         text += (

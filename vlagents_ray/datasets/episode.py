@@ -1,5 +1,5 @@
 """A running episode, with its videos on disk and its numbers in memory, and the statistics of a
-complete one.
+complete episode.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from vlagents_ray.naming import distinct
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
 SAFE_COLUMN = "safe"
-MOMENTS = {  # further columns of each recorded frame
-    "captured_at": "float64",  # s since 1970
-    "tick": "int64",  # of the control loop; gaps are missed or dropped frames
-    SAFE_COLUMN: "bool",  # whether the action is a safe one, not the policy's
+MOMENTS = {  # names of further columns of each recorded frame
+    "captured_at": "float64",  # time of the frame, s since 1970
+    "tick": "int64",  # tick of the control loop; gaps are missed or dropped frames
+    SAFE_COLUMN: "bool",  # whether the action is a safe action instead of the policy's action
 }
 WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
-# Further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32.
+# Further columns of a recording with interventions, in addition to `WANTED_ACTION`, (D,) float32.
 INTERVENTIONS = {
-    INTERVENTION_COLUMN: "bool",  # whether the action is an operator's
+    INTERVENTION_COLUMN: "bool",  # whether an operator chose the action
     # Whether the policy's action is known; if not, `WANTED_ACTION` is zeros.
     "policy_known": "bool",
 }
-# LeRobot's own names for the outcome of an action; `success` is that of the state after it.
+# LeRobot's own names for the outcome of an action. `success` belongs to the state after the action.
 OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 Stats = dict[str, np.ndarray]  # "min", "max", "mean", "std", "count", "q01", ...
 Label = Literal["success", "failure", "discard"]
-INDEX = {  # columns that the dataset adds to each frame
-    "timestamp": "float32",  # s, frame_index / fps
+INDEX = {  # names of columns that the dataset adds to each frame
+    "timestamp": "float32",  # time in the episode, s: frame_index / fps
     "frame_index": "int64",
     "episode_index": "int64",
     "index": "int64",
     "task_index": "int64",
 }
 _DTYPES = {bool: "bool", int: "int64", float: "float64", str: "string"}
-_KEY_FRAMES = 2  # frames between key frames, as LeRobot has for quick access to any frame
+_KEY_FRAMES = 2  # interval of key frames in frames, as in LeRobot, for quick access to any frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,15 +55,15 @@ class FinishedEpisode:
     """A complete episode of N frames, whose files are moved into the dataset."""
 
     instruction: str
-    features: dict[str, Any]  # as in `meta/info.json`
-    # The values of each feature: (N, D) float32, or (N,) of the feature's dtype, or of texts (N,)
-    # objects.
+    features: dict[str, Any]  # descriptions of the features, as in `meta/info.json`
+    # The values of each feature: (N, D) float32, (N,) of the feature's dtype, or (N,) objects for
+    # texts.
     rows: dict[str, np.ndarray]
     images: dict[str, Stats]  # statistics of the videos' frames
-    videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
+    videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N are used
     about: DatasetContract  # the same for each episode of a dataset
     label: Label | None = None
-    # The folder of the running episode, which is removed with all files that are left in it.
+    # The folder of the running episode. It is removed with all files that are left in it.
     folder: Path | None = None
 
 
@@ -71,10 +71,10 @@ class FinishedEpisode:
 class RunningEpisode:
     """A running episode, to which frames are added."""
 
-    folder: Path  # the folder of its videos
+    folder: Path  # folder of the episode's videos
     instruction: str
     fps: float
-    features: dict[str, Any]  # those of earlier episodes; empty in the first
+    features: dict[str, Any]  # features of earlier episodes; empty in the first episode
     interventions: bool
     lossless: bool
     meaning: ActionSpec
@@ -94,13 +94,12 @@ class RunningEpisode:
         policy_action: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the
-        frames before.
+        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from earlier
+        frames.
 
-        `policy_action` is the policy's action, (D,), if another one was executed; None if it is not
-        known.
-        `more` are further columns by name, the same in each frame: a bool, int, float, text, or
-        (D,) float32.
+        `policy_action` is the policy's action, (D,), if another action was executed; None if it is
+        unknown. `more` contains further columns by name, which must be the same in each frame. A
+        value is a bool, int, float, text, or (D,) float32.
         """
         values, names = state_vector(
             obs.state, None if obs.gripper is None else np.array(obs.gripper)
@@ -176,7 +175,7 @@ class RunningEpisode:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _first(self, obs: Obs, names: list[str], action_dim: int, more: Mapping[str, Any]) -> None:
-        """Begin the videos, and determine the features and the contract by the first frame."""
+        """Begin the videos, and determine the features and the contract from the first frame."""
         features: dict[str, Any] = {}
         keys = camera_keys(obs.cameras)
         for name, image in sorted(obs.cameras.items()):
@@ -226,8 +225,8 @@ class RunningEpisode:
 def parts_of(state: Iterable[str], gripper: bool) -> list[str]:
     """Return the parts of the proprioception in the order of `observation.state`.
 
-    If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state of that
-    name is left out.
+    If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state with
+    that name is omitted.
     """
     if not gripper:
         return sorted(state)
@@ -240,13 +239,13 @@ def camera_keys(names: Iterable[str]) -> dict[str, str]:
 
 
 def without_slash(name: str) -> str:
-    """Replace the slashes in a name, as LeRobot allows none in a feature's name."""
+    """Replace the slashes in a name, since LeRobot allows no slashes in a feature's name."""
     return name.replace("/", "_")
 
 
 def video_feature(height: int, width: int, fps: float, pixels: str = "yuv420p") -> dict[str, Any]:
-    """Describe the feature of a camera whose videos have this size, in pixels, rate, in Hz, and
-    pixel format.
+    """Describe the feature of a camera from the size of its videos, pixels, their rate, Hz, and
+    their pixel format.
     """
     size = {"video.height": height, "video.width": width, "video.fps": fps, "video.channels": 3}
     kind = {
@@ -270,7 +269,10 @@ def number_features(dtypes: Mapping[str, str]) -> dict[str, Any]:
 
 
 def outcome_rows(rewards: np.ndarray, success: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of `OUTCOMES` of an episode, (N,) each; its last frame is done."""
+    """Return the columns of `OUTCOMES` for an episode, (N,) each.
+
+    The last frame is marked as done.
+    """
     done = np.arange(len(success)) == len(success) - 1
     return dict(zip(OUTCOMES, (rewards.astype(np.float32), success, done), strict=True))
 
@@ -281,8 +283,8 @@ def state_vector(
     """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect
     them, in `order`.
 
-    `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of
-    the D.
+    `gripper`, (...,), is the opening of the gripper. Returns the numbers, (..., D) float32, and a
+    name for each of the D numbers.
     """
     if order is None:
         order = parts_of(parts, gripper is not None)
@@ -300,11 +302,11 @@ def state_vector(
     return values.astype(np.float32), names
 
 
-# The statistics of recorded features for LeRobot's normalisation (0.4.4,
+# Functions that compute the statistics of recorded features for LeRobot's normalisation (0.4.4,
 # `lerobot/datasets/compute_stats.py`).
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_PIXEL_STRIDE = 4  # in both directions; LeRobot samples pixels as well
+_PIXEL_STRIDE = 4  # step between sampled pixels in both directions; LeRobot also samples pixels
 
 
 def of_values(values: np.ndarray) -> Stats:
@@ -321,7 +323,7 @@ def of_values(values: np.ndarray) -> Stats:
 
 
 class ImageStatistics:
-    """The statistics of one camera in one episode, by channel, of pixels in [0, 1], (3, 1, 1)
+    """The statistics of one camera's pixels in one episode, for each channel, in [0, 1], (3, 1, 1)
     each.
     """
 
@@ -330,7 +332,7 @@ class ImageStatistics:
         self._images = 0
 
     def add(self, image: np.ndarray) -> None:
-        """Count a sample of the pixels of an image, (H, W, 3) uint8."""
+        """Add a sample of the pixels of an image, (H, W, 3) uint8."""
         sample = image[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
         for channel in range(3):
             self._counts[channel] += np.bincount(sample[..., channel].ravel(), minlength=256)
@@ -359,8 +361,9 @@ class ImageStatistics:
 
 
 def joined(a: Mapping[str, Stats], b: Mapping[str, Stats]) -> dict[str, Stats]:
-    """Combine the statistics of two sets of frames; quantiles are averaged by count, as LeRobot
-    does.
+    """Combine the statistics of two sets of frames.
+
+    Quantiles are averaged with the counts as weights, as in LeRobot.
     """
     return {key: _joined(a[key], b[key]) if key in a else b[key] for key in b}
 

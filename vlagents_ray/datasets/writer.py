@@ -1,8 +1,8 @@
-"""A LeRobotDataset v3.0 on disk: Parquet and MP4, written one episode at a time.
+"""A LeRobotDataset v3.0 on disk: Parquet and MP4 files, written one episode at a time.
 
-The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`,
+The layout, names and columns are the same as in LeRobot 0.4.4 (`lerobot/datasets/utils.py`,
 `lerobot_dataset.py`). LeRobot may put many episodes into a file; here each episode has its own
-files, so that it is either complete or absent. Files are renamed to their names when they are
+files, so that it is either complete or absent. Files receive their final names when they are
 complete, `meta/info.json` last. Files of an episode that `info.json` does not count are removed
 when the dataset is opened again.
 """
@@ -41,12 +41,13 @@ DATA, VIDEO, EPISODES = (
     f"meta/episodes/{FILE}.parquet",
 )
 FILES_IN_CHUNK = 1000
-UNFINISHED_FOLDER = "unfinished"  # the folder of the running episodes in a dataset
+UNFINISHED_FOLDER = "unfinished"  # name of the folder of the running episodes in a dataset
 
 
 class Dataset:
-    """A dataset to which episodes are added; opening an existing one continues it with the same
-    columns.
+    """A dataset to which episodes are added.
+
+    Opening an existing dataset continues it with the same columns.
     """
 
     def __init__(
@@ -58,12 +59,13 @@ class Dataset:
         lossless: bool = False,
         durable: bool = True,
     ) -> None:
-        """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
+        """Open or create a dataset of frames at `fps` Hz.
 
-        With `durable`, an episode is on the disk when `save` returns.
+        With `lossless`, videos keep each pixel unchanged. With `durable`, an episode is on the disk
+        when `save` returns.
 
         Raises:
-            ConfigError: The folder has other files, or a dataset of another rate or version.
+            ConfigError: The folder contains other files, or a dataset with another rate or version.
             MissingDependency: The extra "record" is not installed.
         """
         self.root = root
@@ -113,9 +115,10 @@ class Dataset:
         return int(self.info["total_episodes"])
 
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RunningEpisode:
-        """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned.
+        """Begin an episode, to which frames are added.
 
-        Several may run at once. `meaning` describes the actions' numbers, if it is known.
+        It is later passed to `save`, or abandoned. Several episodes may run at the same time.
+        `meaning` describes the numbers of the actions, if their meaning is known.
         """
         unfinished = self.root / UNFINISHED_FOLDER
         unfinished.mkdir(parents=True, exist_ok=True)
@@ -261,9 +264,7 @@ class Dataset:
         return pa.table(columns)
 
     def _tasks_table(self) -> Any:
-        """Make the table of tasks in the format that LeRobot reads: that of a pandas frame
-        indexed by task.
-        """
+        """Make the table of tasks as LeRobot reads it: a pandas frame indexed by task."""
         pa, name = self._pa, "__index_level_0__"
         text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
         columns: list[dict[str, Any]] = [
@@ -308,8 +309,9 @@ class Dataset:
         return folder / name.replace("/", "_")
 
     def _move(self, complete: Path, path: Path) -> None:
-        """Rename a complete file; with `durable`, it is on the disk with its new name when this
-        returns.
+        """Rename a complete file.
+
+        With `durable`, the file is on the disk under its new name when this function returns.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         if self._durable:
@@ -325,7 +327,7 @@ def _file_numbers(episode: int) -> dict[str, int]:
 
 
 def _sync(path: Path) -> None:
-    """Write a file, or the names in a folder, to the disk."""
+    """Flush a file, or the names in a folder, to the disk."""
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)

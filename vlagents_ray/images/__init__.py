@@ -1,1 +1,1 @@
-"""Images: JPEG, PNG and MP4, and the codecs that a message may use."""
+"""Images: JPEG and PNG files, MP4 videos, and the codecs that a message may use."""

@@ -1,5 +1,6 @@
-"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG, in several threads if that
-is faster.
+"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG.
+
+Several threads are used if that is faster.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ T = TypeVar("T")
 NAMES = ("raw", "lossless", "jpeg")
 SUBSAMPLINGS = ("444", "422", "440", "420")
 
-# Time to encode on one core, s per byte of pixels: 1 to 2, and 6 to 12 ns.
+# Encoding times on one core, s per byte of pixels. Measured: JPEG 1 to 2 ns, PNG 6 to 12 ns.
 _JPEG_S, _PNG_S = 1.7e-9, 7e-9
 
 
@@ -80,7 +81,7 @@ def decode_files(
     """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory and time for
     all of them.
 
-    Errors name the camera of a file if `names`, in the order of the files, has it.
+    `names` may contain the cameras' names, in the order of the files, for error messages.
 
     Raises:
         MalformedMessage: A file cannot be decoded.
@@ -88,7 +89,10 @@ def decode_files(
     """
 
     def attributed(convert: Callable[[Any], T], item: Any, index: int) -> T:
-        """Return `convert(item)`; its errors name the camera of the file at `index`."""
+        """Return `convert(item)`.
+
+        Its errors contain the name of the camera of the file at `index`.
+        """
         try:
             return convert(item)
         except InvalidInput as error:

@@ -1,9 +1,9 @@
-"""The structure of a JPEG or PNG file, which is checked before any of it is decoded.
+"""The structure of a JPEG or PNG file, which is checked before any part of the file is decoded.
 
-The size in the header of a file does not bound the cost of decoding it: a progressive JPEG may have
-any number of scans, of 12 bytes each, and a PNG any number of chunks. So a file is admitted by its
-structure, and its cost is estimated from what the decoder will do: samples with their padding,
-scans, rows and bytes.
+The image size in the header of a file does not bound the cost of decoding: a progressive JPEG may
+have any number of scans, of 12 bytes each, and a PNG any number of chunks. The check therefore
+reads the structure, and estimates the cost from the work of the decoder: samples with their
+padding, scans, rows and bytes.
 """
 
 from __future__ import annotations
@@ -18,34 +18,37 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 
 JPEG_MAGIC = b"\xff\xd8\xff"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-# width, height, depth, colour type, compression, filter, interlace.
+# Format of the PNG header: width, height, depth, colour type, compression, filter, interlace.
 PNG_HEADER = struct.Struct(">2I5B")
-RGB8 = (8, 2, 0, 0, 0)  # the rest of the header of an RGB image of 8 bits, not interlaced
+# Header fields after the size, for an RGB image of 8 bits without interlacing.
+RGB8 = (8, 2, 0, 0, 0)
 
-# Limits of the structure. Encoders write about ten scans, and chunks of at least 4 KiB.
+# Limits of the structure. Typical encoders write about ten scans, and chunks of at least 4 KiB.
 _MOST_SCANS = 100
-# Segments of a JPEG before its first scan, or chunks of a PNG, and one more in each KiB.
+# The largest number of segments of a JPEG before its first scan, or of chunks of a PNG. One more is
+# allowed for each KiB of the file.
 _MOST_SEGMENTS = 256
-_MOST_METADATA = 64 * 1024  # bytes of a file beyond twice those of its pixels
+_MOST_METADATA = 64 * 1024  # bytes that a file may have in addition to twice the size of its pixels
 
-# Estimates of the time on one core: a file of no known kind takes more than three times as long.
+# Estimated times on one core. No known kind of file takes more than three times as long.
 _FILE_S = 20e-6
 _SAMPLE_S = 1.7e-9  # per sample of a JPEG
 _SCAN_S = 0.1e-9  # per sample of a JPEG and scan after the first
 _BASELINE_BYTE_S, _PROGRESSIVE_BYTE_S = 5e-9, 20e-9  # per byte of a JPEG
-# Per byte of the unpacked rows: those of `encode_png`, and with Pillow.
+# Times per byte of the unpacked rows, for files of `encode_png` and for files that Pillow decodes.
 _OWN_PNG_S, _PNG_S = 7e-9, 12e-9
-_PILLOW_S = 70e-6  # per file
-_PILLOW_ROW_S = 0.1e-6  # per row
-# Memory in addition to the result, per pixel: the image in 32 bits, and copies of it.
+_PILLOW_S = 70e-6  # per PNG file that Pillow decodes
+_PILLOW_ROW_S = 0.1e-6  # per row that Pillow decodes
+# The memory that Pillow needs in addition to the result, bytes per pixel: the image in 32 bits, and
+# copies of it.
 _PILLOW_PIXEL_BYTES = 16
 
 _SOF = {0xC0: "baseline", 0xC1: "extended", 0xC2: "progressive"}
-# lossless, hierarchical or arithmetic coding.
+# Markers of lossless, hierarchical or arithmetic coding.
 _OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _SOS, _EOI = 0xDA, 0xD9
-_FILL = re.compile(b"\xff+")  # any number of these may precede a marker
-_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the colour type of a PNG
+_FILL = re.compile(b"\xff+")  # fill bytes, any number of which may precede a marker
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # PNG colour type -> number of channels
 _CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 
 
@@ -53,12 +56,12 @@ _CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 class ImageFile:
     """A file whose structure has been checked, with the cost of decoding it."""
 
-    data: bytes  # a copy: the sender may still write into memory that it shares
+    data: bytes  # a copy, since the sender may still write into shared memory
     height: int
     width: int
     decoding_s: float  # estimated time on one core, s
     scratch_bytes: int  # memory that decoding needs in addition to the image, bytes
-    # name, start and end of each critical chunk of a PNG.
+    # The name, start and end of each critical chunk of a PNG.
     chunks: tuple[tuple[bytes, int, int], ...] = ()
 
     @property
@@ -67,7 +70,7 @@ class ImageFile:
 
     @property
     def image_bytes(self) -> int:
-        """Size of the decoded image, (H, W, 3) uint8, bytes."""
+        """The size of the decoded image, (H, W, 3) uint8, in bytes."""
         return 3 * self.height * self.width
 
 
@@ -75,7 +78,8 @@ def read_structure(data: bytes | memoryview, max_pixels: int) -> ImageFile:
     """Check the structure of a JPEG or PNG file, and estimate the cost of decoding it.
 
     Raises:
-        MalformedMessage: The data are no JPEG or PNG file, or one that no camera writes.
+        MalformedMessage: The data are not a JPEG or PNG file, or are a variant that no camera
+            writes.
         MessageTooLarge: The image declares more than `max_pixels`, or the file has too many scans,
             segments or bytes.
     """
@@ -122,7 +126,7 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
             f"image: expected a JPEG of at most {_MOST_SCANS} scans, got {scans}; encode it again"
         )
 
-    # The decoder pads an image to whole units, of up to 32 x 32 pixels.
+    # The decoder pads an image to whole units of up to 32 x 32 pixels.
     padded_pixels = -(-height // unit_height) * unit_height * -(-width // unit_width) * unit_width
     samples = components * padded_pixels
     is_buffered = (
@@ -130,7 +134,7 @@ def _read_jpeg(file: bytes, max_pixels: int) -> ImageFile:
     )
     byte_s = _PROGRESSIVE_BYTE_S if is_buffered else _BASELINE_BYTE_S
     seconds = _FILE_S + samples * (_SAMPLE_S + (scans - 1) * _SCAN_S) + len(file) * byte_s
-    coefficients = 2 * samples if is_buffered else 0  # 16 bits each, of the whole image
+    coefficients = 2 * samples if is_buffered else 0  # coefficients of 16 bits, for the whole image
     return ImageFile(file, height, width, seconds, coefficients)
 
 
@@ -156,8 +160,8 @@ def _jpeg_segment(file: bytes, at: int) -> tuple[int, int, int]:
 
 
 def _jpeg_frame(header: bytes) -> tuple[int, int, int, int, int]:
-    """Return the height, the width, the number of components, and the height and width of a
-    unit, pixels.
+    """Return the height and width of the image, the number of components, and the height and width
+    of a unit, pixels.
     """
     if len(header) < 9 or len(header) != 6 + 3 * header[5]:
         raise MalformedMessage("image: broken JPEG (its header has another length)")
@@ -209,7 +213,7 @@ def _read_png(file: bytes, max_pixels: int) -> ImageFile:
 
 
 def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
-    """Return the name, the start and the end of each critical chunk, up to the last."""
+    """Return the name, the start and the end of each critical chunk, until the final chunk."""
     critical = []
     at = len(PNG_MAGIC)
     for _ in range(_MOST_SEGMENTS + len(file) // 1024):
@@ -228,7 +232,7 @@ def _png_chunks(file: bytes) -> list[tuple[bytes, int, int]]:
 def is_own_png(
     file: bytes, chunks: list[tuple[bytes, int, int]] | tuple[tuple[bytes, int, int], ...]
 ) -> bool:
-    """Return whether a PNG has the chunks that `encode_png` writes, and no more."""
+    """Return whether a PNG has exactly the chunks that `encode_png` writes."""
     header_end, data_start = chunks[0][2], chunks[1][1]
     is_whole = len(chunks) == 3 and header_end == data_start and chunks[2][2] == len(file)
     return (

@@ -4,9 +4,9 @@ The structure of a file is checked first, see `vlagents_ray.images.image_file`: 
 declares more pixels than the caller allows is rejected before memory is allocated for it.
 
 PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the
-row above), and zlib uses its run-length strategy. A search for better filters or longer matches
-takes several times as long and saves a few per cent on camera images with noise. Files of this form
-are read in the same way; others need Pillow.
+row above), and zlib uses its run-length strategy. Searching for better filters or longer matches
+takes several times as long, and saves only a few per cent on camera images with noise. Such files
+are also decoded with numpy and zlib alone; other PNG files need Pillow.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from vlagents_ray.images.image_file import (
     read_structure,
 )
 
-MAX_PIXELS = 4096 * 4096  # default limit of one image
+MAX_PIXELS = 4096 * 4096  # default limit for one image
 _UP = 2
 
 
@@ -87,11 +87,11 @@ def decode_file(file: ImageFile) -> np.ndarray:
         image = _decode_own_png(file) if is_own_png(file.data, file.chunks) else None
         return _decode_png(file) if image is None else image
 
-    # The strict mode, which is the default, rejects truncated data, which libjpeg would fill with
-    # grey.
+    # The default is the strict mode, which rejects truncated data. Otherwise, libjpeg would fill
+    # the missing part with grey.
     try:
-        # The library's defaults, "fast" transform and upsampling, save a twentieth of the time and
-        # cost up to 1.3 dB.
+        # The library's default "fast" transform and upsampling would save a twentieth of the time,
+        # but reduce the quality by up to 1.3 dB.
         picture: np.ndarray = simplejpeg.decode_jpeg(
             file.data, colorspace="RGB", fastdct=False, fastupsample=False
         )
@@ -101,10 +101,10 @@ def decode_file(file: ImageFile) -> np.ndarray:
 
 
 def _decode_png(file: ImageFile) -> np.ndarray:
-    """Decode any PNG file with Pillow, which is passed nothing but the chunks that its pixels need.
+    """Decode any PNG file with Pillow.
 
-    Pillow would read all others in Python, and raises errors of its own kinds for some that are
-    invalid.
+    Only the chunks that the pixels need are passed to Pillow. It would read all other chunks in
+    Python, and raises its own kinds of errors for some invalid ones.
     """
     try:
         from PIL import Image
@@ -117,7 +117,8 @@ def _decode_png(file: ImageFile) -> np.ndarray:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
-                # Keep the upper 8 of 16 bits, as Pillow does for colours; it would clip greys.
+                # Keep the upper 8 of 16 bits, as Pillow does for colours. For greys, Pillow would
+                # clip the values.
                 if picture.mode.startswith("I"):  # "I;16", or "I" before Pillow 11
                     grey = (np.asarray(picture) >> 8).astype(np.uint8)
                     return np.repeat(grey[:, :, None], 3, axis=2)
@@ -129,8 +130,9 @@ def _decode_png(file: ImageFile) -> np.ndarray:
 
 
 def _decode_own_png(file: ImageFile) -> np.ndarray | None:
-    """Decode a file of the form of `encode_png`, with no more memory than its size needs; None
-    for other filters.
+    """Decode a file in the form that `encode_png` writes, with only the memory that its size needs.
+
+    Return None if rows have other filters.
     """
     height, width = file.height, file.width
     _, start, end = file.chunks[1]
@@ -140,7 +142,8 @@ def _decode_own_png(file: ImageFile) -> np.ndarray | None:
         raw = inflate.decompress(memoryview(file.data)[start + 8 : end - 4], height * stride + 1)
     except zlib.error as error:
         raise MalformedMessage(f"image: broken PNG ({error})") from error
-    if len(raw) != height * stride or not inflate.eof:  # zlib compares the checksum at the end
+    # Zlib checks the checksum at the end of the data.
+    if len(raw) != height * stride or not inflate.eof:
         raise MalformedMessage(
             f"image: broken PNG (its data are not {height} rows of {width} pixels)"
         )

@@ -1,4 +1,6 @@
-"""Videos: an encoder of H.264 in MP4, which browsers play, and the images of decoded frames."""
+"""Videos: an encoder of H.264 in MP4, which browsers can play, and the conversion of decoded
+frames to images.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +18,21 @@ from vlagents_ray.registry import require
 
 
 def rgb_converter() -> Callable[[Any], np.ndarray]:
-    """Return what converts the decoded frames of one video to images, (H, W, 3) uint8 RGB.
+    """Return a function that converts the decoded frames of one video to images, (H, W, 3) uint8
+    RGB.
 
-    It keeps its tables and threads, which the `to_ndarray` of a frame makes for that frame alone,
-    in at least 0.25 ms.
+    The function reuses its tables and threads. The method `to_ndarray` of a frame creates them for
+    each frame, which takes at least 0.25 ms.
     """
     reformat = require("av").video.reformatter.VideoReformatter().reformat
     return lambda frame: reformat(frame, format="rgb24").to_ndarray()
 
 
 class Mp4:
-    """The video in progress of one camera; encoding a frame of 224x224 takes about 0.3 ms."""
+    """A video of one camera that is being written.
+
+    Encoding a frame of 224x224 takes about 0.3 ms.
+    """
 
     def __init__(
         self,
@@ -45,8 +51,8 @@ class Mp4:
             fps: The rate of the frames, Hz.
             key_frames: The number of frames from one key frame to the next; None selects x264's
                 default.
-            lossless: Whether to keep each pixel, in RGB: about ten times larger, and unsuitable for
-                browsers.
+            lossless: Whether to keep each pixel unchanged, in RGB. Such a video is about ten times
+                larger, and browsers cannot play it.
         """
         self._av: Any = require("av")
         self._shape = shape
@@ -69,7 +75,8 @@ class Mp4:
             options=options,
         )
 
-        # Unless the video is lossless, the last row or column of an odd image is repeated.
+        # Unless the video is lossless, the last row or column of an image with an odd size is
+        # repeated.
         self.size = self._stream.height, self._stream.width = (
             height + self._pad[0],
             width + self._pad[1],
@@ -95,6 +102,9 @@ class Mp4:
         self._container.close()
 
     def abandon(self) -> None:
-        """Close the encoder without completing the video; errors in writing its end are ignored."""
-        with contextlib.suppress(OSError):  # PyAV's errors of the disk are OSErrors
+        """Close the encoder without completing the video.
+
+        Errors while writing its end are ignored.
+        """
+        with contextlib.suppress(OSError):  # PyAV raises disk errors as OSErrors
             self._container.close()

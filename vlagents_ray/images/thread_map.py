@@ -20,7 +20,7 @@ def _unknown_core() -> int:
 
 
 current_core: Callable[[], int] = _unknown_core
-"""Return the core on which the calling thread runs; -1 if it is not known."""
+"""Return the core on which the calling thread runs; -1 if the core is unknown."""
 if hasattr(os, "sched_setaffinity"):
     current_core = getattr(ctypes.CDLL(None), "sched_getcpu", _unknown_core)
 
@@ -35,8 +35,11 @@ def allowed() -> int:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_LEAST_WORK_S = 0.4e-3  # s; two cameras of 224 x 224 in JPEG gain a fifth of a round trip
-_MOST_HELPERS = 3  # largest number of threads in addition to the caller's; robots have few cameras
+# Shortest work that is divided among threads, s; with two cameras of 224 x 224 in JPEG, this saves
+# a fifth of a round trip.
+_LEAST_WORK_S = 0.4e-3
+# Largest number of threads in addition to the caller's thread; robots have few cameras.
+_MOST_HELPERS = 3
 MOST_THREADS = 1 + _MOST_HELPERS
 
 
@@ -46,14 +49,15 @@ def thread_map(
     """Compute `[function(item) for item in items]`, in several threads if the time on one core,
     `work_s`, is long.
 
-    The function does not wait for other calls of itself. An exception is that of the first item
-    that raised one.
+    The function must not wait for other calls of itself. If calls raise exceptions, the exception
+    of the first such item is raised.
     """
     threads = min(len(items), allowed(), MOST_THREADS)
     if threads < 2 or work_s < _LEAST_WORK_S:
         return [function(item) for item in items]
 
-    todo = iter(range(len(items)))  # shared by all threads, so that a late helper delays nothing
+    # Shared by all threads, so that a helper that starts late delays nothing.
+    todo = iter(range(len(items)))
     results: dict[int, Result] = {}
     errors: dict[int, BaseException] = {}
 
@@ -68,24 +72,25 @@ def thread_map(
     helpers = _helpers(os.getpid())
     helpers.keep_off(current_core())
     helping: list[Future[None]] = []
-    with contextlib.suppress(RuntimeError):  # while the interpreter exits, the caller works alone
+    with contextlib.suppress(RuntimeError):  # While the interpreter exits, the caller works alone.
         for _ in range(threads - 1):
             helping.append(helpers.submit(work))
     work()
 
     for helper in helping:
-        if not helper.cancel():  # it has begun: `items` are in use until it ends
+        if not helper.cancel():  # The helper has begun, and uses `items` until it ends.
             helper.result()
     if errors:
-        raise errors.pop(min(errors))  # popped, so that no reference cycle keeps the items
+        # The error is popped, so that no reference cycle keeps the items.
+        raise errors.pop(min(errors))
     return [results[index] for index in range(len(items))]
 
 
 class _Helpers(ThreadPoolExecutor):
     """Threads that avoid the core of their caller.
 
-    Wake-affine scheduling would often place them there, where they wait for the caller: on two
-    cores, two to four cameras took 20 to 50 % longer.
+    Wake-affine scheduling would often place the threads on that core, where they wait for the
+    caller. On two cores, two to four cameras then took 20 to 50 % longer.
     """
 
     def __init__(self) -> None:
@@ -104,14 +109,16 @@ class _Helpers(ThreadPoolExecutor):
         cores = os.sched_getaffinity(0) - {core}
         if cores and cores != self._cores:
             self._cores = cores
-            with contextlib.suppress(OSError):  # not permitted: the kernel chooses the cores
+            # The call is not permitted, so the kernel chooses the cores.
+            with contextlib.suppress(OSError):
                 for thread in self._ids:
                     os.sched_setaffinity(thread, cores)
 
 
 @cache
 def _helpers(_process: int) -> _Helpers:
-    """Return the helpers of this process; a forked process has its own, since threads do not
-    survive a fork.
+    """Return the helpers of this process.
+
+    A forked process creates new ones, since threads do not survive a fork.
     """
     return _Helpers()

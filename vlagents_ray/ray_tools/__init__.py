@@ -1,3 +1,3 @@
-"""Ray around this project: joining or starting a cluster, watching its head, cleaning up after
+"""Functions around Ray: joining or starting a cluster, monitoring its head, and cleaning up after
 it.
 """

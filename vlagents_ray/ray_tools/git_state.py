@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-MOST_BYTES = 1_000_000  # maximum number of bytes of a diff that are kept
+MOST_BYTES = 1_000_000  # largest number of bytes of a diff that are stored
 _TIMEOUT_S = 30.0
 
 
@@ -21,7 +21,7 @@ class GitState:
     """The state of a repository's tracked files; untracked files are not part of it."""
 
     commit: str  # 40 hexadecimal digits
-    # Hash of the complete difference from the commit; None if there is none.
+    # Hash of the complete difference from the commit; None if there is no difference.
     diff_sha256: str | None
     diff: bytes  # output of `git diff`, truncated to `MOST_BYTES`
 
@@ -51,7 +51,7 @@ def code_of(target: str) -> GitState | None:
     try:
         spec = importlib.util.find_spec(target.partition(":")[0])
     except (ImportError, ValueError):
-        # a parent package is not installed, or the module has no spec
+        # A parent package is not installed, or the module has no spec.
         return None
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return None
@@ -65,7 +65,7 @@ def code_of(target: str) -> GitState | None:
 
 @functools.cache
 def _code(top: str) -> GitState | None:
-    """Return the state at the first call, as later edits do not change the running code."""
+    """Return the state at the first call, since later edits do not change the running code."""
     commit = _git(Path(top), "rev-parse", "--verify", "HEAD")
     diff = _git(Path(top), "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD")
     if commit is None or diff is None:
@@ -81,7 +81,7 @@ def _git(folder: Path, *words: str) -> bytes | None:
         return None
     environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
     try:
-        done = subprocess.run(  # noqa: S603 - words of ours, and a folder
+        done = subprocess.run(  # noqa: S603 - the arguments are constants and a folder
             [git, "-C", str(folder), *words],
             capture_output=True,
             timeout=_TIMEOUT_S,

@@ -1,8 +1,9 @@
-"""Detects that the cluster's head, or Ray's daemon on this machine, has ended.
+"""A monitor that detects the end of the cluster's head, or of Ray's daemon on this machine.
 
-Ray kills a process a minute after it has lost the cluster's head, without a chance to write
-anything. It does not notice the end of its daemon (the raylet) on the same machine. Most calls of
-Ray block in the meantime. Therefore the driver checks both by itself, and exits in time.
+Ray kills a process one minute after the process has lost the cluster's head, and the process cannot
+write anything before. Ray does not detect the end of its daemon (the raylet) on the same machine.
+Most calls of Ray block in the meantime. The driver therefore checks both processes itself, and
+exits in time.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ PERIOD_S = 2.0  # interval of the checks
 ANSWER_S = 1.0  # timeout of a check, which blocks the driver
 # Time after which Ray kills a process without a head.
 _RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"
-_RAY_TIMEOUT_S = 60.0  # its default
-# Share of Ray's timeout after which the head counts as lost; the rest is for an orderly end.
+_RAY_TIMEOUT_S = 60.0  # Ray's default for this time
+# The share of Ray's timeout after which the head counts as lost. The remaining time is for an
+# orderly end.
 _SHARE = 0.4
 _SOCKETS = Path("/proc/net/unix")
 
@@ -96,8 +98,9 @@ class HeadMonitor:
 
 
 def head_is_gone() -> bool:
-    """Return whether the head refuses connections, as it does from SIGTERM until its process
-    ends seconds later.
+    """Return whether the head refuses connections.
+
+    It does so from SIGTERM until its process ends, seconds later.
     """
     try:
         socket.create_connection(_address(), ANSWER_S).close()
@@ -112,8 +115,8 @@ def _address() -> tuple[str, int]:
 
 
 def _exists(unix_socket: str) -> bool:
-    """Return whether a Unix socket is open; its file may remain after the listener has ended."""
+    """Return whether a Unix socket is open. Its file may remain after the listener has ended."""
     try:
         return any(line.endswith(f" {unix_socket}") for line in _SOCKETS.read_text().splitlines())
-    except OSError:  # the system is not Linux
+    except OSError:  # The system is not Linux.
         return False

@@ -1,10 +1,10 @@
 """The adapter to Ray and Ray Serve: all of their private names that this package uses.
 
-`USES` lists the names with the consequence of each that a version lacks, and `check_ray` reports
-them when a server starts. `make rays` tries the versions of `TRIED`; try another one before it is
-allowed. Ray is imported inside the functions, as clients without Ray import this module. Only
-`vlagents_ray.serve.scaling.router` uses a private method of Serve by itself, as Serve sends that
-module by value to processes that may lack this package.
+`USES` lists the names, and the consequence if a version of Ray lacks them. `check_ray` reports
+missing names when a server starts. `make rays` tests the versions of `TRIED`; test a new version
+before you add it. Ray is imported inside the functions, since clients without Ray import this
+module. Only `vlagents_ray.serve.scaling.router` uses a private method of Serve directly, since
+Serve sends that module by value to processes that may lack this package.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LOGGERS = (
 )
 START_LOGGER = "ray._private.services"  # logs the start of Ray's processes
 
-# The oldest and the newest minor version of Ray that were tried.
+# The oldest and the newest minor version of Ray that were tested.
 TRIED = ((2, 60), (2, 60))
 
 
@@ -44,9 +44,9 @@ TRIED = ((2, 60), (2, 60))
 class Use:
     """Private names of Ray that one ability needs."""
 
-    consequence: str  # without one of the names
-    names: tuple[str, ...]  # dotted; methods are called by the actors' handles
-    is_required: bool = True  # otherwise a server starts without the ability
+    consequence: str  # effect if one of the names is missing
+    names: tuple[str, ...]  # dotted names; methods are called through handles of the actors
+    is_required: bool = True  # if False, a server starts without the ability
 
 
 _REPLICA = "ray.serve._private.replica.ReplicaActor"
@@ -138,19 +138,20 @@ USES = (
 
 
 def requirement() -> str:
-    """Return the requirement of the versions that were tried, as `pyproject.toml` states it."""
+    """Return the version requirement for the tested versions, as in `pyproject.toml`."""
     (major, oldest), (_, newest) = TRIED
     return f"ray[serve]>={major}.{oldest},<{major}.{newest + 1}"
 
 
 def check_ray() -> None:
-    """Check that the installed Ray has the private names that are used, and log what will not work
-    as usual; called when a server starts.
+    """Check that the installed Ray has the private names that are used, and log the effects of
+    missing names.
 
-    The log of a version that was tried is for information only.
+    This function is called when a server starts. For a tested version, the log message has the
+    level INFO.
 
     Raises:
-        ConfigError: It lacks a name without which no server runs.
+        ConfigError: Ray lacks a name that a server requires.
     """
     import ray
 
@@ -186,7 +187,7 @@ def check_ray() -> None:
 
 
 def was_tried(version: str) -> bool:
-    """Return whether this version of Ray, such as "2.60.0", is one of those that were tried."""
+    """Return whether this version of Ray, such as "2.60.0", is one of the tested versions."""
     numbers = re.match(r"(\d+)\.(\d+)", version)
     if numbers is None:
         return False
@@ -227,8 +228,8 @@ def node_of_this_process() -> Any:
     imported Ray.
 
     The record contains data that no public function returns: the daemons' sockets, their log
-    folder, and whether this process started them. It exists before the connection does; a call of
-    Ray from another thread would then start a second cluster.
+    folder, and whether this process started them. The record exists before the connection does. In
+    between, a call of Ray from another thread would start a second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
     if worker is None or not worker.global_worker.connected:
@@ -310,8 +311,8 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
         no_monitor=True,
         **params,
     )
-    # `ray_init_cluster` means that a driver starts the cluster, not `ray start`, so that nothing
-    # else joins it by default.
+    # `ray_init_cluster` means that a driver, not `ray start`, starts the cluster, so that no other
+    # process joins it by default.
     return Node(
         ray_params, head=True, shutdown_at_exit=False, spawn_reaper=True, ray_init_cluster=True
     )
@@ -341,7 +342,7 @@ def gpus_here() -> float:
     if manager is None:
         return 0.0
     number = manager.get_current_node_num_accelerators()
-    # CUDA_VISIBLE_DEVICES and similar variables name the visible ones.
+    # CUDA_VISIBLE_DEVICES and similar variables contain the visible GPUs.
     visible = manager.get_current_process_visible_accelerator_ids()
     return float(number if visible is None else min(number, len(visible)))
 
@@ -369,17 +370,17 @@ def create_channel(size: int) -> Any:
 
 
 def register_writer(channel: Any) -> None:
-    """Register this process as the writer of a channel, which Ray's `Channel` does only together
-    with pickling.
+    """Register this process as the writer of a channel.
+
+    Ray's `Channel` can do this only in combination with pickling.
     """
     _worker().core_worker.experimental_channel_register_writer(channel, {})
 
 
 def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
-    """Write the content to a channel; return the reason if that is impossible, otherwise None.
+    """Write the content to a channel; return the reason if writing is impossible, otherwise None.
 
-    An exception raised here would retain the channel's memory for as long as its traceback is
-    referenced.
+    An exception raised here would keep the channel's memory as long as its traceback is referenced.
     """
     import ray
 
@@ -391,8 +392,9 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
 
 
 def read_channel(channel: Any) -> Any:
-    """Return the newest content, with `metadata` and `data`, in place; it is valid while it is
-    referenced.
+    """Return the newest content, with `metadata` and `data`, without a copy.
+
+    It is valid while it is referenced.
 
     Raises:
         ray.exceptions.RayChannelTimeoutError: Nothing was written since the last call.
@@ -404,7 +406,7 @@ def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
     """Return pieces of memory in a form that Ray copies directly into a channel, one after the
     other.
 
-    This is Ray's writer of out-of-band buffers, without any pickled data in band.
+    This uses Ray's writer of out-of-band buffers, without in-band pickled data.
     """
     import ray
 
@@ -415,8 +417,9 @@ def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
 
 
 def channel_pieces(data: Any) -> Any:
-    """Return the pieces in the data of a channel, in place, without unpickling; Ray's parser
-    trusts the data.
+    """Return the pieces in the data of a channel, without a copy and without unpickling.
+
+    Ray's parser does not validate the data.
     """
     import ray
 
@@ -450,7 +453,7 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
         "proxy_location": location,
     }
     for name, parameter in inspect.signature(create).parameters.items():
-        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:  # some exist from Ray 2.59 on
+        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:  # some exist since Ray 2.59
             arguments.setdefault(name, None)
     _, proxies = create(**arguments)
     return _get_global_client(), proxies
@@ -468,8 +471,9 @@ def proxies_now(client: Any) -> list[Any]:
 
 
 def long_polls(client: Any) -> Iterator[Any]:
-    """Yield the long polls that the handles of Serve's client have open at the controller, each
-    with `stop`.
+    """Yield the long polls that the handles of Serve's client have open at the controller.
+
+    Each has a method `stop`.
 
     `serve.shutdown` leaves them open, and Ray would report them as failed tasks.
     """
@@ -488,13 +492,17 @@ def long_polls(client: Any) -> Iterator[Any]:
 
 
 def begin_to_end(client: Any, names: Sequence[str]) -> None:
-    """Begin to end applications; `serve.delete` waits for each of them, for at most a minute."""
+    """Begin to end applications, without waiting.
+
+    `serve.delete` would wait for each application, for at most a minute.
+    """
     client._controller.delete_apps.remote(list(names))
 
 
 def list_applications(client: Any) -> Any:
-    """Return the ref of the list of all applications, which `serve.status` would wait for without
-    a time limit.
+    """Return the ref of the list of all applications.
+
+    `serve.status` would wait for the list without a time limit.
     """
     return client._controller.list_serve_statuses.remote()
 
@@ -513,13 +521,14 @@ def silence_lost_polls() -> None:
     skipped = stdout_deduplicator.skip_re
     if skipped is None:
         stdout_deduplicator.skip_re = re.compile(message)
-    elif message not in skipped.pattern:  # by RAY_DEDUP_LOGS_SKIP_REGEX
+    elif message not in skipped.pattern:  # the pattern that RAY_DEDUP_LOGS_SKIP_REGEX sets
         stdout_deduplicator.skip_re = re.compile(f"{skipped.pattern}|{message}")
 
 
 def end_controller(client: Any) -> Any:
-    """Begin to shut Serve down; return the ref of the call, which fails because it ends the
-    controller.
+    """Begin to shut Serve down, and return the ref of the call.
+
+    The call fails because it ends the controller.
     """
     return client._controller.graceful_shutdown.options(max_task_retries=0).remote()
 
@@ -550,7 +559,7 @@ def replica_is_ending() -> bool:
 
 
 def check_replica() -> None:
-    """Check that `replica_is_ending` works in this process, which is a replica's.
+    """Check that `replica_is_ending` works in this process, which is the process of a replica.
 
     Raises:
         ConfigError: Serve's replica lacks an attribute that is read.
@@ -568,10 +577,11 @@ def check_replica() -> None:
 
 
 def report_to_autoscaling() -> None:
-    """Have the replica of this process report its load to Serve's controller now; from any thread.
+    """Make the replica of this process report its load to Serve's controller now.
 
-    Serve itself records the load and reports what it has recorded by two tasks with the same
-    period, so that a change arrives after up to two of them. Nothing happens without autoscaling.
+    Any thread may call this function. Serve itself has one task that records the load and another
+    task that reports the recorded load. Both have the same period, so that a change may arrive
+    after two periods. Without autoscaling, the function does nothing.
     """
     worker = _worker()
     replica = worker.actors.get(worker.actor_id)._replica_impl
@@ -587,21 +597,23 @@ def report_to_autoscaling() -> None:
 
 
 def replica_is_initialized(replica: Any) -> Any:
-    """Ask a replica's actor whether it has made its callable; return the pending answer."""
+    """Ask a replica's actor whether it has created its callable, and return the ref of the
+    answer.
+    """
     return replica.was_initialized.remote()
 
 
 def ping_replica(replica: Any) -> Any:
-    """Call a method of a replica's actor that its process answers while the policy is at work, as
-    Serve's own router does; return the pending answer.
+    """Call a method of a replica's actor that is answered even while the policy is busy, as Serve's
+    own router does.
+
+    Return the ref of the answer.
     """
     return replica.get_num_ongoing_requests.remote()
 
 
 def replica_request(request_id: str, method: str) -> bytes:
-    """Return the header of a call of a replica's method, as Serve's own router sends it to the
-    replica's actor.
-    """
+    """Return the header with which Serve's own router calls a method of a replica's actor."""
     from ray.serve._private.common import RequestMetadata
 
     return pickle.dumps(

@@ -1,10 +1,12 @@
-"""Cleans up after a killed driver: `python reaper.py FOLDER`, with a pipe as its standard input.
+"""A script that cleans up after a killed driver: `python reaper.py FOLDER`, with a pipe as its
+standard input.
 
-A local cluster normally ends with its driver. After `kill -9` parts of it can remain: an HAProxy
-whose manager was killed first, agents that take a minute to exit, the folder. The end of the pipe
-signals that the driver has ended. A driver that exits in order, while its Ray runs, first writes a
-byte. In that case only processes that use files of the folder can remain: an HAProxy that waits for
-its last connection to close, and Ray's agents, which take a moment to exit.
+A local cluster normally ends with its driver. After `kill -9`, parts of the cluster can remain: an
+HAProxy whose manager was killed first, agents that take a minute to exit, and the folder. The end
+of the pipe signals that the driver has ended. A driver that exits in an orderly way, while its Ray
+runs, first writes a byte to the pipe. In that case, only processes that use files of the folder can
+remain: an HAProxy that waits for its last connection to close, and Ray's agents, which take a
+moment to exit.
 """
 
 from __future__ import annotations
@@ -20,10 +22,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 MARK = "VLAGENTS_RAY_CLUSTER"  # environment variable of every process of the cluster
-_GRACE_S = 3.0  # time for Ray to end by itself
+_GRACE_S = 3.0  # time that Ray has to end by itself
 _ORDERLY = b"."
-_SWEEPS = 200  # at least 10 s: on a busy machine a killed process takes a while to end
-# Consecutive sweeps that must find nothing; during exec a process has no environment.
+_SWEEPS = 200  # at least 10 s, since a killed process may end slowly on a busy machine
+# The number of consecutive sweeps that must find nothing. More than one is needed, since a process
+# has no environment during exec.
 _QUIET_SWEEPS = 3
 
 
@@ -31,10 +34,10 @@ _QUIET_SWEEPS = 3
 def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
     """End the processes marked with `folder` if this process dies within the context.
 
-    An exception of the type `lost` within the context has the same effect, as the cluster then does
-    not end its remaining processes.
+    An exception of the type `lost` within the context has the same effect, since a lost cluster
+    does not end its remaining processes.
     """
-    # The reaper runs as a script, which starts quickly; therefore this module imports no other
+    # The reaper runs as a script that must start quickly. This module therefore imports no other
     # module of the package.
     command = [sys.executable, "-I", __file__, str(folder)]
     reaper = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own module
@@ -76,12 +79,17 @@ def marked(folder: str) -> list[int]:
 
 
 def is_titled(process: Path) -> bool:
-    """Return whether a process, given as a folder of /proc, has a title set by Ray."""
+    """Return whether Ray has set the title of a process.
+
+    The process is specified as a folder of /proc.
+    """
     return (process / "cmdline").read_bytes().startswith(b"ray::")
 
 
 def has_open_files(process: Path, folder: str) -> bool:
-    """Return whether a process, given as a folder of /proc, has a file of `folder` open.
+    """Return whether a process has a file of `folder` open.
+
+    The process is specified as a folder of /proc.
 
     Raises:
         OSError: The process has ended, or belongs to another user.
@@ -94,8 +102,9 @@ def has_open_files(process: Path, folder: str) -> bool:
 
 
 def about(folder: str) -> list[int]:
-    """List the marked processes that no user started: their command line names the folder, or is
-    a title set by Ray.
+    """List the marked processes that were not started by a user.
+
+    Their command line contains the folder, or is a title set by Ray.
     """
     pids = []
     for pid in marked(folder):
@@ -118,7 +127,7 @@ def main() -> None:
         time.sleep(_GRACE_S)
 
     quiet_sweeps = 0
-    for _ in range(_SWEEPS):  # a process may have started another one before it was killed
+    for _ in range(_SWEEPS):  # a process may have started another process before it was killed
         pids = about(folder) if is_orderly else marked(folder)
         quiet_sweeps = 0 if pids else quiet_sweeps + 1
         if quiet_sweeps == _QUIET_SWEEPS:
@@ -128,7 +137,7 @@ def main() -> None:
                 os.kill(pid, signal.SIGKILL)
         time.sleep(0.05)
 
-    if not is_orderly:  # otherwise the driver removes it
+    if not is_orderly:  # otherwise the driver removes the folder
         shutil.rmtree(folder, ignore_errors=True)
 
 

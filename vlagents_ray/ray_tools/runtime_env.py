@@ -15,12 +15,13 @@ from vlagents_ray.errors import ConfigError
 _SECRET = re.compile(
     r"(^|_)(API|ACCESS)?KEY$|(TOKEN|SECRET|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?)$", re.IGNORECASE
 )
-_PASSWORD_IN_URL = re.compile(r"://[^/@\s:]*:(?!\$\{)[^/@\s]+@")  # pip replaces ${NAME} later
+# Pip later replaces ${NAME} with the value of the variable.
+_PASSWORD_IN_URL = re.compile(r"://[^/@\s:]*:(?!\$\{)[^/@\s]+@")
 
 
 def require_no_secrets(runtime_env: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if a variable in `env_vars` is named like a secret, or any URL
-    contains a password.
+    """Raise `ConfigError` if the name of a variable in `env_vars` looks like the name of a secret,
+    or any URL contains a password.
     """
     variables = runtime_env.get("env_vars") or {}
     secrets: list[str] = []
@@ -43,7 +44,7 @@ def require_no_secrets(runtime_env: Mapping[str, Any]) -> None:
 
 
 def _texts(value: object) -> Iterator[str]:
-    """Yield the texts in a value, also those in its mappings and lists; keys are left out."""
+    """Yield the texts in a value and in its nested mappings and lists. Keys are excluded."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, Mapping):

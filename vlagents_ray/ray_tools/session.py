@@ -1,5 +1,5 @@
-"""The connection of this process to a Ray cluster, which is either running already or started
-here.
+"""The connection of this process to a Ray cluster, which is already running or is started by this
+module.
 """
 
 from __future__ import annotations
@@ -29,31 +29,33 @@ log = logging.getLogger(__name__)
 
 HEAD_NODE = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
 _ATTEMPTS = 3
-# Without this setting, a driver whose head has ended waits 5 s to send its last events, which are
-# not used here.
+# With the default, a driver whose head has ended waits 5 s to send its last events, which this
+# package does not use.
 _CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
-# Options of the cluster, not of its driver.
+# Options of the cluster, not of the driver.
 _RESOURCES = ("num_cpus", "num_gpus", "resources", "object_store_memory")
 _FAILED = "Check failed: "  # prefix in the log of a daemon that aborted
-FILES = "ray"  # the folder of Ray's files in a `ray_folder`
+FILES = "ray"  # name of the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
-# The longest socket names in such a folder: Ray's, and HAProxy's, whose folder is named after the
-# node.
+# The longest socket names in such a folder: a socket of Ray, and a socket of HAProxy, whose folder
+# is named after the node.
 _SOCKETS = (
     f"{FILES}/session_2026-01-31_12-00-00_123456_1234567/sockets/.vla12345678",
     f"{'0' * 56}/admin.1234567.tmp",
 )
 _LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
-_REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
+# Number of attempts, 0.05 s apart, since a process that is ending may still write to the folder.
+_REMOVALS = 100
 _FILE = "server.json"  # written into the private folder of a server's Ray when the server is ready
 
-_TOKEN_FILE = "token"  # noqa: S105 - the token of the cluster, in its `ray_folder`
+_TOKEN_FILE = "token"  # noqa: S105 - name of the file with the cluster's token, in its `ray_folder`
 
 MODE, _TOKEN, _TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 # If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the
-# node's, so that all ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
+# node's address, so that all ports are bound to it. (Ray replaces an address given as
+# `_node_ip_address`.)
 ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-_started: list[Any] = []  # Ray's record of the daemons started by this process, at most one
+_started: list[Any] = []  # Ray's record of the daemons that this process has started, at most one
 
 
 @contextlib.contextmanager
@@ -63,12 +65,12 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
     Args:
         address: The address of the cluster. None selects the cluster of RAY_ADDRESS, or of this
             machine. The URL of a server on this machine selects that server's cluster. "auto"
-            selects the cluster of `ray start` or, without one, a server's. "local" starts a cluster
-            that ends with the context.
+            selects the cluster of `ray start` or, if there is none, the cluster of a server.
+            "local" starts a cluster that ends with the context.
         options: Further options of `ray.init`.
 
     Raises:
-        ConfigError: There is no such cluster, or it requires another token.
+        ConfigError: The cluster does not exist, or it requires another token.
     """
     import ray
 
@@ -86,8 +88,8 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 stack.enter_context(variables(token_variables(folder)))
                 with variables({MARK: str(folder)}):
                     start_ray(folder, **options)
-            # Without a cluster of `ray start`, Ray would try that of a server here, and wait for
-            # ten minutes.
+            # If there is no cluster of `ray start`, Ray would try the cluster of a server on this
+            # machine, and wait for ten minutes.
             elif url or (
                 where == "auto" and private.address_of_ray_start() is None and local_servers()
             ):
@@ -138,10 +140,11 @@ def token_variables(folder: Path) -> dict[str, str | None]:
     """Create the token of the cluster that is about to start, and return the variables that select
     it.
 
-    The token runs any code as this user. Ray itself would write one for all clusters of the user to
-    ~/.ray/auth_token, with the permissions of the umask, which usually let every account of the
-    machine read it. A token that the user or another cluster has set is replaced: only processes
-    that `join` reach this cluster, and `join` finds its token.
+    A process with the token can run any code as this user. Ray itself would write one token for all
+    clusters of the user to ~/.ray/auth_token, with the permissions of the umask, so that usually
+    every account of the machine can read it. A token that the user or another cluster has set is
+    replaced: only processes that call `join` can reach this cluster, and `join` finds the cluster's
+    token.
 
     Args:
         folder: The `ray_folder` of the cluster, which no other user can enter.
@@ -155,8 +158,9 @@ def token_variables(folder: Path) -> dict[str, str | None]:
 
 @contextlib.contextmanager
 def variables(values: Mapping[str, str | None]) -> Iterator[None]:
-    """Set environment variables for processes that are started within the context; None unsets
-    one.
+    """Set environment variables for processes that are started within the context.
+
+    The value None unsets a variable.
     """
     before = {name: os.environ.get(name) for name in values}
     _set_variables(values)
@@ -175,15 +179,15 @@ def _set_variables(values: Mapping[str, str | None]) -> None:
 
 
 def start_ray(folder: Path, **options: Any) -> None:
-    """Start a Ray cluster of this machine and join it; try again if the start times out.
+    """Start a Ray cluster on this machine and join it. The start is tried again if it times out.
 
     Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which can be too
     short on a busy machine or if Python's modules are on a slow disk. The next attempt is faster,
-    as the modules are cached by then. `leave_ray` ends the cluster.
+    since the modules are then cached. `leave_ray` ends the cluster.
 
     Args:
-        folder: A `ray_folder`, for the files of Ray. The output of its processes is in log files
-            there.
+        folder: A `ray_folder`, for the files of Ray. It also contains log files with the output of
+            Ray's processes.
         options: Further options of `ray.init`: resources, `logging_level`, `namespace`, ...
 
     Raises:
@@ -204,10 +208,11 @@ def start_ray(folder: Path, **options: Any) -> None:
                 ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
             node = node or private.node_that_failed(error)
-            # If nothing was started, time is not the cause.
+            # If no process was started, a timeout is not the cause.
             if node is None or not node.all_processes:
                 raise
-            node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
+            # Ray does not end these processes itself.
+            node.kill_all_processes(check_alive=False, wait=True)
             if isinstance(error, ValueError):  # an invalid option
                 raise
             reason = f"{error} {_daemon_error(node)}".rstrip()
@@ -229,13 +234,13 @@ def start_ray(folder: Path, **options: Any) -> None:
 
 
 def leave_ray() -> None:
-    """Leave the cluster, and end it if `start_ray` of this process started it."""
+    """Leave the cluster, and end it if this process has started it with `start_ray`."""
     import ray
 
     ray.shutdown()
     while _started:
         _started.pop().kill_all_processes(check_alive=False, wait=True)
-    private.reread_authentication()  # the next cluster has another token
+    private.reread_authentication()  # The next cluster has another token.
 
 
 def started_here() -> bool:
@@ -246,10 +251,11 @@ def started_here() -> bool:
 
 @contextlib.contextmanager
 def _taken_port() -> Iterator[int]:
-    """Yield a port that no other process can listen on, as the port of the unused dashboard.
+    """Yield a port that is already in use, as the port of the unused dashboard.
 
     Ray starts the dashboard's server even without a dashboard, for usage statistics, and waits 2 s
-    for it unless the port is taken. If it is, Ray logs an error, which is dropped here.
+    for it unless the port is in use. If the port is in use, Ray logs an error, which is dropped
+    here.
     """
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port: int = taken.getsockname()[1]
@@ -261,7 +267,7 @@ def _taken_port() -> Iterator[int]:
         logger.addFilter(is_shown)
         try:
             with warnings.catch_warnings():
-                # Ray does not close the socket of its attempt.
+                # Ray does not close the socket of its failed attempt.
                 warnings.simplefilter("ignore", ResourceWarning)
                 yield port
         finally:
@@ -269,8 +275,10 @@ def _taken_port() -> Iterator[int]:
 
 
 def _copy_logs(node: Any) -> Path:
-    """Copy a node's logs to a folder of this user, as the cluster's folder is about to be
-    removed; return the folder.
+    """Copy a node's logs to a folder of this user, since the cluster's folder is about to be
+    removed.
+
+    Return the new folder.
     """
     folder = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
     # After `shutil.Error`, which is an OSError, the other files have been copied.
@@ -280,7 +288,9 @@ def _copy_logs(node: Any) -> Path:
 
 
 def _daemon_error(node: Any) -> str:
-    """Return the reason why a node's daemon ended, from its log; "" if the log has none."""
+    """Return the reason why a node's daemon ended, from the daemon's log; "" if the log contains
+    no reason.
+    """
     try:
         text = (Path(node.get_logs_dir_path()) / "raylet.err").read_text(errors="replace")
     except OSError:
@@ -290,8 +300,8 @@ def _daemon_error(node: Any) -> str:
 
 
 def unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
-    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, since
-    `leave` would block.
+    """Return an exit callback for an `ExitStack` that calls `leave`, except if the head is lost,
+    since `leave` would block.
     """
 
     def end(kind: type[BaseException] | None, *_: object) -> None:
@@ -308,21 +318,22 @@ class LocalServer:
     url: str  # http(s)://host:port
     apps: tuple[str, ...]  # names of its applications, reached at serve://APP inside the cluster
     ray_address: str  # host:port of its Ray cluster
-    # Path of the token of that cluster, which runs any code as this user: `RAY_AUTH_TOKEN_PATH`.
+    # The path of that cluster's token, for `RAY_AUTH_TOKEN_PATH`. A process with the token can run
+    # any code as this user.
     token_file: str
 
 
 def join(server: str | None = None, **options: Any) -> LocalServer:
-    """Connect this process to the Ray cluster of a server on this machine, in place of `ray.init`.
+    """Connect this process to the Ray cluster of a server on this machine, instead of `ray.init`.
 
-    The server's Ray is on the loopback address, in a private folder, and requires a token:
-    `ray.init("auto")` finds it, but connects to another address of this machine, and times out
-    after minutes.
+    The server's Ray listens on the loopback address, uses a private folder, and requires a token.
+    `ray.init("auto")` finds the cluster, but connects to another address of this machine, and times
+    out after minutes.
 
     Actors and tasks of this process then run in that cluster, with the server's Python and with the
     modules of this process's script and working directory. `RemoteAgent("serve://APP")` reaches the
-    policy from this process and from each of them. They end with the server. `ray.shutdown()`
-    leaves the cluster; the server continues.
+    policy from this process and from each actor and task. The actors and tasks end with the server.
+    `ray.shutdown()` leaves the cluster; the server continues.
 
     Args:
         server: The URL of the server, or the name of one of its applications; required if several
@@ -330,7 +341,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         options: Further options of `ray.init`, such as `log_to_driver`.
 
     Returns:
-        The URL of the server, its applications, and the address and the token's file of its Ray
+        The URL of the server, its applications, and the address and the token file of its Ray
         cluster.
 
     Raises:
@@ -353,17 +364,18 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
             f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}"
         )
     _set_variables({MODE: "token", ALONE: "0", _TOKEN: None, _TOKEN_PATH: chosen.token_file})
-    private.use_loopback(True)  # Ray has already read the variables, when it was imported
+    private.use_loopback(True)  # Ray already read the variables when it was imported.
     private.reread_authentication()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
     return chosen
 
 
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
-    """Announce the server of this process's Ray, which is ready, in a file that other programs of
+    """Announce that the server of this process's Ray is ready, in a file that other programs of
     this user can find.
 
-    `apps` are its applications by name, and `ray_address` is host:port of its Ray cluster.
+    `apps` contains the names of its applications, and `ray_address` is host:port of its Ray
+    cluster.
     """
     folder = Path(os.environ[MARK])
     server = LocalServer(url, tuple(apps), ray_address, str(folder / _TOKEN_FILE))
@@ -389,8 +401,8 @@ def metrics_urls() -> tuple[str, ...]:
 
 
 def cluster_id() -> str:
-    """Return the id of this process's cluster: that of its head node, which is another one after
-    the cluster was started again.
+    """Return the id of this process's cluster: the id of its head node, which changes when the
+    cluster is started again.
     """
     import ray
 
@@ -399,7 +411,7 @@ def cluster_id() -> str:
 
 
 def _choose(url_or_app: str | None) -> LocalServer:
-    """Return the server with this URL or application; the only server for None."""
+    """Return the server with this URL or application. With None, return the only server."""
     servers = local_servers()
     fitting = servers
     if url_or_app is not None:
@@ -427,7 +439,7 @@ def _choose(url_or_app: str | None) -> LocalServer:
 
 
 def _running_servers() -> Iterator[LocalServer]:
-    """Yield the servers of this user on this machine, by the daemons of their Rays."""
+    """Yield the servers of this user on this machine, which are found through their Ray daemons."""
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
@@ -441,8 +453,9 @@ def _running_servers() -> Iterator[LocalServer]:
             server = LocalServer(**{**content, "apps": tuple(content["apps"])})
             address = f"--gcs-address={server.ray_address}"
         except (OSError, KeyError, ValueError, TypeError):
-            # The process has ended, is another user's, or its server is not announced.
+            # The process has ended or belongs to another user, or its server is not announced yet.
             continue
-        # A killed cluster may have left the folder, and another cluster may use it now.
+        # A killed cluster may have left its folder behind, and another cluster may use the folder
+        # now.
         if any(address in os.fsdecode(word) for word in words):
             yield server

@@ -202,7 +202,7 @@ def interrupts() -> Iterator[None]:
     """Raise `KeyboardInterrupt` on Ctrl-C and SIGTERM within the context, and record the signal.
 
     Python drops an exception that a handler raises while a destructor or a callback of Ray's C code
-    runs; in that case `raise_dropped_interrupt` raises it later. Outside the main thread, where
+    runs. In that case, `raise_dropped_interrupt` raises it later. Outside of the main thread, where
     Python delivers no signals, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -242,8 +242,8 @@ def raise_dropped_interrupt() -> None:
 def own_sigterm() -> Iterator[None]:
     """Preserve this process's SIGTERM handler during `ray.init`.
 
-    Ray installs a handler whose alarm aborts the process three seconds later, during an orderly
-    exit. If the process had no handler, Ray's remains.
+    Ray installs a handler that sets an alarm, which aborts the process three seconds later, during
+    an orderly exit. If the process had no handler, Ray's handler remains.
     """
     before = signal.getsignal(signal.SIGTERM)
     if not callable(before) or threading.current_thread() is not threading.main_thread():

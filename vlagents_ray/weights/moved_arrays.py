@@ -1,8 +1,8 @@
 """JAX arrays that are in the memory of the host while a policy sleeps.
 
 A JAX array never changes, and has no memory that could be freed while references to the array
-remain. So an `ArrayOnHost` takes its place in dicts and in the policy. As in `trainable`, JAX is
-never imported here.
+remain. An `ArrayOnHost` therefore replaces the array in dicts and in the policy. As in the module
+`trainable`, JAX is never imported here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayOnHost:
-    """The numbers of a JAX array, and where it was."""
+    """The numbers of a JAX array, and the device on which it was."""
 
     numbers: np.ndarray
     sharding: Any
@@ -36,11 +36,12 @@ class ArrayOnHost:
 class MovedArrays:
     """The JAX arrays of one policy that were moved to the host.
 
-    Values may have common arrays, of which one copy is made in each direction.
+    An array that several values share is copied only once in each direction.
     """
 
     def __init__(self) -> None:
-        self._on_host: dict[int, ArrayOnHost] = {}  # by the identity of the array
+        # Copies on the host by the identity of the array.
+        self._on_host: dict[int, ArrayOnHost] = {}
         self._restored: dict[int, Any] = {}  # arrays by the identity of the `ArrayOnHost`
 
     @property
@@ -51,10 +52,11 @@ class MovedArrays:
     def to_host(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return values in which no array is on an accelerator.
 
-        The memory of an array is freed when nothing refers to it any more.
+        The memory of an array is freed when no reference to it remains.
 
         Args:
-            values: The values by name; values that are not such arrays stay.
+            values: The values by name; values that are not JAX arrays on an accelerator stay
+                unchanged.
         """
         moved: dict[str, Any] = {}
         for name, value in values.items():
@@ -67,11 +69,11 @@ class MovedArrays:
         return moved
 
     def from_host(self, values: dict[str, Any]) -> None:
-        """Replace each `ArrayOnHost` by an equal array where the original one was.
+        """Replace each `ArrayOnHost` with an equal array on the device of the original array.
 
         Args:
-            values: The values by name. After an error, those that did not fit are still on the
-                host, and a later call continues.
+            values: The values by name. After an error, the arrays that did not fit into memory are
+                still on the host, and a later call continues.
         """
         for name, value in values.items():
             if isinstance(value, ArrayOnHost):
@@ -87,7 +89,7 @@ class MovedArrays:
 
 
 def is_on_accelerator(value: Any) -> bool:
-    """Return whether a value is a JAX array on another device than a CPU."""
+    """Return whether a value is a JAX array on a device other than a CPU."""
     jax = sys.modules.get("jax")
     if jax is None or not isinstance(value, jax.Array):
         return False

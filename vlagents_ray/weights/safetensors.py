@@ -21,10 +21,11 @@ import numpy as np
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
 from vlagents_ray.naming import without_duplicate_keys
 
-# Longest message with weights: a header (about 40,000 values), or some of the values' bytes.
+# The size of the longest message with weights, which contains a header (about 40,000 values) or a
+# part of the values' bytes.
 MESSAGE_BYTES = 2**22
-# Number of bytes that are sent at once. While a replica reads more, inference calls wait for
-# Python's lock.
+# The number of bytes that are sent at once. With larger pieces, inference calls of the reading
+# replica would wait longer for Python's lock.
 PART_BYTES = 2**20
 _LENGTH = struct.Struct("<Q")
 _NAME_LENGTH = 512  # longest name of a value, characters
@@ -43,7 +44,7 @@ _CODES = {dtype: code for code, dtype in _TYPES.items()}
 
 @dataclass(frozen=True, slots=True)
 class ValueSpec:
-    """Type and shape of one value, whose bytes follow those of the previous value."""
+    """The type and shape of one value. Its bytes follow the bytes of the previous value."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -64,7 +65,7 @@ def header_of(values: Mapping[str, np.ndarray]) -> bytes:
         The length of the header in 8 bytes, and the header.
 
     Raises:
-        InvalidWeights: The format lacks the type of a value.
+        InvalidWeights: The format does not support the type of a value.
     """
     document = {}
     begin = 0
@@ -91,7 +92,7 @@ def parts_of(values: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iter
 
     Args:
         values: The values by name.
-        length: The number of bytes that are yielded at once; the last time it may be fewer.
+        length: The number of bytes that are yielded at once. The last piece may be shorter.
     """
     buffer = bytearray()
     for value in values.values():
@@ -118,7 +119,7 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
         bytes.
 
     Raises:
-        MalformedMessage: The data are not a header or too long, or the offsets of the values
+        MalformedMessage: The data are not a header, or are too long, or the offsets of the values
             overlap, leave gaps or do not fit the shapes.
     """
     announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
@@ -160,8 +161,8 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
 
 
 def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
-    """Check a value's entry in a header; return the begin and the end of its bytes, its type and
-    its shape.
+    """Check a value's entry in a header, and return the value's type and shape and the begin and
+    end of its bytes.
     """
     if len(name) > _NAME_LENGTH:
         raise MalformedMessage(
@@ -194,7 +195,10 @@ def _are_whole(numbers: Any) -> bool:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number of a JSON text; very long ones would take too much time."""
+    """Parse a whole number of a JSON text.
+
+    Very long numbers are rejected, since parsing them would take too much time.
+    """
     if len(text) > _DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
@@ -210,14 +214,14 @@ class ValuesReader:
 
     def __init__(self, specs: Mapping[str, ValueSpec]) -> None:
         self._values: dict[str, np.ndarray] = {}
-        self._pending = deque(specs.items())  # the values of which no byte has arrived
+        self._pending = deque(specs.items())  # values of which no byte has arrived yet
         # The bytes of the current value that have not arrived yet.
         self._missing = np.empty(0, np.uint8)
         self.received = 0  # the number of bytes that have arrived
         self.size = sum(spec.size for spec in specs.values())  # the number of all bytes
 
     def add(self, data: bytes) -> None:
-        """Append the next bytes.
+        """Add the next bytes.
 
         Args:
             data: The bytes, of one value or several.
@@ -274,7 +278,7 @@ def write_values(file: BinaryIO, values: Mapping[str, np.ndarray]) -> None:
         values: The values by name.
 
     Raises:
-        InvalidWeights: The format lacks the type of a value.
+        InvalidWeights: The format does not support the type of a value.
     """
     file.write(header_of(values))
     file.writelines(parts_of(values))

@@ -1,10 +1,10 @@
-"""Values on a GPU that another process copies from their memory, through CUDA's handles for the
-memory of other processes.
+"""Values on a GPU that another process copies directly from GPU memory, through CUDA's interprocess
+memory handles.
 
-A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes of
-the same node that use the same GPU, while the process that made it keeps the memory: see the
+A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes on
+the same node that use the same GPU, while the process that created it keeps the memory: see the
 section on interprocess communication of https://docs.nvidia.com/cuda/cuda-c-programming-guide/. As
-in `trainable`, torch is never imported here.
+in the module `trainable`, torch is never imported here.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class StorageHandle:
     """The memory of one or more values."""
 
     allocation: bytes  # CUDA's handle of the allocation that contains the memory
-    size: int  # bytes
-    begin: int  # the first byte in the allocation
-    counters: bytes  # name of torch's shared file with the counts of readers
+    size: int  # size of the memory, bytes
+    begin: int  # offset of the memory in the allocation, bytes
+    counters: bytes  # name of torch's shared file with the reader counts
     counter: int  # index of the memory's count in that file
 
 
@@ -44,9 +44,9 @@ class StorageHandle:
 class ValueView:
     """One value in shared memory."""
 
-    storage: int  # its key in `SharedValues.storages`
-    dtype: str  # dtype of torch: "float32", "bfloat16", …
-    begin: int  # first element in the storage
+    storage: int  # key of the memory in `SharedValues.storages`
+    dtype: str  # name of a torch dtype: "float32", "bfloat16", …
+    begin: int  # index of the first element in the storage
     shape: tuple[int, ...]
     stride: tuple[int, ...]  # elements
 
@@ -55,13 +55,13 @@ class ValueView:
 class SharedValues:
     """Values by name, most of which are in memory of one GPU."""
 
-    gpu: str  # UUID
-    storages: dict[int, StorageHandle]  # by their addresses in the learner's process
+    gpu: str  # UUID of the GPU
+    storages: dict[int, StorageHandle]  # handles by the memory's address in the learner's process
     views: dict[str, ValueView]
     others: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything except `others` as JSON values, which `from_json` reads."""
+        """Return all fields except `others` as JSON values for `from_json`."""
         storages = {}
         for address, handle in self.storages.items():
             storages[str(address)] = [
@@ -95,23 +95,24 @@ class SharedValues:
 
 
 def gpu_of(values: Mapping[str, Any]) -> str:
-    """Return the UUID of the GPU that holds all values of GPUs; empty if there is not exactly one
-    such GPU.
+    """Return the UUID of the GPU that contains all values on GPUs; empty if there is not exactly
+    one such GPU.
     """
     gpus = {_MEMORY.gpu(value) for value in values.values()} - {""}
     return gpus.pop() if len(gpus) == 1 else ""
 
 
 def readable_gpus(gpu: str) -> tuple[str, ...]:
-    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, itself included;
-    none if `gpu` is empty.
+    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, including `gpu`.
+
+    The result is empty if `gpu` is empty.
     """
     return _MEMORY.readable(gpu) if gpu else ()
 
 
 @contextmanager
 def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Share values with another process, which reads the memory of the GPU, within the context.
+    """Share values within the context with another process, which reads the memory of the GPU.
 
     The values must not change meanwhile.
 
@@ -125,7 +126,7 @@ def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
         NotShared: CUDA cannot share this kind of memory.
     """
     with ExitStack() as stack:
-        stack.callback(_MEMORY.collect)  # after all handles have ended
+        stack.callback(_MEMORY.collect)  # called after all handles have been released
         others: dict[str, Any] = {}
         shared_values = SharedValues(gpu_of(values_by_name), {}, {}, others)
         devices = set()
@@ -137,7 +138,7 @@ def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
             devices.add(value.device)
             storage = value.untyped_storage()
             address = storage.data_ptr()
-            if address not in shared_values.storages:  # tied values have one storage
+            if address not in shared_values.storages:  # Tied values share one storage.
                 handle = stack.enter_context(_MEMORY.handed_over(storage))
                 shared_values.storages[address] = handle
             shared_values.views[name] = ValueView(
@@ -155,8 +156,9 @@ def shared(values_by_name: Mapping[str, Any]) -> Iterator[SharedValues]:
 
 @contextmanager
 def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
-    """Open the values of another process; values on a GPU are not copied, so the caller copies them
-    within the context.
+    """Open the values of another process.
+
+    Values on a GPU are not copied, so the caller must copy them within the context.
 
     Args:
         values: The handles and values that `shared` yields in the other process.
@@ -193,22 +195,24 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
         for device in devices:
             _MEMORY.finish(device)
     finally:
-        # The frames of an error may refer to it, which would keep the memory of the other process.
+        # The frames of an error may keep a reference to it, and thereby the memory of the other
+        # process.
         values_by_name.clear()
 
 
-_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where torch's file of counts is
-_FIRST_COUNT = 64  # the number of bytes before the counts in that file
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - the folder of torch's file of counts
+_FIRST_COUNT = 64  # number of bytes before the counts in the file
 _COUNT = 8  # the number of bytes of a count
 
 
 @contextmanager
 def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
-    """Let torch free memory that it has shared after this context, however often it was read.
+    """Let torch free the memory that it has shared in this context, however many processes have
+    read it.
 
-    Torch keeps such memory as long as its count of readers is not 0. The count is 1 at first, and
-    each reader that ends subtracts 1. So the count is wrong if there was no reader or more than
-    one; as it is unsigned, it is then never 0 again.
+    Torch keeps such memory while the count of its readers is not 0. The count is initially 1, and
+    each reader subtracts 1 when it ends. Without a reader, or with several readers, the count is
+    therefore wrong; since it is unsigned, it would never become 0.
 
     Args:
         counters: The name of torch's file of counts, which exists now.
@@ -225,8 +229,8 @@ def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
 
 
 def _count(counters: bytes, counter: int) -> memoryview | None:
-    """Return the bytes of a count; None, with a warning, if the file is not laid out as
-    expected.
+    """Return the bytes of a count; None, with a warning, if the file does not have the expected
+    layout.
     """
     begin = _FIRST_COUNT + _COUNT * counter
     try:
@@ -242,7 +246,7 @@ def _count(counters: bytes, counter: int) -> memoryview | None:
     return None
 
 
-@lru_cache(maxsize=16)  # once for each reason, and not for each value
+@lru_cache(maxsize=16)  # logged once for each reason, not for each value
 def _warn_of_counts(reason: str) -> None:
     logger.warning(
         "torch's counts of readers cannot be set (%s): memory that was pushed to replicas on the "
@@ -252,31 +256,37 @@ def _warn_of_counts(reason: str) -> None:
     )
 
 
-@lru_cache(maxsize=4)  # torch begins another file after 10,000 values
+@lru_cache(maxsize=4)  # Torch begins another file after 10,000 values.
 def _counts(counters: bytes) -> mmap.mmap:
-    """Map torch's file of counts; the mapping stays valid when torch removes the file."""
+    """Map torch's file of counts into memory.
+
+    The mapping stays valid when torch removes the file.
+    """
     with open(_SHARED_MEMORY / counters.decode().lstrip("/"), "r+b") as file:
         return mmap.mmap(file.fileno(), 0)
 
 
 class _GpuMemory:
-    """Shares memory of GPUs. Tests replace it, to share memory of the CPU if there is no GPU."""
+    """Shares memory of GPUs.
+
+    Tests replace this object to share CPU memory on machines without a GPU.
+    """
 
     def gpu(self, value: Any) -> str:
-        """Return the UUID of the GPU that holds a value; empty if none does."""
+        """Return the UUID of the GPU that contains a value; empty if the value is not on a GPU."""
         torch = sys.modules.get("torch")
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
-        # An empty tensor has no memory, and a sparse one has several.
+        # An empty tensor has no memory block, and a sparse tensor has several.
         has_one_memory = value.layout == torch.strided and value.numel()
         return self._uuid(value.device) if value.is_cuda and has_one_memory else ""
 
     def finish(self, device: Any) -> None:
-        """Wait for the work that this thread has queued on a GPU, since another process does not
-        wait for it.
+        """Wait for the work that this thread has queued on a GPU, since other processes do not wait
+        for it.
 
-        Only the current stream is waited for; waiting for the device would abort graph captures of
-        other threads.
+        This synchronizes only the current stream. Synchronizing the device would abort graph
+        captures of other threads.
         """
         sys.modules["torch"].cuda.current_stream(device).synchronize()
 
@@ -284,9 +294,9 @@ class _GpuMemory:
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
         """Yield a handle of a torch storage for another process."""
         torch = sys.modules["torch"]
-        # Each call of `_share_cuda_` permanently wraps the memory of the storage once more. It is
-        # therefore called on another storage of the same memory, and the learner's own stays
-        # unchanged, however often it is pushed.
+        # Each call of `_share_cuda_` permanently adds a wrapper to the memory of the storage. It is
+        # therefore called on another storage of the same memory. The learner's own storage stays
+        # unchanged, however often its values are pushed.
         whole = torch.empty(0, dtype=torch.uint8, device=storage.device).set_(storage)
         alias = torch.from_dlpack(whole).untyped_storage()
         try:
@@ -299,19 +309,21 @@ class _GpuMemory:
             yield StorageHandle(allocation, size, begin, counters, counter)
 
     def collect(self) -> None:
-        """Free the memory that was handed over, if nothing else refers to it."""
+        """Free the memory that was handed over, if no other reference to it remains."""
         torch = sys.modules.get("torch")
         if torch is not None and torch.cuda.is_initialized():
             torch.cuda.ipc_collect()
 
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
-        """Return the storage of another process; raises `RuntimeError` if it cannot be reached."""
+        """Return the storage of another process; raises `RuntimeError` if the storage cannot be
+        opened.
+        """
         torch = sys.modules["torch"]
         uuids = self._visible_uuids()
         if gpu not in uuids:
             raise RuntimeError("this process does not use that GPU")
-        # The last two are an event to wait for, which torch would never free here, and whether
-        # there is one. The sender has already waited, see `finish`.
+        # The last two arguments are an event to wait for, which torch would never free here, and
+        # whether an event is used. The sender has already waited, see `finish`.
         return torch.UntypedStorage._new_shared_cuda(
             uuids.index(gpu),
             handle.allocation,
@@ -337,7 +349,9 @@ class _GpuMemory:
         return tuple(readable)
 
     def _visible_uuids(self) -> list[str]:
-        """Return the UUIDs of the GPUs that this process sees, by torch's index."""
+        """Return the UUIDs of the GPUs that are visible to this process, in the order of torch's
+        indices.
+        """
         count = sys.modules["torch"].cuda.device_count()
         return [self._uuid(device) for device in range(count)]
 

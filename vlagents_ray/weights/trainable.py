@@ -24,15 +24,16 @@ import numpy as np
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 
 _BFLOAT16 = np.dtype("V2")
-_SHOWN = 5  # most faults in a message
-_THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
-# 4-byte words of a value that are summed at once for a fingerprint.
+_SHOWN = 5  # largest number of faults in a message
+_THREADS = 4  # number of threads that compute a fingerprint; numpy releases Python's lock
+# The number of 4-byte words of a value that are summed at once for a fingerprint.
 _WORDS = 2**20
-# Pieces of so many words that are summed together on a GPU, in which case they take 112 MiB.
+# The number of pieces, of `_WORDS` words each, that are summed together on a GPU. This takes 112
+# MiB.
 _PIECES = 8
 # The odd factor by which the sum of a fingerprint is multiplied before the next words are added.
 _FACTOR = -7046029254386353131
-# Operations that need further memory work on this number of elements of a tensor at once.
+# The number of elements of a tensor that an operation processes at once if it needs further memory.
 _AT_ONCE = 2**24
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
@@ -50,7 +51,7 @@ def named_values(trainable: Any) -> dict[str, Any]:
         NotTrainable: The object is something else.
     """
     if _is_module(trainable):
-        # A module may add state other than tensors (`get_extra_state`), which a learner does not
+        # A module may have state other than tensors (`get_extra_state`), which a learner does not
         # train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
 
@@ -65,15 +66,15 @@ def named_values(trainable: Any) -> dict[str, Any]:
 
 
 def set_values(trainable: Any, values: Mapping[str, Any]) -> None:
-    """Replace values of a trainable object with others of the same shapes, types and devices.
+    """Replace values of a trainable object with new values of the same shapes, types and devices.
 
-    Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have
-    recorded. All others are replaced by reference, which takes no time and no memory; `values` must
-    not be changed afterwards.
+    Values on a GPU are copied to the addresses of the old values, which a CUDA graph may have
+    recorded. Other values are replaced by reference, which takes no time and no memory, so `values`
+    must not be changed afterwards.
 
     Args:
         trainable: The object, as for `named_values`.
-        values: The new values by name; a value whose name is missing stays.
+        values: The new values by name. A value whose name is missing stays unchanged.
     """
     if _is_module(trainable):
         _set_values_of_module(trainable, values)
@@ -95,7 +96,7 @@ def set_values(trainable: Any, values: Mapping[str, Any]) -> None:
 
 
 def _set_values_of_module(module: Any, values: Mapping[str, Any]) -> None:
-    """Replace values of a torch module, as `set_values`."""
+    """Replace values of a torch module, as `set_values` does."""
     tensors = dict(module.named_buffers(remove_duplicate=False))
     tensors |= module.named_parameters(remove_duplicate=False)
     with sys.modules["torch"].no_grad():
@@ -142,8 +143,8 @@ def evaluation_mode(trainable: Any) -> Iterator[None]:
 
 
 def is_copied(trainable: Any) -> bool:
-    """Return whether `set_values` copies into the memory of the old values, so that references
-    to these change.
+    """Return whether `set_values` copies into the memory of the old value, so that references to
+    the old value see the new one.
     """
     return has_gpu_tensors(named_values(trainable))
 
@@ -154,8 +155,9 @@ def has_gpu_tensors(values: Mapping[str, Any]) -> bool:
 
 
 def portable(value: Any) -> np.ndarray:
-    """Convert a value to a numpy array that every process can read, without a copy if it is on the
-    CPU.
+    """Convert a value to a numpy array that every process can read.
+
+    A value on the CPU is not copied.
 
     A bfloat16, which numpy does not have, becomes two bytes of type `V2`, as `converted` and
     `dtype_name` expect.
@@ -170,8 +172,9 @@ def portable(value: Any) -> np.ndarray:
 
 
 def on_host(value: Any) -> Any:
-    """Return a tensor in the memory of the host, contiguous; it is copied only if it is on a
-    GPU, or not contiguous.
+    """Return a contiguous tensor in the memory of the host.
+
+    It is copied only if it is on a GPU or not contiguous.
     """
     value = value.detach()
     if value.is_cuda:
@@ -184,8 +187,8 @@ def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
 
     Args:
         first: The tensors by name.
-        second: Tensors of the same names, shapes and devices. Names of `first` that share memory
-            (see `are_apart`) must share it in `second`, as in a result of `completed`.
+        second: Tensors with the same names, shapes and devices. Names that share memory in `first`
+            (see `are_apart`) must also share memory in `second`, as in a result of `completed`.
     """
     with sys.modules["torch"].no_grad():
         untied = {memory_of(name, value): (name, value) for name, value in first.items()}
@@ -199,11 +202,10 @@ def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
 
 
 def memory_of(name: str, value: Any) -> Any:
-    """Return a key that is equal for two values of a module that are tied, i.e. that are in the
-    same memory.
+    """Return a key that is equal for tied values of a module, i.e. values in the same memory.
 
     Args:
-        name: The name of the value, which is the key of a value without memory.
+        name: The name of the value, which is the key if the value has no memory.
         value: The value.
     """
     if not _is_tensor(value) or value.layout != sys.modules["torch"].strided or not value.numel():
@@ -230,7 +232,7 @@ def own_copy(value: Any) -> Any:
     """Return a copy of a value in memory that is not shared."""
     if _is_tensor(value):
         return value.detach().clone()
-    return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
+    return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change.
 
 
 def own_copies(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -257,10 +259,10 @@ def own_copies(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _copy_together(pairs: Iterable[tuple[Any, Any]]) -> None:
-    """Copy tensors into others on the same GPU.
+    """Copy tensors into other tensors on the same GPU.
 
-    All tensors of the same types are copied by one operation: one for each of hundreds of tensors
-    would delay inference calls, with which they share the GPU and Python's lock.
+    All tensors of the same types are copied in one operation. An operation for each of hundreds of
+    tensors would delay inference calls, which use the same GPU and Python's lock.
 
     Args:
         pairs: Tensors to copy, each with the tensor into whose memory it is copied.
@@ -289,12 +291,12 @@ def converted(value: Any, current: Any) -> Any:
     """Convert a value to the type, precision and device of another one, in memory that is not
     shared.
 
-    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if
+    Numpy arrays in memory that nothing can write, such as Ray's objects, are not copied if
     `current` is on the CPU.
 
     Args:
         value: The value.
-        current: The value whose type, precision and device it gets.
+        current: The value with the type, precision and device of the result.
     """
     if _is_tensor(current):
         torch = sys.modules["torch"]
@@ -304,7 +306,7 @@ def converted(value: Any, current: Any) -> Any:
             array = _unchanging(np.asarray(value))
             is_bfloat16 = array.dtype.kind == "V"
             with warnings.catch_warnings():
-                # torch warns of a read-only array, but nothing writes into it.
+                # Torch warns about a read-only array, but nothing writes into this one.
                 warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)
                 tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
             tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
@@ -324,13 +326,13 @@ def converted(value: Any, current: Any) -> Any:
 
 
 def _room_for(value: Any) -> Any:
-    """Return memory for a value of the same shape, type and device, which is contiguous."""
+    """Return contiguous memory for a value of the same shape, type and device."""
     torch = sys.modules["torch"]
     return torch.empty_like(value, memory_format=torch.contiguous_format)
 
 
 def dtype_name(value: Any) -> str:
-    """Return the name of a value's type without that of its library: "float32", "bfloat16", …."""
+    """Return the name of a value's type without its library, such as "bfloat16"."""
     return "bfloat16" if value.dtype == _BFLOAT16 else str(value.dtype).rpartition(".")[2]
 
 
@@ -340,7 +342,7 @@ def is_array(value: Any) -> bool:
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, container and key of each array or torch module."""
+    """Yield the name, the container and the key of each array or torch module."""
     if not isinstance(tree, dict | list):
         at = f" at {path.rstrip('/')!r}" if path else ""
         raise NotTrainable(
@@ -366,8 +368,9 @@ def _unchanging(array: np.ndarray) -> np.ndarray:
 
 
 def to_numpy(value: Any) -> np.ndarray:
-    """Convert an array or tensor to a type that numpy has: a bfloat16 is the upper half of a
-    float32.
+    """Convert an array or tensor to a type that numpy has.
+
+    A bfloat16 becomes a float32, of which it is the upper half.
     """
     array = portable(value)
     if array.dtype != _BFLOAT16:
@@ -388,13 +391,14 @@ def _is_module(value: Any) -> bool:
 def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -> None:
     """Move torch tensors from GPUs to the host.
 
-    The tensors stay the same objects, with the same views and ties; until `from_host` they must not
-    be read.
+    The tensors stay the same objects, with the same views and ties. They must not be read until
+    `from_host` has been called.
 
     Args:
-        groups: Groups of values by name; values that are not on a GPU stay.
-        moved: A list to which each moved memory is appended: the GPU's, which has no bytes then,
-            and the host's. After an error, it has what was moved before.
+        groups: Groups of values by name. Values that are not on a GPU stay unchanged.
+        moved: A list to which a pair is appended for each moved storage: the storage on the GPU,
+            which is then empty, and its copy on the host. After an error, the list contains the
+            storages that were moved before it.
     """
     tensors = []
     for values in groups:
@@ -406,7 +410,7 @@ def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -
     }
 
     for storage in storages.values():
-        if storage.resizable():  # otherwise it belongs to another library or process
+        if storage.resizable():  # otherwise the memory belongs to another library or process
             host_storage = sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage)
             moved.append((storage, host_storage))
             storage.resize_(0)
@@ -420,8 +424,8 @@ def from_host(moved: list[tuple[Any, Any]]) -> None:
     """Move tensors back to their GPUs, to other addresses.
 
     Args:
-        moved: The list that `to_host` filled, which is emptied. After an error, it has the memory
-            that was not moved yet.
+        moved: The list that `to_host` filled. It is emptied. After an error, it contains the
+            storages that were not moved yet.
     """
     while moved:
         storage, host_storage = moved[-1]
@@ -431,37 +435,38 @@ def from_host(moved: list[tuple[Any, Any]]) -> None:
 
 
 # The following functions work on a GPU at the same time as the inference calls of a policy: on
-# other streams, and with pinned memory that is used again.
+# other streams, and with reusable pinned memory.
 #
 # All threads share torch's default stream, on which the inference calls are queued. A thread that
-# waits for its work there also waits for all calls that were queued before, and CUDA copies
-# pageable memory in turn with them.
+# waits for its work on that stream also waits for all calls that were queued before it, and CUDA
+# executes copies of pageable memory in the same order.
 
-# Bytes of each of two buffers, one of which is filled while the other one is copied.
+# The size of each of two buffers, bytes. One buffer is filled while the other is copied.
 _BUFFER_BYTES = 2**25
 _LOCK = threading.Lock()
-# By device: the stream of copies, and two buffers of pinned memory, each with the event at the end
+# Device -> the stream of copies, and two buffers of pinned memory, each with the event at the end
 # of its last copy.
 _COPY_BUFFERS: dict[Any, tuple[Any, list[tuple[Any, Any]]]] = {}
-# By device: the stream of `beside_acts`. A device has only one, as torch reuses freed memory only
-# on the stream on which it was allocated.
+# Device -> the stream of `beside_acts`. Each device has only one stream, since torch reuses freed
+# memory only on the stream on which it was allocated.
 _BESIDE: dict[Any, Any] = {}
 
 
 @contextmanager
 def beside_acts(device: Any, *, waits: bool = True) -> Iterator[None]:
-    """Run this thread's work on a GPU within the context on another stream than the inference
-    calls, and wait for it at the end.
+    """Within the context, run this thread's GPU work on a stream other than the stream of the
+    inference calls.
 
-    Memory that is allocated within the context may be used again within the next one as soon as it
-    is freed, so that work of other streams on it must be over then.
+    The end of the context waits for the work. Memory that is allocated within the context may be
+    reused in the next context as soon as it is freed. Work of other streams on that memory must be
+    complete by then.
 
     Args:
         device: The GPU; None for the current one. The context does nothing for "cpu", or while the
             process uses no GPU.
-        waits: Whether the work begins after the work that was queued on the current stream before,
-            which may be that of inference calls. Without it, the work reads only what earlier
-            contexts have written, and what is not written any more.
+        waits: Whether the work begins after the work that is already queued on the current stream,
+            which may belong to inference calls. If False, the work may read only memory that
+            earlier contexts have written, and memory to which nothing writes any more.
     """
     torch = sys.modules.get("torch")
     if torch is None or device == "cpu" or not torch.cuda.is_initialized():
@@ -480,10 +485,10 @@ def beside_acts(device: Any, *, waits: bool = True) -> Iterator[None]:
 
 
 def copy(source: Any, target: Any) -> Any:
-    """Copy a tensor into another one.
+    """Copy a tensor into another tensor.
 
-    If only one of them is on a GPU, the copy begins after the work that this thread has queued
-    there, and is over when this function returns.
+    If only one of the tensors is on a GPU, the copy begins after the work that this thread has
+    queued on that GPU, and is complete when this function returns.
 
     Args:
         source: The tensor to copy.
@@ -499,7 +504,7 @@ def copy(source: Any, target: Any) -> Any:
 
         on_gpu = source if source.is_cuda else target
         device, dtype = on_gpu.device, on_gpu.dtype
-        length = _BUFFER_BYTES // dtype.itemsize  # elements that are copied at once
+        length = _BUFFER_BYTES // dtype.itemsize  # number of elements that are copied at once
         with _LOCK, torch.cuda.device(device):
             stream, buffers = _copy_buffers(device)
             stream.wait_stream(torch.cuda.current_stream(device))
@@ -522,7 +527,7 @@ def copy(source: Any, target: Any) -> Any:
                             event.synchronize()
                             target_piece.copy_(pinned)
             finally:
-                # The memory may be freed, or used on other streams, when this function returns.
+                # After this function returns, the memory may be freed or used on other streams.
                 stream.synchronize()
     return target
 
@@ -539,29 +544,29 @@ def _copy_buffers(device: Any) -> tuple[Any, list[tuple[Any, Any]]]:
     return _COPY_BUFFERS[device]
 
 
-# The following functions check that pushed values fit those of a policy, and compute a digest.
+# The following functions check that pushed values fit the values of a policy, and compute a digest.
 
 
 def accepted(
     current: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False
 ) -> dict[str, Any]:
-    """Check pushed values, and convert them to the types and devices of the current ones.
+    """Check pushed values, and convert them to the types and devices of the current values.
 
     Only the types, devices and shapes of the current values are read, except where pushed values
-    are not finite. Names whose current values are tied get the same value, the last one that was
-    pushed.
+    are not finite. Names whose current values are tied receive the same value, namely the last one
+    that was pushed.
 
     Args:
         current: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
-        partial: Whether names may be missing, as in a push of adapters alone.
+        partial: Whether names may be missing, as in a push of adapters only.
 
     Returns:
-        The converted values by name; a name that is tied to a pushed one is included.
+        The converted values by name, including names that are tied to a pushed name.
 
     Raises:
         InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type,
-            or is neither finite nor equal to the current one.
+            or is neither finite nor equal to the current value.
     """
     require_fit(current, pushed, partial=partial)
     memories = {name: memory_of(name, value) for name, value in current.items()}
@@ -573,7 +578,7 @@ def accepted(
     finite |= {name: _is_finite(value) for name, value in values.items() if not finite.get(name)}
     finite |= _fetched({name: result for name, result in finite.items() if _is_tensor(result)})
 
-    # Constants of a module, such as masks of attention, may be infinite: a learner pushes them
+    # Constants of a module, such as attention masks, may be infinite. A learner pushes them
     # unchanged.
     faults: list[str] = []
     for name, is_finite in finite.items():
@@ -586,7 +591,8 @@ def accepted(
 def _all_converted(
     current: Mapping[str, Any], pushed: Mapping[str, Any], names: Mapping[Any, str]
 ) -> dict[Any, Any]:
-    """Convert pushed values as `converted` does, in few operations if they are on the GPU already.
+    """Convert pushed values as `converted` does, but in few operations if they are already on the
+    GPU.
 
     Args:
         current: The current values of the policy, by name.
@@ -617,21 +623,21 @@ def completed(
     allow_same: bool = False,
     in_place: bool = False,
 ) -> dict[str, Any]:
-    """Return the values of a new version: the new values, and the current values of the names that
-    these lack.
+    """Return the values of a new version: the new values, and the current values of all other
+    names.
 
     Args:
         current: The current values of the policy, by name.
         new: The new values, from `accepted`.
-        allow_same: Whether all may equal the current ones.
-        in_place: Whether the current values will change in their memory, so that the current values
-            in the result are copies.
+        allow_same: Whether all new values may be equal to the current values.
+        in_place: Whether the memory of the current values will be overwritten. If so, the current
+            values in the result are copies.
 
     Returns:
         The values by name, in the order of `current`.
 
     Raises:
-        UnchangedWeights: All values equal the current ones, and `allow_same` is not set.
+        UnchangedWeights: All values are equal to the current values, and `allow_same` is not set.
     """
     if not allow_same and all(_is_equal(value, current[name]) for name, value in new.items()):
         raise UnchangedWeights(
@@ -648,8 +654,10 @@ def completed(
 
 
 def are_apart(values: Mapping[str, Any]) -> bool:
-    """Return whether `swap` can exchange each of the tensors: they are contiguous, and share no
-    memory, except that tied ones are equal.
+    """Return whether `swap` can exchange all tensors.
+
+    This requires that they are contiguous and share no memory, except for tied names of the same
+    tensor.
     """
     untied = {memory_of(name, value): value for name, value in values.items() if value.numel()}
     if not all(value.is_contiguous() for value in untied.values()):
@@ -693,8 +701,8 @@ def require_fit(
     elif not pushed:
         faults.append("no value: push at least one")
 
-    # No variable may have a pushed value here: it would keep the learner's memory open as long as
-    # the error refers to this frame.
+    # No variable of this frame may contain a pushed value: an error that refers to the frame would
+    # keep the learner's memory open.
     for name in pushed:
         if name in current:
             fault = _misfit(name, pushed[name], current[name])
@@ -704,12 +712,13 @@ def require_fit(
 
 
 def fingerprint(values: Mapping[str, Any]) -> str:
-    """Return a digest of values on any device: 32 hexadecimal characters over names, shapes, types
-    and all bytes.
+    """Return a digest of values on any device: 32 hexadecimal characters that depend on names,
+    shapes, types and all bytes.
 
-    The digest detects any accidental difference: each word is multiplied by two odd numbers, which
-    depend on its index, and summed modulo 2**64, on a GPU if the value is there. A cryptographic
-    digest would need all values on the host, and take a few seconds for a large model.
+    The digest detects any accidental difference. Each word is multiplied by two odd numbers, which
+    depend on the word's index, and the products are summed modulo 2**64. A value on a GPU is summed
+    on that GPU. A cryptographic digest would need all values on the host, and take a few seconds
+    for a large model.
     """
     on_gpus = {
         name: value for name, value in values.items() if _is_tensor(value) and _on_gpu(value)
@@ -738,7 +747,7 @@ def _refuse(faults: list[str]) -> None:
 
 
 def _misfit(name: str, pushed: Any, current: Any) -> str | None:
-    """Describe the difference of a pushed value's shape or kind of type; None if it fits."""
+    """Describe how a pushed value's shape or kind of type differs; None if the value fits."""
     if not is_array(pushed):
         return f"{name!r}: expected an array, got {type(pushed).__name__}"
     if tuple(pushed.shape) != tuple(current.shape):
@@ -759,28 +768,28 @@ def _kind(dtype: str) -> Any:
 
 
 def _is_finite(value: Any) -> Any:
-    """Return whether all numbers are finite, a bool or a tensor of one."""
+    """Return whether all numbers are finite, as a bool or a tensor with one bool."""
     if not dtype_name(value).startswith(("float", "bfloat", "complex")) or 0 in value.shape:
         return True
     if isinstance(value, np.ndarray):
         with np.errstate(over="ignore", invalid="ignore"):
-            # Minimum and maximum need no array of booleans, which would take a quarter of the
-            # value's memory.
+            # Minimum and maximum are checked, since an array of booleans would take a quarter of
+            # the value's memory.
             return bool(np.isfinite(value.min()) and np.isfinite(value.max()))
     if not _is_tensor(value):
         return bool(sys.modules["jax"].numpy.isfinite(value).all())
     if value.is_complex():
         value = sys.modules["torch"].view_as_real(value)
-    # Minimum and maximum need no memory, as above.
+    # Minimum and maximum need no additional memory, as above.
     return sys.modules["torch"].stack(value.aminmax()).isfinite().all()
 
 
 def _all_finite_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the names of torch tensors of real numbers that are surely finite, each with True.
+    """Return True for the name of each torch tensor of real numbers that is known to be finite.
 
-    The largest absolute values of all tensors of a device and type are computed together: several
-    operations for each of hundreds of tensors would delay inference calls, with which they share
-    the GPU and Python's lock.
+    The largest absolute values of all tensors of a device and type are computed together. Several
+    operations for each of hundreds of tensors would delay inference calls, which use the same GPU
+    and Python's lock.
     """
     groups: dict[Any, list[str]] = {}
     for name, value in values.items():
@@ -817,7 +826,7 @@ def _is_equal(new: Any, current: Any) -> bool:
 
 @functools.cache
 def _keys(count: int) -> np.ndarray:
-    """Return odd numbers without a pattern, (2, count) int64, from the finalizer of splitmix64."""
+    """Return pseudo-random odd numbers, (2, count) int64, from the finalizer of splitmix64."""
     key = np.arange(1, 2 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         key = (key ^ (key >> np.uint64(shift))) * np.uint64(factor)
@@ -841,9 +850,9 @@ def _sums(value: Any) -> np.ndarray:
 def _sums_on_gpus(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the two sums of each tensor on a GPU, as `_sums` does, (2,) int64 by name.
 
-    Pieces of the same length are summed together, whichever tensors they belong to: several
-    operations for each of hundreds of tensors would delay inference calls, with which they share
-    the GPU and Python's lock. The host joins the sums of the pieces.
+    Pieces of the same length are summed together, whichever tensors they belong to. Several
+    operations for each of hundreds of tensors would delay inference calls, which use the same GPU
+    and Python's lock. The host combines the sums of the pieces.
     """
     names = {memory_of(name, value): name for name, value in values.items()}
     pieces_by_device: dict[Any, dict[int, list[tuple[Any, Any]]]] = {}
@@ -855,7 +864,7 @@ def _sums_on_gpus(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
     sums = {memory: np.zeros(2, np.int64) for memory in names}
     for pieces_by_length in pieces_by_device.values():
-        # The shorter rest of a tensor is its last piece.
+        # The last piece of a tensor may be shorter.
         pieces = []
         for length in sorted(pieces_by_length, reverse=True):
             pieces += pieces_by_length[length]
@@ -866,7 +875,7 @@ def _sums_on_gpus(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _words_on_gpu(value: Any) -> Any:
-    """Return the bytes of a tensor on a GPU as words, int32; zeros fill the last one."""
+    """Return the bytes of a tensor on a GPU as words, int32. The last word is padded with zeros."""
     torch = sys.modules["torch"]
     data = value.detach().reshape(-1).contiguous().view(torch.uint8)
     if len(data) % 4 or data.storage_offset() % 4:
@@ -878,7 +887,7 @@ def _piece_sums(pieces: Sequence[Any]) -> np.ndarray:
     """Return the sums of pieces of tensors on one GPU.
 
     Args:
-        pieces: Words, (at most `_WORDS`,) int32 each. Those of one length follow each other.
+        pieces: Words, (at most `_WORDS`,) int32 each. Pieces of the same length are consecutive.
 
     Returns:
         The two sums of each piece, (N, 2) int64.
@@ -901,8 +910,9 @@ def _piece_sums(pieces: Sequence[Any]) -> np.ndarray:
 
 
 def _fetched(tensors: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return small tensors of equal shapes as arrays, with a single copy from each device, which
-    waits for all of them.
+    """Return small tensors of equal shapes as arrays.
+
+    A single copy from each device waits for all of its tensors.
     """
     arrays: dict[str, np.ndarray] = {}
     for device in {tensor.device for tensor in tensors.values()}:
