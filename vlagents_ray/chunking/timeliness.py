@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from vlagents_ray.errors import Overloaded, PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import AGE_MS, IN_TIME
 
-KEPT_AGES = 10_000  # the number of ages that are kept: 1,000 s at 10 Hz
+KEPT_AGES = 10_000  # number of stored ages: 1,000 s at 10 Hz
 # After these errors no replica has executed the request, which may be sent again.
 _NOT_EXECUTED = (TooManyRequests, Overloaded, PolicyUnavailable, UnknownSession)
 
@@ -27,10 +27,10 @@ _NOT_EXECUTED = (TooManyRequests, Overloaded, PolicyUnavailable, UnknownSession)
 def counts_ticks(error: Exception | None) -> bool:
     """Return whether a replica counts the ticks that a request reports.
 
-    It counts them when it answers the request. Clients report them again otherwise.
+    A replica counts them when it answers the request. Otherwise, clients report them again.
 
     Args:
-        error: The error with which it answers; None if it answers with an action.
+        error: The error with which the replica answers; None if it answers with an action.
     """
     return not isinstance(error, _NOT_EXECUTED)
 

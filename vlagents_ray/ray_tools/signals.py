@@ -298,13 +298,13 @@ def raised_at_once(stopping_s: float = 0.0) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in this thread on a signal within the context, after its handler
     has run.
 
-    Code that looks at the flag of `stop_signals` does so between two calls. A call that lasts
-    needs this, unless it writes results. A signal without a handler keeps its default action.
-    If the call catches the exception and continues, the exception is raised again.
+    Code that uses `stop_signals` checks its flag between two calls. A long call must be wrapped in
+    this context, unless it writes results. A signal without a handler keeps its default action. If
+    the call catches the exception and continues, the exception is raised again.
 
     Args:
-        stopping_s: How long the call may last if `stop_signals` has received a signal before it,
-            s. By default, `KeyboardInterrupt` is raised in place of the call.
+        stopping_s: The time that the call may take if `stop_signals` has received a signal before
+            it, s. By default, `KeyboardInterrupt` is raised instead of the call.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
